@@ -1,0 +1,51 @@
+"""Certified, differentiable reachability of neural-network control loops (Reach-SDP) in JAX.
+
+Turn on 64-bit floats before building networks and sets::
+
+    import jax
+    jax.config.update("jax_enable_x64", True)
+
+    import reachjax as rj
+"""
+
+from reachjax.basis import ChangeOfBasis, change_of_basis
+from reachjax.certificates import Certificate
+from reachjax.reach import ReachTube, reach, reach_step
+from reachjax.relaxation import AbstractRelaxation, LocalBounds, PaperQC
+from reachjax.sets import AbstractSet, Box, PolyhedralSet, Polytope, Template
+from reachjax.solvers import SCS, AbstractSolver, Clarabel, CvxpySolver, SolverStatus
+from reachjax.specs import Counterexample, Verdict, VerdictStatus, verify
+from reachjax.systems import MLP, AbstractActivation, AffinePlant, ClosedLoop, ReLU
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "MLP",
+    "SCS",
+    "AbstractActivation",
+    "AbstractRelaxation",
+    "AbstractSet",
+    "AbstractSolver",
+    "AffinePlant",
+    "Box",
+    "Certificate",
+    "ChangeOfBasis",
+    "Clarabel",
+    "ClosedLoop",
+    "Counterexample",
+    "CvxpySolver",
+    "LocalBounds",
+    "PaperQC",
+    "PolyhedralSet",
+    "Polytope",
+    "ReLU",
+    "ReachTube",
+    "SolverStatus",
+    "Template",
+    "Verdict",
+    "VerdictStatus",
+    "change_of_basis",
+    "reach",
+    "reach_step",
+    "verify",
+]

@@ -1,0 +1,92 @@
+"""What a bound rests on, kept so that anyone can check it again.
+
+A certificate holds the program of one step, the multipliers that prove its offsets, and the dual
+moment matrices: where one has rank one, it is the worst trajectory itself. Witnesses are simulated
+trajectories; the true support of the reachable set lies between witness and bound.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from reachjax.lmi import Program
+from reachjax.pytrees import Replaceable, pytree
+from reachjax.recheck import interval_offsets, sound_offsets
+from reachjax.solvers import Solution, SolverStatus
+
+
+@pytree
+class Certificate(Replaceable):
+    """Proof of the offsets of one step, `directions x[t] <= bounds`.
+
+    Attributes:
+        program: facts, products and objectives over the scaled basis.
+        multipliers: `(f, K)`, one row a facet.
+        moments: `(f, n, n)`, dual matrices over the unscaled basis with corner 1; NaN where the
+            solver gave none.
+        codes: `(f,)`, how the solver ended, as values of `SolverStatus`.
+        solver_offsets: `(f,)`, what the solver itself claimed; not bounds.
+        bounds: `(f,)`, the offsets that were proved.
+        witnesses: `(f,)`, the largest simulated value of each direction.
+        witness_states: `(f, n_x)`, the initial states that attain them.
+        seconds: `(f,)`, solver time.
+    """
+
+    program: Program
+    multipliers: Float[np.ndarray, "f K"]
+    moments: Float[np.ndarray, "f n n"]
+    codes: Int[np.ndarray, " f"]
+    solver_offsets: Float[np.ndarray, " f"]
+    bounds: Float[np.ndarray, " f"]
+    witnesses: Float[np.ndarray, " f"]
+    witness_states: Float[np.ndarray, "f n_x"]
+    seconds: Float[np.ndarray, " f"]
+
+    @classmethod
+    def from_solution(cls, program: Program, solution: Solution) -> Certificate:
+        """Recheck what a solver proposed; witnesses are not known yet (NaN)."""
+        facets = len(solution.offsets)
+        return cls(
+            program=program,
+            multipliers=solution.multipliers,
+            moments=solution.moments,
+            codes=solution.statuses,
+            solver_offsets=solution.offsets,
+            bounds=_proved(program, solution.multipliers, solution.statuses),
+            witnesses=np.full(facets, np.nan),
+            witness_states=np.full((facets, 0), np.nan),
+            seconds=solution.seconds,
+        )
+
+    @property
+    def statuses(self) -> tuple[SolverStatus, ...]:
+        """How the solver ended on each facet; each has a sentence of `advice`."""
+        return tuple(SolverStatus(int(code)) for code in self.codes)
+
+    @property
+    def gaps(self) -> Float[np.ndarray, " f"]:
+        """`bounds - witnesses`: how much tightness may be left, never negative."""
+        return self.bounds - self.witnesses
+
+    def recheck(self) -> Float[np.ndarray, " f"]:
+        """Prove the offsets anew, from the program and the multipliers alone.
+
+        Sound for any multipliers: negative ones are clipped where the sign matters, and what
+        the matrix inequality misses is paid for. To recheck others:
+        `certificate.replace(multipliers=others).recheck()`.
+
+        Raises:
+            ValueError: the multipliers contain NaN or infinity, or have another shape.
+        """
+        return _proved(self.program, self.multipliers, self.codes)
+
+
+def _proved(program: Program, multipliers: np.ndarray, codes: np.ndarray) -> np.ndarray:
+    """The rechecked offsets; where the solver did not solve, interval arithmetic if it is better.
+
+    Where it did, the offset stays that of the relaxation, even if intervals happen to be tighter.
+    """
+    offsets = sound_offsets(program, multipliers)
+    unsolved = np.asarray(codes) != SolverStatus.SOLVED
+    return np.where(unsolved, np.minimum(offsets, interval_offsets(program)), offsets)

@@ -1,0 +1,69 @@
+"""Checks of what users pass in: errors name the argument, what was expected and what arrived."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def is_concrete(*trees: Any) -> bool:
+    """Whether every leaf holds numbers, and none stands for them inside `jax.jit` or `vmap`."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+class Numbers:
+    """Converts what a user passes to a finite floating-point array of an expected shape.
+
+    Args:
+        shapes: the shapes that are allowed, in words: each is one axis name for each axis, such as
+            `"(time, n)"`. Only the number of axes is checked.
+    """
+
+    def __init__(self, *shapes: str):
+        self.expected = " or ".join(shapes)
+        self.ndims = {shape.count(",") + (not shape.endswith(",)")) for shape in shapes}
+
+    def __call__(self, value: Any, name: str = "value") -> jax.Array:
+        """Convert `value`, which errors call `name`.
+
+        Raises:
+            TypeError: `value` is not numeric.
+            ValueError: `value` has another number of axes, or holds NaN or infinity.
+        """
+        expected = f"{name} must be an array of shape {self.expected}"
+        try:
+            array = jnp.asarray(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            kind = type(value).__name__
+            raise TypeError(f"{expected}, but a {kind} arrived: {error}") from None
+        if array.ndim not in self.ndims:
+            raise ValueError(f"{expected}, but one of shape {array.shape} arrived")
+        if is_concrete(array) and not np.isfinite(array).all():
+            where = tuple(int(i) for i in np.argwhere(~np.isfinite(np.asarray(array)))[0])
+            raise ValueError(f"{name} must be finite, but entry {where} is {array[where]}")
+        return array
+
+
+def same_size(expected: str, arrived: str, sizes: tuple[int | None, int | None]) -> None:
+    """Raise a `ValueError` built from both sides when the two sizes differ."""
+    if sizes[0] != sizes[1]:
+        raise ValueError(f"{arrived} {sizes[1]}, but {expected} {sizes[0]}")
+
+
+def require_double_precision(**arguments: Any) -> None:
+    """Certificates need 64-bit floats: say how to turn them on when they are off.
+
+    Raises:
+        RuntimeError: JAX's 64-bit mode is off, or an argument was built while it was off.
+    """
+    remedy = 'call jax.config.update("jax_enable_x64", True) before building networks and sets'
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(f"reachability needs 64-bit floats, but JAX's are off: {remedy}")
+    for name, tree in arguments.items():
+        for leaf in jax.tree.leaves(tree):
+            if jnp.result_type(leaf) != jnp.float64:
+                kind = jnp.result_type(leaf)
+                raise RuntimeError(f"{name} holds {kind}, but float64 is needed: {remedy}")

@@ -1,0 +1,92 @@
+"""The one formula, as data.
+
+For each facet `a . x+ <= b` the paper's theorem 1 asks for multipliers with
+
+    F' Gamma F  +  p e' + e p'  -  2 b e e'  <=  0        (negative semidefinite)
+
+over the basis: `F` stacks the facts, `Gamma` weighs their products, `p` is the row of `a . x+` and
+`e` picks the constant 1. Multiplied from both sides by a trajectory's basis vector it says
+`2 (a . x+ - b) <= -(products) <= 0`.
+
+The program is stated in scaled coordinates, `xi = T eta` with `|eta_i| <= 1` on the set, which
+keeps multipliers of order one and bounds `|eta|^2` by the number of entries.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from reachjax.basis import Rows
+from reachjax.bounds import LoopBounds
+from reachjax.pytrees import pytree
+from reachjax.relaxation import Products
+from reachjax.rounding import Ball, gamma
+
+
+@pytree
+class Program:
+    """The semidefinite programs of one step: one for each facet, all but the objective shared.
+
+    Attributes:
+        facts: `(m, n)` rows over the scaled basis, never negative on the set.
+        objective: `(f, n)` rows over the scaled basis: `a . x+` for each facet.
+        products: which pairs of facts are multiplied.
+        shift: `(n,)`, the midpoint of each entry of the basis (zero for the constant).
+        scale: `(n,)`, the radius of each entry: `xi_i = shift_i + scale_i eta_i`; zero where the
+            entry is unused or has one value; 1 for the constant.
+    """
+
+    facts: Rows
+    objective: Rows
+    products: Products
+    shift: Float[Array, " n"]
+    scale: Float[Array, " n"]
+
+    def transformation(self) -> Float[Array, "n n"]:
+        """The matrix `T` of `xi = T eta`."""
+        return scaling(self.shift, self.scale)
+
+
+def scaling(shift: Float[Array, " n"], scale: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """`T` with `T eta = shift + scale * eta`, the constant entry staying 1."""
+    last = jnp.arange(scale.shape[0]) == scale.shape[0] - 1
+    return jnp.diag(scale) + jnp.outer(jnp.where(last, 0.0, shift), last)
+
+
+def basis_box(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Midpoint and radius of each entry of the basis `[x, z, 1]`.
+
+    A unit that has left the basis gets radius zero. One that stays although its output has a single
+    value (a dead neuron that the paper keeps) is scaled by its input, so that it does stay.
+    """
+    z = bounds.output
+    if prune:
+        gone = bounds.passing | bounds.blocking
+        mid, rad = jnp.where(gone, 0.0, z.mid), jnp.where(gone, 0.0, z.rad)
+    else:
+        y = bounds.preactivation
+        size = abs(y.mid) + y.rad
+        mid, rad = z.mid, jnp.where(z.rad > 0, z.rad, jnp.where(size > 0, size, 1.0))
+    one = jnp.ones(1)
+    return (
+        jnp.concatenate([bounds.state.mid, mid, 0 * one]),
+        jnp.concatenate([bounds.state.rad, rad, one]),
+    )
+
+
+def weighted_products(program: Program, multipliers: Float[Array, " K"]) -> Ball:
+    """`F' Gamma F` `(n, n)` with a bound of its rounding error, for one facet's multipliers.
+
+    Works on JAX arrays and on numpy arrays alike.
+    """
+    products, facts = program.products, program.facts
+    weights = multipliers[products.multiplier][:, None]
+    L, dL = facts.mid[products.left], facts.rad[products.left]
+    R, dR = facts.mid[products.right], facts.rad[products.right]
+    half = (weights * L).T @ R
+    size = abs(weights)
+    rounding = gamma(len(products.left) + 4) * ((size * abs(L)).T @ abs(R))
+    inherited = (size * dL).T @ (abs(R) + dR) + (size * abs(L)).T @ dR
+    error = (rounding + inherited) * (1 + gamma(len(products.left) + 4))
+    return Ball((half + half.T) / 2, (error + error.T) / 2)

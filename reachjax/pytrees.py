@@ -1,0 +1,72 @@
+"""Immutable dataclasses that are JAX pytrees and may check their fields when a user builds them.
+
+`flax.struct.dataclass` runs `__post_init__` again whenever JAX rebuilds the object, with whatever
+stands for a leaf at that moment (`None`, a shape, a stacked batch), so a check there would reject
+`jax.vmap` over networks. Here JAX rebuilds objects without calling the constructor.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Self, TypeVar, dataclass_transform
+
+import jax
+
+T = TypeVar("T")
+
+
+def static(**kwargs: Any) -> Any:
+    """A field that is part of the tree's structure: hashable, and a new value compiles anew."""
+    return dataclasses.field(metadata={"static": True}, **kwargs)
+
+
+def converted(*, converter: Callable[..., Any], **kwargs: Any) -> Any:
+    """A field whose value passes through `converter(value, name=...)` in the constructor."""
+    return dataclasses.field(metadata={"converter": converter}, **kwargs)
+
+
+@dataclass_transform(field_specifiers=(static, converted), frozen_default=True)
+def pytree(cls: type[T]) -> type[T]:
+    """Make `cls` a frozen dataclass and a pytree; conversions and checks run for users only."""
+    check = cls.__dict__.get("__post_init__", lambda self: None)
+
+    def convert_and_check(self) -> None:
+        for field in dataclasses.fields(self):
+            value, converter = getattr(self, field.name), field.metadata.get("converter")
+            if converter is not None and value is not None:
+                name = f"{type(self).__name__}.{field.name}"
+                object.__setattr__(self, field.name, converter(value, name=name))
+        check(self)
+
+    cls.__post_init__ = convert_and_check  # type: ignore[attr-defined]
+    cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    data = tuple(f.name for f in fields if not f.metadata.get("static"))
+    meta = tuple(f.name for f in fields if f.metadata.get("static"))
+
+    def flatten_with_keys(tree):
+        children = [(jax.tree_util.GetAttrKey(name), getattr(tree, name)) for name in data]
+        return children, tuple(getattr(tree, name) for name in meta)
+
+    def unflatten(aux, children):
+        tree = object.__new__(cls)
+        for name, value in zip((*data, *meta), (*children, *aux), strict=True):
+            object.__setattr__(tree, name, value)
+        return tree
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten)
+    return cls
+
+
+class Replaceable:
+    """Copies with some fields changed, checked as a new object is."""
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy in which the named fields are replaced."""
+        return dataclasses.replace(self, **changes)  # type: ignore[type-var]
+
+    def _set(self, **values: Any) -> None:
+        """Store converted fields from `__post_init__`, while the object is being built."""
+        for name, value in values.items():
+            object.__setattr__(self, name, value)

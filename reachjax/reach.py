@@ -1,0 +1,220 @@
+"""Reachable sets, step by step (the paper's section IV).
+
+One step: facts of the set, facts of the units, rows of the successor, the program, a solver, the
+recheck. A tube repeats it, each set being the next one's set of states (equation (seq_SDP)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from reachjax.basis import columns, loop_rows
+from reachjax.bounds import loop_bounds
+from reachjax.certificates import Certificate
+from reachjax.checks import require_double_precision, same_size
+from reachjax.lmi import Program, basis_box, scaling
+from reachjax.pytrees import Replaceable, pytree, static
+from reachjax.relaxation import AbstractRelaxation, FactLayout, LocalBounds
+from reachjax.sets import AbstractSet, Box, Polytope, Template
+from reachjax.solvers import AbstractSolver, Clarabel
+from reachjax.systems import ClosedLoop
+from reachjax.witnesses import initial_states, proposed_states, witnesses
+
+Progress = Callable[[Iterable[int]], Iterable[int]]
+"""Wraps the iteration over time steps, such as `tqdm.tqdm` or `rich.progress.track`."""
+
+SAMPLES = 1000
+
+
+@pytree
+class ReachTube(Replaceable):
+    """Sets that surely contain every state of the loop, one for each time.
+
+    Attributes:
+        loop: the loop they were computed for.
+        template: the facet directions.
+        sets: `sets[t]` for `t = 0 .. horizon`; `sets[0]` is the initial set.
+        certificates: `certificates[t]` for `t = 1 .. horizon`; the first entry is `None`.
+        start: the time of the initial set, for time-varying loops.
+    """
+
+    loop: ClosedLoop
+    template: Template
+    sets: tuple[AbstractSet, ...]
+    certificates: tuple[Certificate | None, ...]
+    start: int = static(default=0)
+
+    @property
+    def horizon(self) -> int:
+        """The number of steps."""
+        return len(self.sets) - 1
+
+    def proof(self, t: int) -> Certificate:
+        """The certificate of `sets[t]`.
+
+        Raises:
+            ValueError: there is none for this time (the initial set needs none).
+        """
+        certificate = self.certificates[t] if 0 < t <= self.horizon else None
+        if certificate is None:
+            raise ValueError(f"certificates are for t = 1 .. {self.horizon}, but {t} was asked for")
+        return certificate
+
+    def simulate(self, samples: int = SAMPLES, seed: int = 0) -> Float[Array, "c h+1 n_x"]:
+        """Trajectories from corners of the initial set and `samples` points drawn from it."""
+        states = initial_states(self.sets[0], samples, seed)
+        return self.loop.simulate(states, self.horizon, self.start)
+
+
+def reach_step(
+    loop: ClosedLoop,
+    X: AbstractSet,
+    template: Template,
+    *,
+    t: int = 0,
+    relaxation: AbstractRelaxation = LocalBounds(),  # noqa: B008  (immutable)
+    solver: AbstractSolver = Clarabel(),  # noqa: B008
+    samples: int = SAMPLES,
+    seed: int = 0,
+) -> tuple[Polytope, Certificate]:
+    """The polytope that contains every successor of a set, and its certificate.
+
+    Args:
+        loop: the closed loop.
+        X: the set of states at time `t`.
+        template: the facet directions.
+        t: the time, for time-varying loops.
+        relaxation: which products of facts are used.
+        solver: what solves the semidefinite programs.
+        samples: how many states are simulated for witnesses, besides the corners.
+        seed: of the samples.
+
+    Raises:
+        RuntimeError: JAX's 64-bit floats are off.
+        TypeError: an argument is of another kind.
+        ValueError: dimensions disagree, the set is empty or unbounded, or `t` is beyond the loop.
+
+    Source: theorem 1 and problem (sdp::poly) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
+    """
+    tube = reach(loop, X, 1, template, relaxation, 1, solver, start=t, samples=samples, seed=seed)
+    following = tube.sets[1]
+    assert isinstance(following, Polytope)
+    return following, tube.proof(1)
+
+
+def reach(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    horizon: int,
+    template: Template,
+    relaxation: AbstractRelaxation = LocalBounds(),  # noqa: B008  (immutable)
+    window: int = 1,
+    solver: AbstractSolver = Clarabel(),  # noqa: B008
+    *,
+    start: int = 0,
+    samples: int = SAMPLES,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> ReachTube:
+    """Sets that surely contain every state of the loop at times `1 .. horizon`.
+
+    Args:
+        loop: the closed loop.
+        X0: the set of initial states.
+        horizon: the number `N` of steps.
+        template: the facet directions of every set.
+        relaxation: which products of facts are used.
+        window: over how many steps each program reaches back; 1 is the paper's recursion.
+        solver: what solves the semidefinite programs.
+        start: the time of `X0`, for time-varying loops.
+        samples: how many trajectories are simulated for witnesses, besides those from corners.
+        seed: of the samples.
+        progress: wraps the iteration over steps to show a progress bar, such as `tqdm.tqdm`.
+
+    Raises:
+        RuntimeError: JAX's 64-bit floats are off.
+        TypeError: an argument is of another kind.
+        ValueError: dimensions disagree, `X0` is empty or unbounded, the window is not supported,
+            or a time-varying loop ends before the horizon.
+
+    Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
+    """
+    _check(loop, X0, horizon, template, relaxation, window, solver, start)
+    sets: list[AbstractSet] = [X0]
+    certificates: list[Certificate] = []
+    steps = range(horizon)
+    for k in steps if progress is None else progress(steps):
+        X = sets[-1]
+        program = _program(loop, X.facts(), X.bounding_box(), template, start + k, relaxation)
+        program = jax.device_get(program)
+        certificates.append(Certificate.from_solution(program, solver.solve(program)))
+        sets.append(template.polytope(jnp.asarray(certificates[-1].bounds)))
+
+    states = initial_states(X0, samples, seed)
+    states = jnp.concatenate([states, proposed_states(X0, certificates[0].moments)])
+    values, origins = witnesses(loop, states, template.directions, horizon, start)
+    certificates = [
+        certificate.replace(witnesses=values[k], witness_states=origins[k])
+        for k, certificate in enumerate(certificates)
+    ]
+    return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
+
+
+@partial(jax.jit, static_argnames="relaxation")
+def _program(
+    loop: ClosedLoop,
+    set_facts: Float[Array, "m n_x+1"],
+    box: Box,
+    template: Template,
+    t: int,
+    relaxation: AbstractRelaxation,
+) -> Program:
+    """Theorem 1 for every facet of one step, over the scaled basis `[x, z, 1]`."""
+    n, k = loop.states, loop.units
+    size = n + k + 1
+    bounds = loop_bounds(loop, box, t)
+    rows = loop_rows(loop, columns(0, n, size), n, t, bounds, relaxation.remove_stable)
+    one = columns(size - 1, 1, size)
+    of_the_set = set_facts[:, :-1] @ rows.state + set_facts[:, -1]
+    facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts)
+    shift, scale = basis_box(bounds, relaxation.remove_stable)
+    T = scaling(shift, scale)
+    return Program(
+        facts=facts @ T,
+        objective=(template.directions @ rows.successor) @ T,
+        products=relaxation.products(FactLayout(len(set_facts), k)),
+        shift=shift,
+        scale=scale,
+    )
+
+
+def _check(loop, X0, horizon, template, relaxation, window, solver, start) -> None:
+    for name, value, kind in (
+        ("loop", loop, ClosedLoop),
+        ("X0", X0, AbstractSet),
+        ("template", template, Template),
+        ("relaxation", relaxation, AbstractRelaxation),
+        ("solver", solver, AbstractSolver),
+    ):
+        if not isinstance(value, kind):
+            hint = " object, not a class" if isinstance(value, type) else ""
+            raise TypeError(f"{name} must be a {kind.__name__}{hint}, but {value!r} arrived")
+    require_double_precision(loop=loop, X0=X0, template=template)
+    if isinstance(X0, Box) and X0.steps is not None:
+        raise ValueError(f"X0 must be one box, but bounds of shape {X0.lower.shape} arrived")
+    same_size(
+        "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)
+    )
+    same_size(
+        "the loop's number of states is",
+        "the dimension of template is",
+        (loop.states, template.dimension),
+    )
+    loop.check_horizon(horizon, start)
+    if window != 1:
+        raise ValueError(f"window must be 1 (one step at a time), but {window!r} arrived")

@@ -1,0 +1,127 @@
+"""Offsets that hold whatever multipliers a solver returned.
+
+For a facet, write the matrix of `lmi` as `[N v; v' s - 2b]` over the scaled basis `eta`, whose
+entries lie in `[-1, 1]`. For every `eps >= 0` that makes `N - eps I` negative definite,
+
+    2 a . x+  <=  s + v' (eps I - N)^-1 v + eps (n - 1)
+
+on the set, so the best `eps` gives the smallest offset that these multipliers prove. It is found in
+floating point and then proved: `eps I - M + theta I` is shown to be positive semidefinite by a
+Cholesky factorisation that runs to completion (Rump, Verification of positive definiteness, BIT
+2006), with the rounding errors of `M` itself bounded entry by entry; what is missing costs
+`theta n / 2`. Where the arithmetic overflows, interval arithmetic is the answer.
+
+Everything here is numpy on the host.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import brentq
+
+from reachjax.lmi import Program, weighted_products
+from reachjax.rounding import UNIT, Ball, gamma
+
+
+def sound_offsets(program: Program, multipliers: np.ndarray) -> np.ndarray:
+    """The smallest offset `(f,)` that each facet's multipliers `(f, K)` are shown to prove.
+
+    Signed multipliers that are negative are taken as zero.
+
+    Raises:
+        ValueError: the multipliers have another shape, or contain NaN or infinity.
+    """
+    facets, count = program.objective.mid.shape[0], program.products.free.shape[0]
+    multipliers = np.asarray(multipliers, dtype=float)
+    if multipliers.shape != (facets, count):
+        raise ValueError(
+            f"multipliers must have shape {(facets, count)} (facets, products), "
+            f"but {multipliers.shape} arrived"
+        )
+    broken = ~np.isfinite(multipliers).all(axis=1)
+    if broken.any():
+        raise ValueError(
+            f"multipliers of facet {int(np.argmax(broken))} contain NaN or infinity: "
+            "they prove nothing"
+        )
+    clipped = np.where(program.products.free, multipliers, np.maximum(multipliers, 0.0))
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow ends in the interval bound
+        return np.array([_sound_offset(program, i, clipped[i]) for i in range(facets)])
+
+
+def interval_offsets(program: Program) -> np.ndarray:
+    """Offsets `(f,)` by interval arithmetic alone: `|eta_i| <= 1` in the objective rows."""
+    p = program.objective
+    size = abs(p.mid[:, :-1]).sum(axis=1) + p.rad.sum(axis=1)
+    rounding = gamma(p.mid.shape[1]) * (size + abs(p.mid[:, -1]))
+    return p.mid[:, -1] + size + 2 * rounding
+
+
+def _sound_offset(program: Program, facet: int, multipliers: np.ndarray) -> float:
+    by_intervals = float(interval_offsets(program)[facet])
+    used = program.scale > 0
+    matrix = _facet_matrix(program, facet, multipliers)
+    mid, rad = matrix.mid[np.ix_(used, used)], matrix.rad[np.ix_(used, used)]
+    if not (np.isfinite(mid).all() and np.isfinite(rad).all()):
+        return by_intervals
+    offset, shift = _best_offset(mid)
+    error = float(rad.sum(axis=1).max()) * (1 + gamma(len(mid)))  # spectral norm <= row sums
+    slack = _proved_slack(mid, offset, shift)
+    n = len(mid)
+    cost = (shift * (n - 1) + (slack + error) * n) / 2
+    proved = offset + cost + gamma(4) * (abs(offset) + cost)
+    return proved if np.isfinite(proved) else by_intervals
+
+
+def _facet_matrix(program: Program, facet: int, multipliers: np.ndarray) -> Ball:
+    """`F' Gamma F + p e' + e p'` with a bound of its rounding error."""
+    products = weighted_products(program, multipliers)
+    p = program.objective
+    mid, rad = products.mid.copy(), products.rad.copy()
+    for part, whole in ((p.mid[facet], mid), (p.rad[facet], rad)):
+        whole[-1, :] += part
+        whole[:, -1] += part
+    return Ball(mid, (rad + gamma(4) * abs(mid)) * (1 + gamma(4)))
+
+
+def _best_offset(matrix: np.ndarray) -> tuple[float, float]:
+    """The offset `b` and the shift `eps` that minimise the bound of this module's docstring.
+
+    Its derivative in `eps` is `(n - 1 - |(eps I - N)^-1 v|^2) / 2`, which grows with `eps`.
+    """
+    s, v, N = matrix[-1, -1], matrix[-1, :-1], matrix[:-1, :-1]
+    if len(v) == 0:
+        return s / 2, 0.0
+    values, vectors = np.linalg.eigh(N)
+    w = vectors.T @ v
+    tiny = len(v) * UNIT * max(abs(values).max(), abs(v).max(), np.finfo(float).tiny)
+    least = max(0.0, values[-1] + tiny)
+    most = least + tiny + np.linalg.norm(w) / np.sqrt(len(v))
+
+    def excess(shift: float) -> float:
+        return float(np.sum((w / (shift - values)) ** 2) - len(v))
+
+    shift = brentq(excess, least, most) if excess(least) > 0 > excess(most) else least
+    return (s + float(np.sum(w**2 / (shift - values)))) / 2, float(shift)
+
+
+def _proved_slack(matrix: np.ndarray, offset: float, shift: float) -> float:
+    """A `slack >= 0` for which `diag(shift I, 2 offset) - matrix + slack I` surely is semidefinite.
+
+    A Cholesky factorisation that completes for `P - c I`, with `c` at least
+    `gamma_{n+1} trace(P) / (1 - gamma_{n+1})`, shows that `P` is positive semidefinite.
+    """
+    n = len(matrix)
+    P = -matrix + np.diag(np.r_[np.full(n - 1, shift), 2 * offset])
+    formed = gamma(2) * (abs(matrix).max() + abs(shift) + 2 * abs(offset)) * 2
+    size = abs(np.diag(P)).sum() + np.finfo(float).tiny
+    slack = 0.0
+    for _ in range(60):
+        margin = 2 * gamma(n + 1) * (size + n * slack)
+        try:
+            np.linalg.cholesky(P + (slack - margin) * np.eye(n))
+        except np.linalg.LinAlgError:
+            slack = max(4 * slack, 8 * margin)
+        else:
+            return slack + formed
+    return np.inf

@@ -1,0 +1,158 @@
+"""Which products of facts enter the semidefinite program: that choice is the relaxation.
+
+Facts are stacked as `[1; facets of the set; z; z - y; caps of z; caps of z - y]`. The product of
+two of them is never negative on a trajectory, the product `z (z - y)` is zero there. Weighted by
+multipliers they form `F' Gamma F` (propositions 1-2 and lemma 1 of the paper, and what others add
+to them). A diagonal entry of `Gamma` would only add a positive semidefinite term, which never
+helps, so there is none.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from reachjax.pytrees import pytree
+
+
+@dataclasses.dataclass(frozen=True)
+class FactLayout:
+    """Where each kind of fact stands among the rows: `facets` of the set, `units` of the loop."""
+
+    facets: int
+    units: int
+
+    @property
+    def set_facets(self) -> range:
+        """Facets of the set of states."""
+        return range(1, 1 + self.facets)
+
+    def _kind(self, number: int) -> range:
+        first = 1 + self.facets + number * self.units
+        return range(first, first + self.units)
+
+    @property
+    def output(self) -> range:
+        """`z >= 0`."""
+        return self._kind(0)
+
+    @property
+    def slack(self) -> range:
+        """`z - y >= 0`."""
+        return self._kind(1)
+
+    @property
+    def output_cap(self) -> range:
+        """`max(u, 0) - z >= 0`."""
+        return self._kind(2)
+
+    @property
+    def slack_cap(self) -> range:
+        """`max(-l, 0) - (z - y) >= 0`."""
+        return self._kind(3)
+
+
+@pytree
+class Products:
+    """Pairs of facts and the multiplier that weighs each.
+
+    Attributes:
+        left: `(p,)`, row numbers of facts.
+        right: `(p,)`, row numbers of facts.
+        multiplier: `(p,)`, the multiplier of each pair; several pairs may share one.
+        free: `(K,)`, multipliers of either sign (the product is zero); the others are `>= 0`.
+    """
+
+    left: Int[Array, " p"]
+    right: Int[Array, " p"]
+    multiplier: Int[Array, " p"]
+    free: Bool[Array, " K"]
+
+
+class AbstractRelaxation(abc.ABC):
+    """A choice of products. Hashable and immutable: it is static where code is compiled.
+
+    A subclass has a field `remove_stable`: whether units that bounds prove to be affine leave the
+    basis.
+    """
+
+    remove_stable: bool
+
+    @abc.abstractmethod
+    def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
+        """Pairs of facts that share a multiplier, the free groups first, and how many are free."""
+
+    def products(self, facts: FactLayout) -> Products:
+        """The pairs as index arrays."""
+        groups, free = self.groups(facts)
+        pairs = np.array(list(itertools.chain.from_iterable(groups)), dtype=int).reshape(-1, 2)
+        owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+        signs = np.arange(len(groups)) < free
+        return Products(*map(jnp.asarray, (pairs[:, 0], pairs[:, 1], owner, signs)))
+
+
+@dataclasses.dataclass(frozen=True)
+class PaperQC(AbstractRelaxation):
+    """The paper's quadratic constraints, every neuron in the basis unless asked otherwise.
+
+    Products: facet x facet of the set (`Gamma` of proposition 1), `1 x z` (`eta`), `1 x (z - y)`
+    (`nu`), the free `z (z - y)` (`lambda_i`), and with `repeated` the slope restriction between
+    neurons (`lambda_ij` of lemma 1), which is `z_i (z_j - y_j) + z_j (z_i - y_i)` once the
+    complementarities hold.
+
+    Args:
+        repeated: whether to include `lambda_ij`.
+        remove_stable: whether neurons that interval bounds prove to be affine leave the basis,
+            which the paper does not do.
+    """
+
+    repeated: bool = True
+    remove_stable: bool = False
+
+    def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
+        """Free complementarities, then `Gamma`, `eta`, `nu`, `lambda_ij`."""
+        free = [[pair] for pair in zip(facts.output, facts.slack, strict=True)]
+        signed = [[pair] for pair in itertools.combinations(facts.set_facets, 2)]
+        signed += [[(0, i)] for i in (*facts.output, *facts.slack)]
+        if self.repeated:
+            signed += _crossed(facts)
+        return free + signed, len(free)
+
+
+@dataclasses.dataclass(frozen=True)
+class LocalBounds(AbstractRelaxation):
+    """The paper's constraints and those that pre-activation bounds `l <= y <= u` give.
+
+    Adds `z (u - z)`, `(z - y) (-l - (z - y))` and `(u - z) (-l - (z - y))`, the last being the
+    triangle relaxation; stable neurons leave the basis. This is what the authors' code and DeepSDP
+    (Fazlyab, Morari, Pappas, 2020) use.
+
+    Args:
+        repeated: whether to include `lambda_ij`.
+        remove_stable: whether neurons that interval bounds prove to be affine leave the basis.
+    """
+
+    repeated: bool = True
+    remove_stable: bool = True
+
+    def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
+        """The paper's groups, then the products of caps."""
+        groups, free = PaperQC(self.repeated).groups(facts)
+        for left, right in (
+            (facts.output, facts.output_cap),
+            (facts.slack, facts.slack_cap),
+            (facts.output_cap, facts.slack_cap),
+        ):
+            groups += [[pair] for pair in zip(left, right, strict=True)]
+        return groups, free
+
+
+def _crossed(facts: FactLayout) -> list[list[tuple[int, int]]]:
+    """`z_i (z_j - y_j)` and `z_j (z_i - y_i)` under one multiplier, for every pair of neurons."""
+    z, r = facts.output, facts.slack
+    return [[(z[i], r[j]), (z[j], r[i])] for i, j in itertools.combinations(range(facts.units), 2)]

@@ -1,0 +1,8 @@
+"""Geometry: sets of states, their facts, support functions, samples and volumes."""
+
+from reachjax.sets.base import AbstractSet, PolyhedralSet
+from reachjax.sets.box import Box
+from reachjax.sets.polytope import Polytope
+from reachjax.sets.template import Template
+
+__all__ = ["AbstractSet", "Box", "PolyhedralSet", "Polytope", "Template"]

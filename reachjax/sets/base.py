@@ -1,0 +1,79 @@
+"""What every set of states can do.
+
+A set enters the semidefinite program through its **facts**: rows `r` over `[x, 1]` with
+`r . [x, 1] >= 0` on the set. For a polytope `A x <= b` these are the rows of `[-A, b]`, whose
+pairwise products span the quadratic constraint of the paper's proposition 1.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
+
+from reachjax.pytrees import Replaceable
+
+if TYPE_CHECKING:
+    from reachjax.sets.box import Box
+
+
+class AbstractSet(Replaceable, abc.ABC):
+    """A closed convex set of states in `n` dimensions."""
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """The number `n` of coordinates."""
+
+    @abc.abstractmethod
+    def facts(self) -> Float[Array, "m n+1"]:
+        """Rows `r` with `r . [x, 1] >= 0` for every `x` of the set."""
+
+    @abc.abstractmethod
+    def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
+        """The largest value of each direction on the set (rounded up where it is computed)."""
+
+    @abc.abstractmethod
+    def contains(
+        self, points: Float[ArrayLike, "*batch n"], tolerance: float = 0.0
+    ) -> Bool[Array, "*batch"]:
+        """Whether each point lies in the set, enlarged by `tolerance` in the facts' scale."""
+
+    @abc.abstractmethod
+    def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
+        """Points drawn uniformly from the set."""
+
+    @abc.abstractmethod
+    def volume(self) -> Float[Array, ""] | float:
+        """The `n`-dimensional volume (length, area, ...)."""
+
+    @abc.abstractmethod
+    def bounding_box(self) -> Box:
+        """The smallest box around the set."""
+
+
+class PolyhedralSet(AbstractSet):
+    """A set bounded by facets, `A x <= b`."""
+
+    @property
+    @abc.abstractmethod
+    def facets(self) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
+        """The pair `(A, b)`: the set is `A x <= b`."""
+
+    @abc.abstractmethod
+    def vertices(self) -> Float[Array, "v n"]:
+        """The corners; their convex hull is the set."""
+
+    def facts(self) -> Float[Array, "m n+1"]:
+        """The rows `[-a, b]`: a facet's slack `b - a . x` is never negative."""
+        A, b = self.facets
+        return jnp.hstack([-A, b[:, None]])
+
+    def contains(
+        self, points: Float[ArrayLike, "*batch n"], tolerance: float = 0.0
+    ) -> Bool[Array, "*batch"]:
+        """Whether `A x <= b + tolerance` holds for each point."""
+        A, b = self.facets
+        return jnp.all(jnp.asarray(points) @ A.T <= b + tolerance, axis=-1)

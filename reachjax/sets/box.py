@@ -1,0 +1,120 @@
+"""Boxes: one interval per coordinate."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+
+from reachjax.checks import Numbers, is_concrete
+from reachjax.pytrees import converted, pytree
+from reachjax.rounding import gamma
+from reachjax.sets.base import PolyhedralSet
+
+MOST_CORNERS = 2**16
+
+
+@pytree
+class Box(PolyhedralSet):
+    """The box `lower <= x <= upper`; a flat one (`lower == upper` somewhere) is allowed.
+
+    Both may carry a leading time axis when the box is a time-varying input box; `at(t)` then gives
+    the box of one time.
+
+    Args:
+        lower: `(n,)` or `(time, n)`, in the units of the coordinates.
+        upper: same shape as `lower`.
+
+    Raises:
+        ValueError: shapes differ, a bound is not finite, or `lower > upper` in a coordinate.
+
+    Example:
+        >>> box = Box([2.5, -0.25], [3.0, 0.25])
+        >>> float(box.volume())
+        0.25
+    """
+
+    lower: Float[Array, "*time n"] = converted(converter=Numbers("(n,)", "(time, n)"))
+    upper: Float[Array, "*time n"] = converted(converter=Numbers("(n,)", "(time, n)"))
+
+    def __post_init__(self):
+        lower, upper = self.lower, self.upper
+        if lower.shape != upper.shape:
+            raise ValueError(
+                f"Box.lower and Box.upper must have one shape, "
+                f"but {lower.shape} and {upper.shape} arrived"
+            )
+        if is_concrete(lower, upper) and bool(jnp.any(lower > upper)):
+            where = tuple(int(i) for i in np.argwhere(np.asarray(lower > upper))[0])
+            raise ValueError(
+                f"Box.lower must not exceed Box.upper, but at {where} "
+                f"lower is {lower[where]} and upper {upper[where]}: the box is empty"
+            )
+
+    @property
+    def dimension(self) -> int:
+        """The number of coordinates."""
+        return self.lower.shape[-1]
+
+    @property
+    def steps(self) -> int | None:
+        """The number of times a time-varying box is given for; `None` for a constant one."""
+        return self.lower.shape[0] if self.lower.ndim == 2 else None
+
+    def at(self, t) -> Box:
+        """The box at time `t`."""
+        return self if self.steps is None else Box(self.lower[t], self.upper[t])
+
+    @property
+    def center(self) -> Float[Array, " n"]:
+        """The midpoint."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def widths(self) -> Float[Array, " n"]:
+        """The length of each side."""
+        return self.upper - self.lower
+
+    @property
+    def facets(self) -> tuple[Float[Array, "2n n"], Float[Array, " 2n"]]:
+        """`-x <= -lower`, then `x <= upper`."""
+        eye = jnp.eye(self.dimension)
+        return jnp.vstack([-eye, eye]), jnp.concatenate([-self.lower, self.upper])
+
+    def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
+        """`max a . x` over the box, attained at a corner; rounded up."""
+        directions = jnp.asarray(directions)
+        terms = directions * jnp.where(directions > 0, self.upper, self.lower)
+        # along an axis nothing is rounded, and nothing is added
+        inexact = jnp.sum(directions != 0, axis=-1) > jnp.max(abs(directions) == 1, axis=-1)
+        rounding = gamma(self.dimension) * jnp.sum(abs(terms), axis=-1)
+        return jnp.sum(terms, axis=-1) + jnp.where(inexact, rounding, 0.0)
+
+    def vertices(self) -> Float[Array, "2**n n"]:
+        """All corners, flat coordinates included.
+
+        Raises:
+            ValueError: there are more than 65536 of them.
+        """
+        if 2**self.dimension > MOST_CORNERS:
+            raise ValueError(
+                f"a box of dimension {self.dimension} has {2**self.dimension} corners, "
+                f"more than the {MOST_CORNERS} that are listed"
+            )
+        upper = np.stack(np.unravel_index(np.arange(2**self.dimension), (2,) * self.dimension), 1)
+        return jnp.where(jnp.asarray(upper, dtype=bool), self.upper, self.lower)
+
+    def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
+        """Points drawn uniformly."""
+        shape = (count, self.dimension)
+        draws = jax.random.uniform(key, shape, dtype=self.lower.dtype)
+        return jnp.clip(self.lower + draws * self.widths, self.lower, self.upper)
+
+    def volume(self) -> Float[Array, ""]:
+        """The product of the widths."""
+        return jnp.prod(self.widths)
+
+    def bounding_box(self) -> Box:
+        """The box itself."""
+        return self

@@ -1,0 +1,94 @@
+"""Polytopes in facet form."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+
+from reachjax.checks import Numbers, is_concrete, same_size
+from reachjax.pytrees import converted, pytree
+from reachjax.sets import polyhedra
+from reachjax.sets.base import PolyhedralSet
+from reachjax.sets.box import Box
+
+
+@pytree
+class Polytope(PolyhedralSet):
+    """The polytope `A x <= b` (the paper's proposition 1).
+
+    It may be unbounded, such as a half-space to be avoided; what needs corners, a volume or a
+    support function then says so. Supports, bounding boxes and corners come from linear programs
+    on the host, so they are not for use inside `jax.jit`.
+
+    Args:
+        A: `(m, n)`, one facet normal a row, none of them zero.
+        b: `(m,)`, the offsets.
+
+    Raises:
+        ValueError: sizes differ, an entry is not finite, or a row of `A` is zero.
+
+    Example:
+        >>> diamond = Polytope([[1, 1], [1, -1], [-1, 1], [-1, -1]], [1, 1, 1, 1])
+        >>> round(diamond.volume(), 6)
+        2.0
+    """
+
+    A: Float[Array, "m n"] = converted(converter=Numbers("(m, n)"))
+    b: Float[Array, " m"] = converted(converter=Numbers("(m,)"))
+
+    def __post_init__(self):
+        A, b = self.A, self.b
+        same_size("Polytope.A has a number of rows of", "Polytope.b has length", (len(A), len(b)))
+        if is_concrete(A) and not np.all(np.any(np.asarray(A) != 0, axis=1)):
+            row = int(np.argmin(np.any(np.asarray(A) != 0, axis=1)))
+            raise ValueError(f"row {row} of Polytope.A is zero: it is no facet")
+
+    @property
+    def dimension(self) -> int:
+        """The number of coordinates."""
+        return self.A.shape[1]
+
+    @property
+    def facets(self) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
+        """`(A, b)`."""
+        return self.A, self.b
+
+    def _host(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.asarray(self.A, dtype=float), np.asarray(self.b, dtype=float)
+
+    def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
+        """Upper bounds of `max a . x`, exact to rounding (rebuilt from dual multipliers).
+
+        Raises:
+            ValueError: the polytope is empty or unbounded.
+        """
+        return jnp.asarray(polyhedra.support(*self._host(), np.asarray(directions, dtype=float)))
+
+    def bounding_box(self) -> Box:
+        """The smallest box around the polytope.
+
+        Raises:
+            ValueError: the polytope is empty or unbounded.
+        """
+        lower, upper = polyhedra.bounding_box(*self._host())
+        return Box(lower, upper)
+
+    def vertices(self) -> Float[Array, "v n"]:
+        """The corners, in any dimension, flat polytopes included (Qhull).
+
+        Raises:
+            ValueError: the polytope is empty or unbounded.
+        """
+        return jnp.asarray(polyhedra.vertices(*self._host()))
+
+    def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
+        """Points drawn uniformly, by a triangulation of the corners."""
+        seed = np.asarray(jax.random.bits(key, (4,), dtype=jnp.uint32))
+        rng = np.random.default_rng(seed.tolist())
+        return jnp.asarray(polyhedra.uniform(*self._host(), rng, count))
+
+    def volume(self) -> float:
+        """The `n`-dimensional volume; zero for a flat polytope (Qhull)."""
+        return polyhedra.volume(*self._host())

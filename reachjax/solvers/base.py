@@ -1,0 +1,85 @@
+"""What a solver takes and gives back.
+
+Whatever the status, a solution is only a proposal: bounds come from `recheck`. A solver that fails
+proposes zero multipliers, which prove the interval bound and no more.
+"""
+
+from __future__ import annotations
+
+import abc
+import enum
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from reachjax.lmi import Program
+
+
+class SolverStatus(enum.IntEnum):
+    """How a solver ended. "Almost solved" is not solved, and "solved" is not proof."""
+
+    SOLVED = 0
+    INACCURATE = 1
+    INFEASIBLE = 2
+    UNBOUNDED = 3
+    LIMIT = 4
+    FAILED = 5
+
+    @property
+    def advice(self) -> str:
+        """One sentence on what this means and what to do."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    SolverStatus.SOLVED: "solved to the tolerance asked for",
+    SolverStatus.INACCURATE: "the tolerance was not reached: the bound is sound, perhaps loose; "
+    "ask for a looser tolerance or try another solver",
+    SolverStatus.INFEASIBLE: "reported infeasible, which a bounded set rules out: the data are "
+    "badly scaled for this solver; the interval bound was used",
+    SolverStatus.UNBOUNDED: "reported unbounded, which a non-empty set rules out: check that the "
+    "set is not empty; the interval bound was used",
+    SolverStatus.LIMIT: "stopped at the limit of iterations or time: the bound is sound, perhaps "
+    "loose; raise the limit",
+    SolverStatus.FAILED: "broke down without an answer: the interval bound was used; "
+    "try another solver or relaxation",
+}
+
+
+class Solution(NamedTuple):
+    """What a solver proposes for the facets of one program; arrays only.
+
+    Attributes:
+        offsets: `(f,)`, its own optimal values, NaN where it has none. Not bounds.
+        multipliers: `(f, K)`, zero where it has none.
+        moments: `(f, n, n)`, the dual matrices over the unscaled basis with corner 1, NaN where
+            it has none.
+        statuses: `(f,)`, values of `SolverStatus`.
+        seconds: `(f,)`, wall time of each facet.
+    """
+
+    offsets: Float[np.ndarray, " f"]
+    multipliers: Float[np.ndarray, "f K"]
+    moments: Float[np.ndarray, "f n n"]
+    statuses: Int[np.ndarray, " f"]
+    seconds: Float[np.ndarray, " f"]
+
+    @classmethod
+    def blank(cls, facets: int, multipliers: int, size: int) -> Solution:
+        """No proposal yet: zero multipliers, everything else missing."""
+        return cls(
+            offsets=np.full(facets, np.nan),
+            multipliers=np.zeros((facets, multipliers)),
+            moments=np.full((facets, size, size), np.nan),
+            statuses=np.full(facets, int(SolverStatus.FAILED)),
+            seconds=np.zeros(facets),
+        )
+
+
+class AbstractSolver(abc.ABC):
+    """Solves the programs of one step. Hashable and immutable: its options are its fields."""
+
+    @abc.abstractmethod
+    def solve(self, program: Program) -> Solution:
+        """Propose multipliers for every facet of a program whose leaves are numpy arrays."""

@@ -1,0 +1,78 @@
+"""The program as a solver should see it: nothing empty, nothing at rounding level, unit sizes.
+
+Columns that no row uses are dropped, so are rows whose coefficients are rounding noise (one of size
+1e-16 scaled up to 1 made a solver report "solved" for an offset below the true support). The
+generators that remain are scaled to unit norm.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from reachjax.lmi import Program
+
+NOISE = 16.0
+"""Rows no larger than this many times their own rounding error count as zero."""
+
+CHUNK = 256
+"""Pairs whose dense outer products are held in memory at once."""
+
+
+class CompactProgram(NamedTuple):
+    """`sum_k y_k G_k + p e' + e p' - 2 b e e' <= 0` with `|G_k| = 1`, in `n` used columns.
+
+    Attributes:
+        generators: sparse `(n * n, K')`, the flattened `G_k`.
+        objective: `(f, n)`.
+        free: `(K',)`, multipliers of either sign.
+        columns: `(n,)`, numbers of the columns kept.
+        kept: `(K',)`, numbers of the multipliers kept.
+        norms: `(K',)`: the program's multiplier is `y_k / norms_k`.
+    """
+
+    generators: sp.csc_array
+    objective: np.ndarray
+    free: np.ndarray
+    columns: np.ndarray
+    kept: np.ndarray
+    norms: np.ndarray
+
+
+def compact(program: Program) -> CompactProgram:
+    """Drop what is empty or noise, and bring the generators to unit norm."""
+    columns = np.flatnonzero(program.scale > 0)
+    facts = np.asarray(program.facts.mid)[:, columns]
+    noise = np.asarray(program.facts.rad)[:, columns]
+    size = np.linalg.norm(facts, axis=1)
+    solid = size > NOISE * np.linalg.norm(noise, axis=1)
+    facts = np.where(solid[:, None], facts, 0.0)
+    generators, norms = _generators(program, facts)
+    kept = np.flatnonzero(norms > 0)
+    unit_size = sp.diags_array(1 / norms[kept])
+    return CompactProgram(
+        generators=sp.csc_array(generators[:, kept] @ unit_size),
+        objective=np.asarray(program.objective.mid)[:, columns],
+        free=np.asarray(program.products.free)[kept],
+        columns=columns,
+        kept=kept,
+        norms=norms[kept],
+    )
+
+
+def _generators(program: Program, facts: np.ndarray) -> tuple[sp.csc_array, np.ndarray]:
+    """The flattened `sum sym(p' q)` of each multiplier's pairs `(n * n, K)`, and their norms."""
+    left, right = np.asarray(program.products.left), np.asarray(program.products.right)
+    owner = np.asarray(program.products.multiplier)
+    count, pairs, n = len(program.products.free), len(left), facts.shape[1]
+    blocks = []
+    for first in range(0, pairs, CHUNK):
+        here = slice(first, first + CHUNK)
+        outer = facts[left[here], :, None] * facts[right[here], None, :]
+        symmetric = (outer + outer.transpose(0, 2, 1)) / 2
+        blocks.append(sp.csr_array(symmetric.reshape(-1, n * n)))
+    sharing = sp.csr_array((np.ones(pairs), (owner, np.arange(pairs))), shape=(count, pairs))
+    generators = sp.csc_array((sharing @ sp.vstack(blocks, format="csr")).T)
+    return generators, np.sqrt(np.asarray(generators.multiply(generators).sum(axis=0)).ravel())

@@ -1,0 +1,208 @@
+"""Reach-avoid specifications, decided from a tube (the paper's equations (reach_avoid)).
+
+A verdict has three values. *Proved*: every state is surely where it must be, and the margins say by
+how much. *Refuted*: a simulated trajectory breaks the specification, and is given. *Unknown*: the
+sets are too large to prove it, and no trajectory breaks it; margins of both kinds say how far apart
+they are. Margins are distances in the units of the state.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Mapping, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.reach import ReachTube
+from reachjax.sets import PolyhedralSet, polyhedra
+
+AvoidSets = Sequence[PolyhedralSet] | Mapping[int, Sequence[PolyhedralSet]]
+
+ROUNDING = 1e-9
+"""A trajectory must break a requirement by more than this part of the state's size to refute it."""
+
+
+class VerdictStatus(enum.Enum):
+    """What is known of a specification."""
+
+    PROVED = "proved"
+    REFUTED = "refuted"
+    UNKNOWN = "unknown"
+
+
+@dataclasses.dataclass(frozen=True)
+class Counterexample:
+    """A simulated trajectory that breaks a specification.
+
+    Attributes:
+        requirement: which part it breaks: `goal`, `safe` or `avoid[i]`.
+        time: when.
+        violation: by how much, in the units of the state.
+        states: `(horizon + 1, n_x)`, the whole trajectory.
+        inputs: `(horizon, n_u)`.
+    """
+
+    requirement: str
+    time: int
+    violation: float
+    states: Float[np.ndarray, "h+1 n_x"]
+    inputs: Float[np.ndarray, "h n_u"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What is known of a specification, part by part.
+
+    Attributes:
+        status: proved, refuted or unknown.
+        margins: for each requirement `(horizon + 1,)`, the certified margin at each time; NaN where
+            nothing is required. Negative: not proved.
+        simulated: the same for the sampled trajectories. Negative: broken.
+        counterexample: the trajectory, when refuted.
+    """
+
+    status: VerdictStatus
+    margins: dict[str, Float[np.ndarray, " h+1"]]
+    simulated: dict[str, Float[np.ndarray, " h+1"]]
+    counterexample: Counterexample | None = None
+
+    def __bool__(self) -> bool:
+        raise TypeError("a verdict has three values: compare verdict.status with VerdictStatus")
+
+    def __str__(self) -> str:
+        lines = [self.status.name]
+        for name, margins in self.margins.items():
+            t = int(np.nanargmin(margins))
+            simulated = float(np.nanmin(self.simulated[name]))
+            lines.append(
+                f"  {name}: certified margin {margins[t]:+.4g} (smallest, at t = {t}), "
+                f"simulated margin {simulated:+.4g}"
+            )
+        if self.counterexample is not None:
+            e = self.counterexample
+            lines.append(
+                f"  counterexample: from {np.round(e.states[0], 4).tolist()} it breaks "
+                f"{e.requirement} at t = {e.time} by {e.violation:.4g}"
+            )
+        return "\n".join(lines)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Requirement:
+    """A set to be inside of, or to stay out of, at one time."""
+
+    name: str
+    time: int
+    region: PolyhedralSet
+    inside: bool
+
+    def certified(self, tube: ReachTube) -> float:
+        """How far every state surely is on the right side."""
+        reached = tube.sets[self.time]
+        C, d = (np.asarray(part) for part in self.region.facets)
+        if self.inside:
+            norms = np.linalg.norm(C, axis=1)
+            return float(np.min((d - np.asarray(reached.support(C))) / norms))
+        assert isinstance(reached, PolyhedralSet)
+        A, b = (np.asarray(part) for part in reached.facets)
+        return polyhedra.separation(A, b, C, d)
+
+    def simulated(self, trajectories: np.ndarray) -> np.ndarray:
+        """How far each trajectory `(c,)` is on the right side; negative on the wrong one."""
+        C, d = (np.asarray(part) for part in self.region.facets)
+        room = (d - trajectories[:, self.time] @ C.T) / np.linalg.norm(C, axis=1)
+        depth = room.min(axis=1)
+        return depth if self.inside else -depth
+
+    def proved(self, margin: float) -> bool:
+        """Sets are closed: touching is inside."""
+        return margin >= 0 if self.inside else margin > 0
+
+
+def verify(
+    tube: ReachTube,
+    goal: PolyhedralSet | None = None,
+    avoid: AvoidSets = (),
+    safe: PolyhedralSet | None = None,
+    *,
+    samples: int = 10_000,
+    seed: int = 0,
+) -> Verdict:
+    """Decide a reach-avoid specification from a tube.
+
+    Args:
+        tube: certified sets for `t = 0 .. horizon`.
+        goal: where every state must be at the horizon.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
+            time to a sequence.
+        safe: where every state must be at all times (its complement is avoided).
+        samples: how many trajectories are simulated in search of a counterexample, besides those
+            from corners and witnesses.
+        seed: of the samples.
+
+    Raises:
+        TypeError: a set is of a kind without facets.
+        ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
+
+    Source: equations (reach_avoid) and (reach_avoid_approx) of the paper.
+    """
+    requirements = _requirements(tube, goal, avoid, safe)
+    states = [tube.proof(t).witness_states for t in range(1, tube.horizon + 1)]
+    witnessed = tube.loop.simulate(jnp.concatenate(states), tube.horizon, tube.start)
+    trajectories = np.concatenate([witnessed, tube.simulate(samples, seed)])
+    margins: dict[str, np.ndarray] = {}
+    simulated: dict[str, np.ndarray] = {}
+    proved, worst = True, None
+    for item in requirements:
+        blank = np.full(tube.horizon + 1, np.nan)
+        margin, rooms = item.certified(tube), item.simulated(trajectories)
+        margins.setdefault(item.name, blank.copy())[item.time] = margin
+        simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min()
+        proved = proved and item.proved(margin)
+        size = 1.0 + abs(trajectories[:, item.time]).max()
+        if rooms.min() < -ROUNDING * size and (worst is None or rooms.min() < worst[0]):
+            worst = (float(rooms.min()), item, trajectories[rooms.argmin()])
+    if worst is not None:
+        example = _counterexample(tube, *worst)
+        return Verdict(VerdictStatus.REFUTED, margins, simulated, example)
+    status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
+    return Verdict(status, margins, simulated)
+
+
+def _counterexample(
+    tube: ReachTube, room: float, item: _Requirement, states: np.ndarray
+) -> Counterexample:
+    inputs = [tube.loop.input(jnp.asarray(x), tube.start + t) for t, x in enumerate(states[:-1])]
+    return Counterexample(item.name, item.time, -room, states, np.stack(inputs))
+
+
+def _requirements(
+    tube: ReachTube, goal: PolyhedralSet | None, avoid: AvoidSets, safe: PolyhedralSet | None
+) -> list[_Requirement]:
+    everywhere = range(tube.horizon + 1)
+    if isinstance(avoid, PolyhedralSet):
+        raise TypeError(
+            "avoid must be a sequence of sets or a mapping from times: write avoid=[...]"
+        )
+    timed = avoid if isinstance(avoid, Mapping) else dict.fromkeys(everywhere, avoid)
+    found = [_Requirement("goal", tube.horizon, goal, True)] if goal is not None else []
+    found += [_Requirement("safe", t, safe, True) for t in everywhere if safe is not None]
+    for t, regions in timed.items():
+        if t not in everywhere:
+            raise ValueError(f"avoid names time {t}, but the tube is for t = 0 .. {tube.horizon}")
+        found += [_Requirement(f"avoid[{i}]", t, A, False) for i, A in enumerate(regions)]
+    if not found:
+        raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")
+    for item in found:
+        if not isinstance(item.region, PolyhedralSet):
+            kind = type(item.region).__name__
+            raise TypeError(f"{item.name} must be a Box or a Polytope, but a {kind} arrived")
+        if item.region.dimension != tube.loop.states:
+            raise ValueError(
+                f"{item.name} has dimension {item.region.dimension}, "
+                f"but the loop has {tube.loop.states} states"
+            )
+    return found

@@ -1,0 +1,8 @@
+"""What is verified: activations, networks, plants and the loop they close."""
+
+from reachjax.systems.activations import AbstractActivation, ReLU
+from reachjax.systems.closed_loop import ClosedLoop
+from reachjax.systems.networks import MLP
+from reachjax.systems.plants import AffinePlant
+
+__all__ = ["MLP", "AbstractActivation", "AffinePlant", "ClosedLoop", "ReLU"]

@@ -1,0 +1,50 @@
+"""Simulated trajectories as lower bounds of what is reachable.
+
+A witness is an initial state whose trajectory attains a value of a direction: no sound offset can
+be smaller. Candidates are the corners of the initial set, points drawn from it, and whatever states
+the dual of a semidefinite program proposes.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.sets import AbstractSet, PolyhedralSet
+from reachjax.systems import ClosedLoop
+
+MOST_DIMENSIONS = 12
+"""Corners are listed up to this dimension (a box has 4096 of them there)."""
+
+
+def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[Array, "c n_x"]:
+    """Corners of a polyhedral set of few dimensions and `count` points drawn from it."""
+    drawn = X0.sample(jax.random.key(seed), count)
+    if isinstance(X0, PolyhedralSet) and X0.dimension <= MOST_DIMENSIONS:
+        return jnp.concatenate([X0.vertices(), drawn])
+    return drawn
+
+
+def proposed_states(X0: AbstractSet, moments: np.ndarray) -> Float[Array, "f n_x"]:
+    """The state columns of dual moment matrices, those that lie in the set."""
+    states = jnp.asarray(moments[:, : X0.dimension, -1])
+    return states[np.asarray(X0.contains(states))]
+
+
+def witnesses(
+    loop: ClosedLoop,
+    states: Float[Array, "c n_x"],
+    directions: Float[Array, "f n_x"],
+    horizon: int,
+    start: int = 0,
+) -> tuple[Float[np.ndarray, "h f"], Float[np.ndarray, "h f n_x"]]:
+    """The largest value of each direction at times `1 .. horizon`, and the initial states.
+
+    Returns:
+        Values `(horizon, f)` and initial states `(horizon, f, n_x)`.
+    """
+    trajectories = loop.simulate(states, horizon, start)[:, 1:]
+    values = np.asarray(trajectories @ directions.T)
+    return values.max(axis=0), np.asarray(states)[values.argmax(axis=0)]

@@ -15,6 +15,9 @@ from reachjax.pytrees import Replaceable, pytree
 from reachjax.recheck import interval_offsets, sound_offsets
 from reachjax.solvers import Solution, SolverStatus
 
+SHORTFALL = 1e-3
+"""A claim that its multipliers miss by more than this, relatively, is not the optimal value."""
+
 
 @pytree
 class Certificate(Replaceable):
@@ -53,7 +56,7 @@ class Certificate(Replaceable):
             moments=solution.moments,
             codes=solution.statuses,
             solver_offsets=solution.offsets,
-            bounds=_proved(program, solution.multipliers, solution.statuses),
+            bounds=_proved(program, solution.multipliers, solution.statuses, solution.offsets),
             witnesses=np.full(facets, np.nan),
             witness_states=np.full((facets, 0), np.nan),
             seconds=solution.seconds,
@@ -70,7 +73,7 @@ class Certificate(Replaceable):
         return self.bounds - self.witnesses
 
     def recheck(self) -> Float[np.ndarray, " f"]:
-        """Prove the offsets anew, from the program and the multipliers alone.
+        """Prove the offsets anew, from the program and the multipliers.
 
         Sound for any multipliers: negative ones are clipped where the sign matters, and what
         the matrix inequality misses is paid for. To recheck others:
@@ -79,14 +82,21 @@ class Certificate(Replaceable):
         Raises:
             ValueError: the multipliers contain NaN or infinity, or have another shape.
         """
-        return _proved(self.program, self.multipliers, self.codes)
+        return _proved(self.program, self.multipliers, self.codes, self.solver_offsets)
 
 
-def _proved(program: Program, multipliers: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """The rechecked offsets; where the solver did not solve, interval arithmetic if it is better.
+def _proved(
+    program: Program, multipliers: np.ndarray, codes: np.ndarray, claims: np.ndarray
+) -> np.ndarray:
+    """The rechecked offsets, never below what the relaxation itself gives.
 
-    Where it did, the offset stays that of the relaxation, even if intervals happen to be tighter.
+    The recheck knows that the basis is bounded, so it may prove less than the program's optimal
+    value. Where the solver has that value, the offset stays there: it means what the relaxation's
+    name says, and its derivative is the program's. Where the solver has none, or its multipliers
+    fall short of it, interval arithmetic is taken if it is better.
     """
     offsets = sound_offsets(program, multipliers)
-    unsolved = np.asarray(codes) != SolverStatus.SOLVED
-    return np.where(unsolved, np.minimum(offsets, interval_offsets(program)), offsets)
+    answered = np.isin(codes, (SolverStatus.SOLVED, SolverStatus.INACCURATE))
+    borne_out = offsets <= claims + SHORTFALL * (1 + abs(claims))  # False where the claim is NaN
+    relaxed, fallback = np.fmax(offsets, claims), np.fmin(offsets, interval_offsets(program))
+    return np.where(answered & borne_out, relaxed, fallback)

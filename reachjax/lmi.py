@@ -15,6 +15,7 @@ keeps multipliers of order one and bounds `|eta|^2` by the number of entries.
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.basis import Rows
@@ -75,7 +76,7 @@ def basis_box(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " n"], Floa
     )
 
 
-def weighted_products(program: Program, multipliers: Float[Array, " K"]) -> Ball:
+def weighted_products(program: Program, multipliers: Float[Array | np.ndarray, " K"]) -> Ball:
     """`F' Gamma F` `(n, n)` with a bound of its rounding error, for one facet's multipliers.
 
     Works on JAX arrays and on numpy arrays alike.

@@ -17,7 +17,7 @@ Everything here is numpy on the host.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from reachjax.lmi import Program, weighted_products
 from reachjax.rounding import UNIT, Ball, gamma
@@ -101,7 +101,10 @@ def _best_offset(matrix: np.ndarray) -> tuple[float, float]:
     def excess(shift: float) -> float:
         return float(np.sum((w / (shift - values)) ** 2) - len(v))
 
-    shift = brentq(excess, least, most) if excess(least) > 0 > excess(most) else least
+    if excess(least) > 0 > excess(most):
+        shift = root_scalar(excess, bracket=(least, most)).root
+    else:
+        shift = least
     return (s + float(np.sum(w**2 / (shift - values)))) / 2, float(shift)
 
 

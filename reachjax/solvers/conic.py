@@ -150,7 +150,11 @@ class Clarabel(_ConicSolver):
     time_limit: float = float("inf")
 
     def settings(self) -> tuple[str, dict[str, Any]]:
-        """Clarabel's own names; a stalled run still returns its last iterate, as inaccurate."""
+        """Clarabel's own names; a stalled run still returns its last iterate, as inaccurate.
+
+        Chordal decomposition stays off: with it, programs whose dual has no interior (dead neurons,
+        the paper's constraints without `lambda_ij`) stalled at two digits; without it, at nine.
+        """
         tight = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
         loose = ("reduced_tol_gap_abs", "reduced_tol_gap_rel", "reduced_tol_feas")
         return "CLARABEL", {
@@ -159,6 +163,7 @@ class Clarabel(_ConicSolver):
             "max_iter": self.max_iterations,
             "time_limit": self.time_limit,
             "accept_unknown": True,
+            "chordal_decomposition_enable": False,
         }
 
 

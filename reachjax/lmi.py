@@ -14,19 +14,24 @@ keeps multipliers of order one and bounds `|eta|^2` by the number of entries.
 
 from __future__ import annotations
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.basis import Rows
-from reachjax.bounds import LoopBounds
-from reachjax.pytrees import pytree
-from reachjax.relaxation import Products
+from reachjax.basis import Rows, columns, loop_rows
+from reachjax.bounds import LoopBounds, loop_bounds
+from reachjax.pytrees import Replaceable, pytree
+from reachjax.relaxation import AbstractRelaxation, FactLayout, Products
 from reachjax.rounding import Ball, gamma
+from reachjax.sets import AbstractSet, Box, Template
+from reachjax.systems import ClosedLoop
 
 
 @pytree
-class Program:
+class Program(Replaceable):
     """The semidefinite programs of one step: one for each facet, all but the objective shared.
 
     Attributes:
@@ -43,10 +48,6 @@ class Program:
     products: Products
     shift: Float[Array, " n"]
     scale: Float[Array, " n"]
-
-    def transformation(self) -> Float[Array, "n n"]:
-        """The matrix `T` of `xi = T eta`."""
-        return scaling(self.shift, self.scale)
 
 
 def scaling(shift: Float[Array, " n"], scale: Float[Array, " n"]) -> Float[Array, "n n"]:
@@ -91,3 +92,44 @@ def weighted_products(program: Program, multipliers: Float[Array | np.ndarray, "
     inherited = (size * dL).T @ (abs(R) + dR) + (size * abs(L)).T @ dR
     error = (rounding + inherited) * (1 + gamma(len(products.left) + 4))
     return Ball((half + half.T) / 2, (error + error.T) / 2)
+
+
+def step_program(
+    loop: ClosedLoop,
+    X: AbstractSet,
+    template: Template,
+    t: int,
+    relaxation: AbstractRelaxation,
+) -> Program:
+    """Theorem 1 for every facet of the successors of `X` at time `t`, over the scaled basis.
+
+    Compiled once for a loop's shape, a number of facets and a relaxation.
+    """
+    return _step_program(loop, X.facts(), X.bounding_box(), template.directions, t, relaxation)
+
+
+@partial(jax.jit, static_argnames="relaxation")
+def _step_program(
+    loop: ClosedLoop,
+    set_facts: Float[Array, "m n_x+1"],
+    box: Box,
+    directions: Float[Array, "f n_x"],
+    t: int,
+    relaxation: AbstractRelaxation,
+) -> Program:
+    n, k = loop.states, loop.units
+    size = n + k + 1
+    bounds = loop_bounds(loop, box, t)
+    rows = loop_rows(loop, columns(0, n, size), n, t, bounds, relaxation.remove_stable)
+    one = columns(size - 1, 1, size)
+    of_the_set = set_facts[:, :-1] @ rows.state + set_facts[:, -1]
+    facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts)
+    shift, scale = basis_box(bounds, relaxation.remove_stable)
+    T = scaling(shift, scale)
+    return Program(
+        facts=facts @ T,
+        objective=(directions @ rows.successor) @ T,
+        products=relaxation.products(FactLayout(len(set_facts), k)),
+        shift=shift,
+        scale=scale,
+    )

@@ -7,19 +7,16 @@ recheck. A tube repeats it, each set being the next one's set of states (equatio
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from reachjax.basis import columns, loop_rows
-from reachjax.bounds import loop_bounds
 from reachjax.certificates import Certificate
 from reachjax.checks import require_double_precision, same_size
-from reachjax.lmi import Program, basis_box, scaling
+from reachjax.lmi import step_program
 from reachjax.pytrees import Replaceable, pytree, static
-from reachjax.relaxation import AbstractRelaxation, FactLayout, LocalBounds
+from reachjax.relaxation import AbstractRelaxation, LocalBounds
 from reachjax.sets import AbstractSet, Box, Polytope, Template
 from reachjax.solvers import AbstractSolver, Clarabel
 from reachjax.systems import ClosedLoop
@@ -149,9 +146,7 @@ def reach(
     certificates: list[Certificate] = []
     steps = range(horizon)
     for k in steps if progress is None else progress(steps):
-        X = sets[-1]
-        program = _program(loop, X.facts(), X.bounding_box(), template, start + k, relaxation)
-        program = jax.device_get(program)
+        program = jax.device_get(step_program(loop, sets[-1], template, start + k, relaxation))
         certificates.append(Certificate.from_solution(program, solver.solve(program)))
         sets.append(template.polytope(jnp.asarray(certificates[-1].bounds)))
 
@@ -163,34 +158,6 @@ def reach(
         for k, certificate in enumerate(certificates)
     ]
     return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
-
-
-@partial(jax.jit, static_argnames="relaxation")
-def _program(
-    loop: ClosedLoop,
-    set_facts: Float[Array, "m n_x+1"],
-    box: Box,
-    template: Template,
-    t: int,
-    relaxation: AbstractRelaxation,
-) -> Program:
-    """Theorem 1 for every facet of one step, over the scaled basis `[x, z, 1]`."""
-    n, k = loop.states, loop.units
-    size = n + k + 1
-    bounds = loop_bounds(loop, box, t)
-    rows = loop_rows(loop, columns(0, n, size), n, t, bounds, relaxation.remove_stable)
-    one = columns(size - 1, 1, size)
-    of_the_set = set_facts[:, :-1] @ rows.state + set_facts[:, -1]
-    facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts)
-    shift, scale = basis_box(bounds, relaxation.remove_stable)
-    T = scaling(shift, scale)
-    return Program(
-        facts=facts @ T,
-        objective=(template.directions @ rows.successor) @ T,
-        products=relaxation.products(FactLayout(len(set_facts), k)),
-        shift=shift,
-        scale=scale,
-    )
 
 
 def _check(loop, X0, horizon, template, relaxation, window, solver, start) -> None:

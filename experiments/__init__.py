@@ -1,0 +1,1 @@
+"""Studies that a person can run: `python -m experiments.<name>`."""

@@ -1,0 +1,138 @@
+"""Claims about the linear programs and triangulations behind polytopes."""
+
+from fractions import Fraction
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+from reachjax.sets import polyhedra
+from tests.networks import box_region, simplex_region
+
+fractions = np.vectorize(Fraction, otypes=[object])
+
+
+def cube(lower, upper):
+    n = len(lower)
+    return np.vstack([-np.eye(n), np.eye(n)]), np.r_[-np.asarray(lower), upper]
+
+
+@pytest.fixture(params=[(n, kind) for n in (1, 2, 3, 6) for kind in ("box", "simplex")], ids=str)
+def region(request):
+    n, kind = request.param
+    return simplex_region(n, n) if kind == "simplex" else box_region(n, n, rotated=n > 1)
+
+
+def test_dual_multipliers_are_nonnegative_and_prove_the_support(region):
+    for a in np.random.default_rng(0).normal(size=(10, region.A.shape[1])):
+        y = polyhedra.dual_multipliers(region.A, region.b, a)
+        assert (y >= 0).all()
+        np.testing.assert_allclose(y @ region.A, a, atol=1e-12)
+        assert y @ region.b == pytest.approx((region.corners @ a).max(), abs=1e-10)
+
+
+def test_bounds_hold_for_the_exact_corners_of_a_long_thin_triangle():
+    # x <= 1, x + 1e6 y >= 0 and x - 1e6 y >= 0: corners (0, 0) and (1, -+1e-6), to rounding
+    A, b = np.array([[1.0, 0.0], [-1.0, -1e6], [-1.0, 1e6]]), np.array([1.0, 0.0, 0.0])
+    lower, upper = (fractions(part) for part in polyhedra.bounding_box(A, b))
+    tip = 1 / Fraction(1e6)
+    assert lower[0] <= 0
+    assert lower[1] <= -tip
+    assert upper[0] >= 1
+    assert upper[1] >= tip
+    assert max(-lower[0], upper[0] - 1, -tip - lower[1], upper[1] - tip) < 1e-8
+
+
+def test_bounds_pay_for_inexact_multipliers(monkeypatch):
+    A, b, inexact = *cube([-2, -1], [1, 3]), polyhedra.dual_multipliers
+    monkeypatch.setattr(
+        polyhedra, "dual_multipliers", lambda A, b, a: 0.99 * inexact(A, b, a) + 0.001
+    )
+    lower, upper = polyhedra.bounding_box(A, b)
+    assert (lower <= [-2, -1]).all()
+    assert (upper >= [1, 3]).all()
+    directions = np.array([[1.0, 1.0], [-1.0, 0.5]])
+    assert (polyhedra.support(A, b, directions) >= [4.0, 3.5]).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_the_largest_ball_in_a_cube_and_in_a_simplex(n):
+    center, radius = polyhedra.chebyshev(*cube([1.0] * n, [1.5] * n))
+    np.testing.assert_allclose(center, 1.25)
+    assert radius == pytest.approx(0.25)
+    A, b = np.vstack([-np.eye(n), np.ones((1, n))]), np.r_[np.zeros(n), 1.0]
+    assert polyhedra.chebyshev(A, b)[1] == pytest.approx(1 / (n + np.sqrt(n)))
+
+
+def test_the_largest_ball_of_an_unbounded_or_empty_polytope_is_refused():
+    with pytest.raises(ValueError, match="unbounded"):
+        polyhedra.chebyshev(np.array([[1.0, 0.0]]), np.array([1.0]))
+    with pytest.raises(ValueError, match="empty"):
+        polyhedra.chebyshev(np.array([[1.0], [-1.0]]), np.array([0.0, -1.0]))
+
+
+# Boxes around the origin against a box whose nearest facet is `gap` away: margins are known.
+@pytest.mark.parametrize("gap", [2.0, 0.25, 0.0, -0.5])
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_the_margin_of_two_boxes_is_the_gap_between_their_facets(n, gap):
+    A, b = cube([-1.0] * n, [1.0] * n)
+    C, d = cube([1.0 + gap, *[-3.0] * (n - 1)], [5.0 + gap, *[3.0] * (n - 1)])
+    margin = polyhedra.separation(A, b, C, d)
+    assert Fraction(margin) <= Fraction(gap)
+    assert margin == pytest.approx(gap, abs=1e-12)
+
+
+def test_the_margin_is_a_distance_along_normals_not_between_corners():
+    margin = polyhedra.separation(*cube([0, 0], [1, 1]), *cube([2, 2], [3, 3]))
+    assert margin == pytest.approx(1.0, abs=1e-12)
+    diagonal, offset = np.array([[-1.0, -1.0]]), np.array([-4.0])  # x + y >= 4
+    margin = polyhedra.separation(*cube([0, 0], [1, 1]), diagonal, offset)
+    assert margin == pytest.approx(np.sqrt(2), abs=1e-12)
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.7, 1.5, 4.0])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("n", [2, 3])
+def test_the_margin_is_that_of_a_convex_program(n, seed, distance):
+    rng = np.random.default_rng(seed)
+    first, second = simplex_region(n, seed), box_region(n, seed + 10, rotated=True)
+    away = rng.normal(size=n)
+    away = (
+        first.corners.mean(axis=0)
+        - second.corners.mean(axis=0)
+        + distance * away / np.linalg.norm(away)
+    )
+    scales = rng.uniform(0.1, 10.0, len(second.b))  # facet normals need not have unit length
+    C = second.A * scales[:, None]
+    d = (second.b + second.A @ away) * scales
+    x = cp.Variable(n)
+    excess = cp.max(cp.multiply(1 / np.linalg.norm(C, axis=1), C @ x - d))
+    expected = cp.Problem(cp.Minimize(excess), [first.A @ x <= first.b]).solve(solver="CLARABEL")
+    assert polyhedra.separation(first.A, first.b, C, d) == pytest.approx(expected, abs=1e-6)
+    assert distance not in (0.0, 4.0) or (expected > 0) == (distance == 4.0)
+
+
+def test_vertices_of_an_interval_come_in_order():
+    corners = polyhedra.vertices(np.array([[2.0], [-4.0]]), np.array([1.0, 4.0]))
+    np.testing.assert_allclose(corners, [[-1.0], [0.5]], rtol=1e-13)
+
+
+def test_samples_are_uniform_although_triangles_are_not_of_one_size():
+    # a rectangle of area 10 with a tip of area 0.5 at its left end
+    A = np.array([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 1.0], [-1.0, -1.0]])
+    b = np.array([0.5, 0.5, 10.0, 0.5, 0.5])
+    tip = 0.25
+    x = polyhedra.uniform(A, b, np.random.default_rng(0), 20_000)
+    assert (x @ A.T <= b + 1e-12).all()
+    # standard deviations of these estimates: 0.0011, 0.021 and 0.002
+    assert np.mean(x[:, 0] < 0) == pytest.approx(tip / (10 + tip), abs=0.005)
+    assert np.mean(x[:, 0]) == pytest.approx((10 * 5 - tip / 6) / (10 + tip), abs=0.1)
+    assert np.mean(x[:, 1]) == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize("n", [2, 3, 6])
+def test_samples_of_a_simplex_have_its_moments(n):
+    A, b = np.vstack([-np.eye(n), np.ones((1, n))]), np.r_[np.zeros(n), 1.0]
+    x = polyhedra.uniform(A, b, np.random.default_rng(0), 20_000)
+    np.testing.assert_allclose(x.mean(axis=0), 1 / (n + 1), atol=0.01)
+    np.testing.assert_allclose(x.var(axis=0), n / ((n + 1) ** 2 * (n + 2)), rtol=0.05)

@@ -1,0 +1,189 @@
+"""Solvers propose; what they propose is well formed, and every way of ending is mapped."""
+
+import jax
+import numpy as np
+import pytest
+from scipy.linalg import eigvalsh
+
+import reachjax as rj
+from reachjax.lmi import scaling, step_program
+from reachjax.recheck import interval_offsets
+from reachjax.solvers.compact import compact
+from reachjax.solvers.conic import STATUSES
+from tests.loops import closed_loop, random_loop
+from tests.networks import box_region, directions, simulate
+
+SOLVERS = {
+    "Clarabel": rj.Clarabel(),
+    "SCS": rj.SCS(),
+    "by name": rj.CvxpySolver("CLARABEL", {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9}),
+}
+
+
+@pytest.fixture(scope="module")
+def setting():
+    """(loop arrays, set, program) of a loop with three states."""
+    data, region = random_loop(3, seed=5), box_region(3, seed=5)
+    X, template = rj.Polytope(region.A, region.b), rj.Template(directions(3, extra=1))
+    program = step_program(closed_loop(data), X, template, 0, rj.LocalBounds())
+    return data, region, jax.device_get(program)
+
+
+@pytest.fixture(scope="module", params=SOLVERS.values(), ids=SOLVERS.keys())
+def solution(request, setting):
+    return request.param.solve(setting[2])
+
+
+def test_solvers_agree(setting, solution):
+    reference = rj.Clarabel().solve(setting[2])
+    # SCS stops at 1e-7 of feasibility, which leaves some 1e-5 in the value
+    np.testing.assert_allclose(solution.offsets, reference.offsets, atol=2e-5)
+
+
+def test_moments_are_semidefinite_with_corner_one_and_satisfy_facts_and_complementarity(
+    setting, solution
+):
+    program = setting[2]
+    unscale = np.linalg.pinv(np.asarray(scaling(program.shift, program.scale)))
+    products = program.products
+    for moment in solution.moments:
+        X = unscale @ moment @ unscale.T
+        assert X[-1, -1] == pytest.approx(1.0, abs=1e-12)
+        assert eigvalsh(X)[0] >= -1e-6
+        values = np.einsum(
+            "pi,ij,pj->p", program.facts.mid[products.left], X, program.facts.mid[products.right]
+        )
+        sums = np.bincount(products.multiplier, values, len(products.free))
+        assert abs(sums[products.free]).max() <= 1e-4
+        assert sums[~products.free].min() >= -1e-4
+
+
+def test_the_moment_attains_the_offset(setting, solution):
+    program = setting[2]
+    unscale = np.linalg.pinv(np.asarray(scaling(program.shift, program.scale)))
+    states = np.array([(unscale @ X @ unscale.T)[:, -1] for X in solution.moments])
+    attained = np.einsum("fi,fi->f", program.objective.mid, states)
+    np.testing.assert_allclose(attained, solution.offsets, atol=1e-4)
+
+
+def test_signed_multipliers_are_nonnegative_to_tolerance(setting, solution):
+    signed = solution.multipliers[:, ~setting[2].products.free]
+    assert signed.min() >= -1e-6
+
+
+LIMITED = {
+    "iteration limit": (rj.Clarabel(max_iterations=2), {rj.SolverStatus.LIMIT}),
+    "time limit": (rj.Clarabel(time_limit=1e-9), {rj.SolverStatus.LIMIT}),
+    "SCS stopped early": (
+        rj.SCS(max_iterations=3),
+        {rj.SolverStatus.LIMIT, rj.SolverStatus.INACCURATE},
+    ),
+    "crude tolerance": (rj.Clarabel(tolerance=1e-1), {rj.SolverStatus.SOLVED}),
+}
+
+
+@pytest.mark.parametrize(("solver", "expected"), LIMITED.values(), ids=LIMITED.keys())
+def test_bounds_are_sound_when_the_solver_is_stopped_early(setting, solver, expected):
+    data, region, _ = setting
+    X = rj.Polytope(region.A, region.b)
+    following, certificate = rj.reach_step(
+        closed_loop(data), X, rj.Template(directions(3, extra=1)), solver=solver
+    )
+    assert set(certificate.statuses) <= expected
+    states = np.vstack([region.corners, region.sample(20_000, seed=0)])
+    assert np.all(following.contains(simulate(data, states, 1)[1]))
+    assert np.all(certificate.gaps >= 0)
+
+
+@pytest.mark.parametrize("word", sorted(STATUSES))
+def test_bounds_are_sound_under_every_status_that_cvxpy_has(setting, monkeypatch, word):
+    """Whatever cvxpy says, with values of any kind or none, the bound holds."""
+    import cvxpy as cp
+
+    data, region, program = setting
+    rng = np.random.default_rng(0)
+
+    def solve(problem, **_):
+        if word == "solver_error":
+            raise cp.SolverError("broken")
+        problem._status = word
+        for variable in problem.variables():
+            value = rng.normal(size=variable.shape)
+            variable.save_value(None if "feasible" in word else value)
+
+    monkeypatch.setattr(cp.Problem, "solve", solve)
+    solution = rj.Clarabel().solve(program)
+    assert set(solution.statuses) == {STATUSES[word]}
+    certificate = rj.Certificate.from_solution(program, solution)
+    states = np.vstack([region.corners, region.sample(20_000, seed=0)])
+    attained = (simulate(data, states, 1)[1] @ directions(3, extra=1).T).max(axis=0)
+    assert np.all(certificate.bounds >= attained)
+    assert all(status.advice for status in certificate.statuses)
+    if word == "solver_error" or "feasible" in word:
+        np.testing.assert_array_equal(certificate.bounds, interval_offsets(program))
+        assert np.isnan(solution.offsets).all()
+        assert np.isnan(solution.moments).all()
+
+
+def test_every_status_of_cvxpy_is_mapped():
+    import cvxpy.settings as s
+
+    words = {
+        getattr(s, name)
+        for name in (
+            "OPTIMAL",
+            "OPTIMAL_INACCURATE",
+            "INFEASIBLE",
+            "INFEASIBLE_INACCURATE",
+            "UNBOUNDED",
+            "UNBOUNDED_INACCURATE",
+            "INFEASIBLE_OR_UNBOUNDED",
+            "USER_LIMIT",
+            "SOLVER_ERROR",
+        )
+    }
+    assert words == set(STATUSES)
+
+
+def test_rows_at_rounding_level_and_empty_columns_do_not_reach_the_solver(setting):
+    program = setting[2]
+    noisy = program.facts.mid.copy()
+    noisy[5] = 1e-17 * np.sign(noisy[5] + 0.5)
+    noise = program.facts.rad.copy()
+    noise[5] = 1e-17
+    reduced = compact(program.replace(facts=type(program.facts)(noisy, noise)))
+    touched = (program.products.left == 5) | (program.products.right == 5)
+    gone = set(range(len(program.products.free))) - set(reduced.kept.tolist())
+    alone = {
+        k
+        for k in program.products.multiplier[touched]
+        if np.all(touched[program.products.multiplier == k])
+    }
+    assert alone
+    assert alone <= gone
+    np.testing.assert_array_equal(reduced.columns, np.flatnonzero(program.scale > 0))
+    sizes = np.sqrt(reduced.generators.multiply(reduced.generators).sum(axis=0))
+    np.testing.assert_allclose(sizes, 1.0)
+
+
+def test_the_model_is_built_once_for_all_facets(setting, monkeypatch):
+    import reachjax.solvers.conic as conic
+
+    built = []
+    original = conic._Model.__init__
+
+    def counted(self, program):
+        built.append(program)
+        original(self, program)
+
+    monkeypatch.setattr(conic._Model, "__init__", counted)
+    rj.Clarabel().solve(setting[2])
+    assert len(built) == 1
+
+
+def test_a_facet_does_not_depend_on_the_facets_solved_before_it(setting):
+    program = setting[2]
+    order = np.arange(len(program.objective.mid))[::-1]
+    turned = program.replace(objective=program.objective[order])
+    forward, backward = rj.Clarabel().solve(program), rj.Clarabel().solve(turned)
+    np.testing.assert_allclose(forward.offsets, backward.offsets[order], atol=1e-12)

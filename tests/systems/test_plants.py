@@ -1,0 +1,46 @@
+"""Claims about affine plants: any of the three arrays may vary in time."""
+
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from tests.networks import plant
+
+STEPS = 4
+
+
+@pytest.mark.parametrize("varying", list(product([False, True], repeat=3)), ids=str)
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_each_array_may_vary_in_time_on_its_own(n, varying):
+    constant, moving = plant(n, 2, seed=n), plant(n, 2, seed=n, steps=STEPS)
+    arrays = [moving[i] if v else constant[i] for i, v in enumerate(varying)]
+    system = rj.AffinePlant(*arrays)
+    assert (system.states, system.inputs) == (n, 2)
+    assert system.steps == (STEPS if any(varying) else None)
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=n), rng.normal(size=2)
+    successor = jax.jit(system.propagate)
+    for t in range(STEPS):
+        A, B, c = (a[t] if v else a for a, v in zip(arrays, varying, strict=True))
+        np.testing.assert_array_equal(system.at(t)[0], A)
+        np.testing.assert_array_equal(system.at(t)[1], B)
+        np.testing.assert_array_equal(system.at(t)[2], c)
+        expected = A @ x + B @ u + c
+        np.testing.assert_allclose(system.propagate(x, u, t), expected, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(successor(x, u, t), expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("lead", [(), (STEPS,)], ids=["LTI", "LTV"])
+def test_the_offset_is_zero_when_left_out(lead):
+    system = rj.AffinePlant(np.ones((*lead, 3, 3)), np.ones((*lead, 3, 1)))
+    np.testing.assert_array_equal(system.c, np.zeros(3))
+    np.testing.assert_allclose(system.propagate(jnp.ones(3), jnp.ones(1), 1), 4.0)
+
+
+def test_integers_become_floats():
+    system = rj.AffinePlant([[1, 1], [0, 1]], [[0], [1]], [2, 0])
+    assert {a.dtype for a in jax.tree.leaves(system)} == {jnp.dtype("float64")}

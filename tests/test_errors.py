@@ -1,0 +1,172 @@
+"""Bad input, each with its own error: it names the argument, what was expected and what arrived."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from tests.networks import he_network
+
+NAN, INF = float("nan"), float("inf")
+NET = rj.MLP.from_layers(he_network((2, 3, 1), seed=0))
+PLANT = rj.AffinePlant(0.5 * np.eye(2), np.ones((2, 1)))
+LOOP = rj.ClosedLoop(PLANT, NET, rj.Box([-1.0], [1.0]))
+LTV = LOOP.replace(plant=rj.AffinePlant(np.stack([np.eye(2)] * 3), np.ones((2, 1))))
+X0, TEMPLATE, LINE = rj.Box([0.0, 0.0], [0.1, 0.1]), rj.Template.box(2), rj.Box([0.0], [1.0])
+STRIP = rj.Polytope([[1, 0], [-1, 0]], [1, 1])
+EMPTY = rj.Polytope([[1, 0], [-1, 0], [0, 1], [0, -1]], [0, -1, 1, 1])
+FOUR_TIMES = rj.Box(-np.ones((4, 1)), np.ones((4, 1)))
+EYE, ONES = np.eye(2), np.ones((2, 1))
+
+
+def layers(*shapes):
+    return rj.MLP.from_layers([(np.ones(shape), np.zeros(shape[0])) for shape in shapes])
+
+
+def layer(W, b):
+    return rj.MLP.from_layers([(W, b)])
+
+
+def reach(**changes):
+    arguments = {"loop": LOOP, "X0": X0, "horizon": 1, "template": TEMPLATE}
+    return rj.reach(**(arguments | changes))
+
+
+# What the message must say, and the call that must say it.
+BAD_VALUES = {
+    r"Box\.lower must be finite, but entry \(1,\) is nan": lambda: rj.Box([0, NAN], [1, 1]),
+    r"Box\.upper must be finite, but entry \(1,\) is inf": lambda: rj.Box([0, 0], [1, INF]),
+    r"at \(1,\) lower is 2.0 and upper 1.0: the box is empty": lambda: rj.Box([0, 2], [1, 1]),
+    r"lower must not exceed .*at \(1, 0\) lower is 2": lambda: rj.Box([[0], [2]], [[1], [1]]),
+    r"one shape, but \(2,\) and \(3,\) arrived": lambda: rj.Box([0, 0], [1, 1, 1]),
+    r"Box\.lower must .*\(n,\) or \(time, n\), but one of shape \(\)": lambda: rj.Box(0.0, 1.0),
+    r"Polytope\.A must be finite, .*\(0, 0\)": lambda: rj.Polytope([[NAN, 0]], [1]),
+    r"Polytope\.b has length 3, but .* rows of 2": lambda: rj.Polytope(EYE, [1, 1, 1]),
+    r"row 1 of Polytope\.A is zero": lambda: rj.Polytope([[1, 0], [0, 0]], [1, 1]),
+    r"Polytope\.A must .*\(m, n\), but one of shape \(2,\)": lambda: rj.Polytope([1, 0], [1]),
+    r"Template\.directions must be finite": lambda: rj.Template([[INF, 0], [0, 1]]),
+    r"directions do not bound a set: row 0 .* zero": lambda: rj.Template([[0, 0], [0, 1]]),
+    r"layers\[1\] takes 3 .*layers\[0\] has 4 outputs": lambda: layers((4, 2), (1, 3)),
+    r"W of MLP\.layers\[0\] has 2 rows.* length 4": lambda: layer(np.ones((2, 4)), np.ones(4)),
+    r"b of MLP\.layers\[0\] must .*\(outputs,\).*\(2, 1\)": lambda: layer(EYE, ONES),
+    r"W of MLP\.layers\[0\] must be finite": lambda: layer(np.full((1, 2), NAN), np.ones(1)),
+    r"MLP\.layers must hold at least one pair": lambda: rj.MLP.from_layers([]),
+    r"AffinePlant\.A must have 3 rows.*\(2, 3\)": lambda: rj.AffinePlant(np.ones((2, 3)), ONES),
+    r"AffinePlant\.B must have 2 rows.*\(3, 1\)": lambda: rj.AffinePlant(EYE, np.ones((3, 1))),
+    r"AffinePlant\.B must .*\(n_x, n_u\).*\(2,\)": lambda: rj.AffinePlant(EYE, [1, 1]),
+    r"AffinePlant\.c must have 2 rows.*\(1,\)": lambda: rj.AffinePlant(EYE, ONES, [1]),
+    r"time axes .*'A': 3, 'B': 4": lambda: rj.AffinePlant(np.ones((3, 2, 2)), np.ones((4, 2, 1))),
+    "inputs is 3, but the plant's number of states is 2": lambda: rj.ClosedLoop(
+        PLANT, layers((1, 3))
+    ),
+    "outputs is 2, but the plant's number of inputs is 1": lambda: rj.ClosedLoop(
+        PLANT, layers((2, 2))
+    ),
+    "input_box is 2, but the plant's number of inputs is 1": lambda: LOOP.replace(input_box=X0),
+    "input_box is 4, but .* time steps is 3": lambda: LTV.replace(input_box=FOUR_TIMES),
+    "x0 is 3, but .* states is 2": lambda: LOOP.simulate(jnp.ones((5, 3)), 1),
+    r"x0 must be finite, but entry \(1,\) is nan": lambda: LOOP.simulate([0.0, NAN], 1),
+    r"X0 must be one box, .* \(1, 2\)": lambda: reach(X0=rj.Box([[0, 0]], [[1, 1]])),
+    "X0 is 1, but the loop's number of states is 2": lambda: reach(X0=LINE),
+    "unbounded in direction": lambda: reach(X0=STRIP),
+    "empty: no point satisfies": lambda: reach(X0=EMPTY),
+    "template is 3, but .* states is 2": lambda: reach(template=rj.Template.box(3)),
+    "'MOSCOW' is not among .*CLARABEL": lambda: reach(solver=rj.CvxpySolver("MOSCOW")),
+    "window must be 1 .*, but 0 arrived": lambda: reach(window=0),
+    "window must be 1 .*, but 2 arrived": lambda: reach(window=2),
+    "3 time steps, but steps 0 to 4 were": lambda: reach(loop=LTV, horizon=4),
+    "3 time steps, but steps 2 to 4 were": lambda: reach(loop=LTV, horizon=2, start=2),
+    "3 time steps, but steps 3 to 4 were": lambda: rj.change_of_basis(LTV, t=3),
+}
+
+BAD_TYPES = {
+    r"Box\.lower must be an array .* a str arrived": lambda: rj.Box("low", "high"),
+    r"MLP\.layers\[0\] must be a pair .* ndarray": lambda: rj.MLP.from_layers([np.ones((3, 1))]),
+    r"MLP\.layers must be pairs .*ArrayImpl": lambda: rj.MLP.from_layers(jnp.ones((2, 2))),
+    r"MLP\.activation must .*class.*ReLU'": lambda: NET.replace(activation=rj.ReLU),
+    r"MLP\.activation must be an activation obj": lambda: NET.replace(activation=jax.nn.relu),
+    r"ClosedLoop\.plant must be .* a MLP arrived": lambda: rj.ClosedLoop(NET, PLANT),
+    r"ClosedLoop\.input_box must .* a tuple": lambda: rj.ClosedLoop(PLANT, NET, (-1, 1)),
+    r"X0 must be .*\[\[0, 0\], \[1, 1\]\]": lambda: reach(X0=[[0, 0], [1, 1]]),
+    "loop must be a ClosedLoop": lambda: reach(loop=NET),
+    "template must be a Template": lambda: reach(template=TEMPLATE.directions),
+    "relaxation must .*not a class.*LocalBounds": lambda: reach(relaxation=rj.LocalBounds),
+    "solver must .*not a class.*Clarabel": lambda: reach(solver=rj.Clarabel),
+    "solver must .*'SCS' arrived": lambda: reach(solver="SCS"),
+    # misspelt options
+    "tolerence": lambda: rj.Clarabel(tolerence=1e-8),
+    "max_iter'": lambda: rj.SCS(max_iter=9),
+    "repeat'": lambda: rj.PaperQC(repeat=True),
+    "stable'": lambda: rj.LocalBounds(stable=True),
+    "relaxtion": lambda: reach(relaxtion=rj.PaperQC()),
+    "inputbox": lambda: LOOP.replace(inputbox=X0),
+}
+
+
+@pytest.mark.parametrize(("message", "call"), BAD_VALUES.items(), ids=BAD_VALUES)
+def test_bad_values_are_named_and_counted(message, call):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+@pytest.mark.parametrize(("message", "call"), BAD_TYPES.items(), ids=BAD_TYPES)
+def test_wrong_kinds_and_misspelt_options_are_named(message, call):
+    with pytest.raises(TypeError, match=message):
+        call()
+
+
+@pytest.mark.parametrize("horizon", [0, -1, True, 2.0, "2", None])
+@pytest.mark.parametrize("call", [reach, lambda horizon: LOOP.simulate(jnp.zeros(2), horizon)])
+def test_a_horizon_is_a_positive_integer(call, horizon):
+    with pytest.raises(ValueError, match=f"positive integer, but {horizon!r} arrived"):
+        call(horizon=horizon)
+
+
+@pytest.mark.parametrize("call", [reach, lambda: rj.change_of_basis(LOOP)], ids=["reach", "basis"])
+def test_without_64_bit_floats_the_error_says_how_to_turn_them_on(call):
+    with jax.enable_x64(False), pytest.raises(RuntimeError, match="jax_enable_x64"):
+        call()
+
+
+@pytest.mark.parametrize("name", ["loop", "X0", "template"])
+def test_what_was_built_from_32_bit_floats_is_named(name):
+    built = {"loop": LOOP, "X0": X0, "template": TEMPLATE}[name]
+    leftover = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), built)
+    with pytest.raises(RuntimeError, match=f"{name} holds float32, but float64 is needed"):
+        reach(**{name: leftover})
+
+
+@pytest.fixture(scope="module")
+def tube():
+    return reach(horizon=2, samples=10)
+
+
+@pytest.mark.parametrize(
+    ("required", "error", "message"),
+    [
+        ({}, ValueError, "nothing to verify: give a goal, avoid sets or a safe set"),
+        ({"avoid": []}, ValueError, "nothing to verify"),
+        ({"avoid": STRIP}, TypeError, r"write avoid=\[...\]"),
+        ({"goal": [0, 1]}, TypeError, "goal must be a Box or a Polytope, but a list arrived"),
+        ({"goal": LINE}, ValueError, "goal has dimension 1, but the loop has 2 states"),
+        ({"safe": LINE}, ValueError, "safe has dimension 1, but the loop has 2 states"),
+        ({"avoid": [X0, LINE]}, ValueError, r"avoid\[1\] has dimension 1, but the loop has 2"),
+        ({"avoid": {3: [X0]}}, ValueError, "avoid names time 3, but the tube is for t = 0 .. 2"),
+        ({"gaol": STRIP}, TypeError, "gaol"),
+    ],
+)
+def test_bad_specifications_are_named(tube, required, error, message):
+    with pytest.raises(error, match=message):
+        rj.verify(tube, **required)
+
+
+def test_a_verdict_is_not_a_truth_value(tube):
+    with pytest.raises(TypeError, match=r"three values: compare verdict\.status"):
+        bool(rj.verify(tube, goal=STRIP, samples=10))
+
+
+@pytest.mark.parametrize("t", [0, -1, 3])
+def test_certificates_are_for_the_steps_after_the_first_set(tube, t):
+    with pytest.raises(ValueError, match=rf"t = 1 .. 2, but {t} was asked for"):
+        tube.proof(t)

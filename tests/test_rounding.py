@@ -1,0 +1,158 @@
+"""Claims about midpoint-radius arithmetic: it encloses the exact result, and not by much.
+
+Exact results are computed with fractions. A ball `x` stands for every number within `x.rad` of
+`x.mid`, so the result must hold the exact midpoint plus all that the radii can add.
+"""
+
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from reachjax.rounding import UNIT, Ball
+
+fractions = np.vectorize(Fraction, otypes=[object])
+
+
+def random_data(seed, magnitude=1.0, rows=4, length=7):
+    """A matrix, two vectors and their radii; signs vary, so sums cancel in part."""
+    rng = np.random.default_rng(seed)
+    W, M = magnitude * rng.normal(size=(rows, length)), rng.normal(size=(length, rows))
+    x, y = rng.normal(size=(2, length))
+    return W, M, magnitude * x, magnitude * y, *(magnitude * rng.uniform(size=(2, length)))
+
+
+def mixed_data(seed):
+    """Entries from 1e-20 to 1e20 in one sum."""
+    W, M, x, y, dx, dy = random_data(seed)
+    spread = 10.0 ** np.random.default_rng(seed).uniform(-20, 20, size=x.shape)
+    return W, M, x * spread, y / spread, dx * spread * 1e-6, dy / spread * 1e-6
+
+
+def cancelling_data(seed):
+    """`W x` and `x + y` are at rounding level, though their terms are not."""
+    W, M, x, _, dx, dy = random_data(seed)
+    W[:, -1] = -(W[:, :-1] @ x[:-1]) / x[-1]
+    M[-1] = -(x[:-1] @ M[:-1]) / x[-1]
+    return W, M, x, -x * (1 + 3 * UNIT), 1e-17 * dx, 1e-17 * dy
+
+
+DATA = {
+    "of order one": random_data(0),
+    "large": random_data(1, magnitude=1e90),
+    "small": random_data(2, magnitude=1e-90),
+    "of mixed magnitude": mixed_data(3),
+    "cancelling": cancelling_data(4),
+    "one term": random_data(5, length=1),
+    "many terms": random_data(6, rows=2, length=300),
+}
+
+# (operation, what it does to radii, sizes of what is rounded)
+OPERATIONS = {
+    "matrix @ ball": (
+        lambda W, M, x, y: W @ x,
+        lambda W, M, dx, dy: abs(W) @ dx,
+        lambda W, M, x, y: abs(W) @ abs(x),
+    ),
+    "ball @ matrix": (
+        lambda W, M, x, y: x @ M,
+        lambda W, M, dx, dy: dx @ abs(M),
+        lambda W, M, x, y: abs(x) @ abs(M),
+    ),
+    "ball + ball": (
+        lambda W, M, x, y: x + y,
+        lambda W, M, dx, dy: dx + dy,
+        lambda W, M, x, y: abs(x + y),
+    ),
+    "ball - ball": (
+        lambda W, M, x, y: x - y,
+        lambda W, M, dx, dy: dx + dy,
+        lambda W, M, x, y: abs(x - y),
+    ),
+    "array + ball": (
+        lambda W, M, x, y: W[0] + x,
+        lambda W, M, dx, dy: dx,
+        lambda W, M, x, y: abs(W[0] + x),
+    ),
+    "array - ball": (
+        lambda W, M, x, y: W[0] - x,
+        lambda W, M, dx, dy: dx,
+        lambda W, M, x, y: abs(W[0] - x),
+    ),
+    "ball - array": (
+        lambda W, M, x, y: x - W[0],
+        lambda W, M, dx, dy: dx,
+        lambda W, M, x, y: abs(x - W[0]),
+    ),
+    "matrix @ ball @ matrix": (
+        lambda W, M, x, y: W @ x @ W,
+        lambda W, M, dx, dy: abs(W) @ dx @ abs(W),
+        lambda W, M, x, y: abs(W) @ abs(x) @ abs(W),
+    ),
+}
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("numpy_like", [np, jnp], ids=["numpy", "jax"])
+@pytest.mark.parametrize("operation", OPERATIONS.values(), ids=OPERATIONS.keys())
+@pytest.mark.parametrize("data", DATA.values(), ids=DATA.keys())
+def test_the_exact_result_is_enclosed_by_a_small_radius(data, operation, numpy_like, compiled):
+    compute, widen, size = operation
+    W, M, x, y, dx, dy = data
+    arrays = [numpy_like.asarray(part) for part in (W, M)]
+    balls = [Ball(numpy_like.asarray(m), numpy_like.asarray(r)) for m, r in ((x, dx), (y, dy))]
+    ball = (jax.jit(compute) if compiled else compute)(*arrays, *balls)
+
+    exact = [fractions(part) for part in data]
+    distance = abs(fractions(ball.mid) - compute(*exact[:4])) + widen(*exact[:2], *exact[4:])
+    radius = fractions(ball.rad)
+    assert (distance <= radius).all()
+    rounding = size(*exact[:4]) + widen(*exact[:2], *exact[4:])
+    assert (radius <= distance + 4 * (len(x) + 30) * Fraction(UNIT) * rounding).all()
+
+
+@pytest.mark.parametrize("data", DATA.values(), ids=DATA.keys())
+def test_lower_and_upper_bound_the_whole_ball(data):
+    mid, rad = data[2], data[4]
+    ball = Ball(jnp.asarray(mid), jnp.asarray(rad))
+    below, above = fractions(mid) - fractions(rad), fractions(mid) + fractions(rad)
+    spare = Fraction(40 * UNIT) * (abs(fractions(mid)) + fractions(rad))
+    assert (below - spare <= fractions(ball.lower)).all()
+    assert (fractions(ball.lower) <= below).all()
+    assert (above <= fractions(ball.upper)).all()
+    assert (fractions(ball.upper) <= above + spare).all()
+
+
+@pytest.mark.parametrize("data", DATA.values(), ids=DATA.keys())
+def test_a_ball_between_two_bounds_holds_both_and_little_more(data):
+    lower, upper = np.minimum(data[2], data[3]), np.maximum(data[2], data[3])
+    ball = Ball.between(jnp.asarray(lower), jnp.asarray(upper))
+    mid, rad = fractions(ball.mid), fractions(ball.rad)
+    assert (mid - rad <= fractions(lower)).all()
+    assert (fractions(upper) <= mid + rad).all()
+    size = abs(fractions(lower)) + abs(fractions(upper))
+    half = (fractions(upper) - fractions(lower)) / 2
+    assert (rad <= half * (1 + Fraction(40 * UNIT)) + Fraction(2 * UNIT) * size).all()
+
+
+def test_a_ball_between_equal_bounds_is_that_number():
+    x = jnp.asarray(DATA["of mixed magnitude"][2])
+    ball = Ball.between(x, x)
+    np.testing.assert_array_equal(ball.mid, x)
+    np.testing.assert_array_equal(ball.rad, 0.0)
+
+
+def test_a_ball_minus_itself_keeps_its_width():
+    ball = Ball(jnp.array([1.0, -2.0]), jnp.array([0.5, 0.25]))
+    difference = ball - ball
+    np.testing.assert_array_equal(difference.mid, 0.0)
+    np.testing.assert_allclose(difference.rad, [1.0, 0.5], rtol=1e-14)
+
+
+def test_negation_and_indexing_keep_radii():
+    ball = Ball(jnp.array([1.0, -2.0, 3.0]), jnp.array([0.1, 0.2, 0.3]))
+    part = (-ball)[1:]
+    np.testing.assert_array_equal(part.mid, [2.0, -3.0])
+    np.testing.assert_array_equal(part.rad, [0.2, 0.3])

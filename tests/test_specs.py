@@ -1,0 +1,138 @@
+"""Verdicts: proved, refuted with a trajectory, or unknown, and never a bare truth value."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from tests.networks import he_network
+
+
+def contraction(n_x=2, input_box=None):
+    """`x+ = x / 2`: its sets are known exactly."""
+    A = np.eye(n_x) / 2
+    net = rj.MLP.from_layers([(np.zeros((1, n_x)), [0.0])])
+    return rj.ClosedLoop(rj.AffinePlant(A, np.zeros((n_x, 1))), net, input_box)
+
+
+@pytest.fixture(scope="module")
+def tube():
+    """From `[0.5, 1]^2` to `[1/8, 1/4]^2` in two steps."""
+    return rj.reach(contraction(), rj.Box([0.5, 0.5], [1, 1]), 2, rj.Template.octagonal(2))
+
+
+@pytest.fixture(scope="module")
+def loose():
+    """A tube whose sets are much larger than what is reached."""
+    layers = [(2 * W, b) for W, b in he_network((2, 8, 8, 1), seed=3)]
+    loop = rj.ClosedLoop(
+        rj.AffinePlant([[1.0, 0.5], [0.0, 1.0]], [[0.1], [0.5]]),
+        rj.MLP.from_layers(layers),
+        rj.Box([-1.0], [1.0]),
+    )
+    template = rj.Template.box(2)
+    return rj.reach(loop, rj.Box([-0.2, -0.2], [0.2, 0.2]), 3, template, rj.PaperQC(False))
+
+
+def half_space(a, b):
+    return rj.Polytope([a], [b])
+
+
+PROVED = {
+    "goal": ({"goal": rj.Box([0, 0], [0.3, 0.3])}, "goal", 2, 0.05),
+    "polytope goal": ({"goal": half_space([3.0, 4.0], 2.0)}, "goal", 2, 0.05),
+    "safe": ({"safe": rj.Box([0, 0], [1, 1])}, "safe", 0, 0.0),
+    "half-space avoided": ({"avoid": [half_space([1, 0], 0.1)]}, "avoid[0]", 2, 0.025),
+    "avoided early": ({"avoid": {0: [half_space([1, 0], 0.2)]}}, "avoid[0]", 0, 0.3),
+    "box avoided": ({"avoid": {1: [rj.Box([0.6, 0.0], [0.9, 1.0])]}}, "avoid[0]", 1, 0.1),
+}
+
+
+@pytest.mark.parametrize(("spec", "name", "t", "margin"), PROVED.values(), ids=PROVED.keys())
+def test_what_holds_is_proved_with_its_margin(tube, spec, name, t, margin):
+    verdict = rj.verify(tube, **spec)
+    assert verdict.status is rj.VerdictStatus.PROVED
+    assert verdict.counterexample is None
+    assert verdict.margins[name][t] == pytest.approx(margin, abs=1e-7)
+    assert np.nanmin(verdict.margins[name]) == verdict.margins[name][t]
+    assert np.all(np.nan_to_num(verdict.simulated[name] - verdict.margins[name]) >= -1e-12)
+
+
+REFUTED = {
+    "goal": ({"goal": rj.Box([0, 0], [0.2, 0.3])}, "goal", 2, 0.05),
+    "safe": ({"safe": rj.Box([0.2, 0.0], [1, 1])}, "safe", 2, 0.075),
+    "avoid": ({"avoid": {1: [half_space([-1, 0], -0.4)]}}, "avoid[0]", 1, 0.1),
+    "worst of several": (
+        {"goal": rj.Box([0, 0], [0.24, 0.3]), "safe": rj.Box([0, 0], [0.9, 2])},
+        "safe",
+        0,
+        0.1,
+    ),
+}
+
+
+@pytest.mark.parametrize(("spec", "name", "t", "violation"), REFUTED.values(), ids=REFUTED.keys())
+def test_what_fails_is_refuted_by_a_trajectory_of_the_loop(tube, spec, name, t, violation):
+    verdict = rj.verify(tube, **spec)
+    assert verdict.status is rj.VerdictStatus.REFUTED
+    example = verdict.counterexample
+    assert (example.requirement, example.time) == (name, t)
+    assert example.violation == pytest.approx(violation, abs=1e-9)
+    assert tube.sets[0].contains(example.states[0])
+    again = tube.loop.simulate(jnp.asarray(example.states[0]), tube.horizon)
+    np.testing.assert_array_equal(example.states, again)
+    for k, u in enumerate(example.inputs):
+        stepped = tube.loop.plant.propagate(example.states[k], u, k)
+        np.testing.assert_allclose(stepped, example.states[k + 1], rtol=1e-14)
+    assert "counterexample" in str(verdict)
+
+
+def test_what_neither_is_proved_nor_broken_is_unknown_with_both_margins(loose):
+    certified = np.asarray(loose.sets[3].support(np.array([[0.0, 1.0]])))[0]
+    reached = float(np.max(loose.simulate(10_000)[:, 3, 1]))
+    between = (certified + reached) / 2
+    assert reached < between - 0.01
+    assert between < certified - 0.01
+    verdict = rj.verify(loose, goal=half_space([0, 1], between))
+    assert verdict.status is rj.VerdictStatus.UNKNOWN
+    assert verdict.counterexample is None
+    assert verdict.margins["goal"][3] < 0 < verdict.simulated["goal"][3]
+    assert str(verdict).startswith("UNKNOWN")
+
+
+def test_touching_is_inside_a_closed_safe_set_but_not_outside_a_closed_avoid_set(tube):
+    edge = rj.Box([0.0, 0.0], [1.0, 1.0])  # the initial set touches its upper sides
+    assert rj.verify(tube, safe=edge).status is rj.VerdictStatus.PROVED
+    touched = {0: [half_space([-1, 0], -1.0)]}  # x_1 >= 1
+    assert rj.verify(tube, avoid=touched).status is rj.VerdictStatus.UNKNOWN
+
+
+def test_a_larger_goal_never_loses_a_proof(loose):
+    upper = float(np.asarray(loose.sets[3].support(np.eye(2)))[0])
+    order = [rj.verify(loose, goal=half_space([1, 0], upper + e)).status for e in (-1e-6, 1e-6)]
+    assert order[1] is rj.VerdictStatus.PROVED
+    assert order[0] is not rj.VerdictStatus.PROVED
+
+
+def test_the_safe_set_is_the_complement_of_its_outer_half_spaces(loose):
+    box = rj.Box([-2.0, -1.0], [2.0, 1.0])
+    A, b = box.facets
+    outside = [rj.Polytope([-a], [-float(limit)]) for a, limit in zip(A, b, strict=True)]
+    safe, avoid = rj.verify(loose, safe=box), rj.verify(loose, avoid=outside)
+    worst = np.min([avoid.margins[f"avoid[{i}]"] for i in range(4)], axis=0)
+    np.testing.assert_allclose(safe.margins["safe"], worst, atol=1e-9)
+
+
+def test_three_dimensions_and_a_narrow_avoid_set():
+    start = rj.Box(np.full(3, 0.5), np.ones(3))
+    tube = rj.reach(contraction(3), start, 2, rj.Template.box(3))
+    beside = rj.Polytope(np.vstack([np.eye(3), -np.eye(3)]), [0.1, 1, 1, 0, 0, 0])
+    inside = rj.Box(np.full(3, 0.2), np.full(3, 0.21))
+    assert rj.verify(tube, avoid={2: [beside]}).status is rj.VerdictStatus.PROVED
+    assert rj.verify(tube, avoid={2: [inside]}, samples=100).status is not rj.VerdictStatus.PROVED
+
+
+def test_a_verdict_is_no_truth_value(tube):
+    verdict = rj.verify(tube, safe=rj.Box([0, 0], [1, 1]))
+    with pytest.raises(TypeError, match=r"compare verdict\.status"):
+        bool(verdict)

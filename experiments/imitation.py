@@ -12,8 +12,6 @@ about it, when they do not.
 """
 
 import hashlib
-import json
-import os
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
@@ -22,12 +20,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import rich
 from flax import nnx
 from jaxtyping import Float
 from numpy import ndarray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from experiments import stored
 from experiments.mpc import LinearMPC
 
 # Candidate states are drawn, and training steps compiled, in blocks of these sizes. The file of
@@ -78,7 +76,7 @@ def sample_policy(
     settings = {f.name: np.asarray(getattr(mpc, f.name)).tolist() for f in fields(mpc)}
     settings |= {"seed": int(seed), "lower": lower.tolist(), "upper": upper.tolist()}
     nothing = {"states": np.empty((0, n)), "inputs": np.empty((0, m)), "block": 0}
-    kept = _load(path, settings) or nothing
+    kept = stored.load(path, settings) or nothing
     states, inputs, block = kept["states"], kept["inputs"], int(kept["block"])
     with _bar(progress) as bar:
         task = bar.add_task("sampling the MPC", total=count, completed=min(count, len(states)))
@@ -94,7 +92,7 @@ def sample_policy(
             states = np.vstack([states, draws[feasible]])
             inputs = np.vstack([inputs, decisions[feasible]])
             block += 1
-            _save(path, settings, states=states, inputs=inputs, block=block)
+            stored.save(path, settings, states=states, inputs=inputs, block=block)
             bar.update(task, completed=min(count, len(states)))
     return Samples(states[:count], inputs[:count])
 
@@ -135,7 +133,7 @@ def train_network(
         "restarts": restarts,
         "validation": validation,
     }
-    kept = None if retrain else _load(path, settings)
+    kept = None if retrain else stored.load(path, settings)
     if kept is not None:
         layers = [(kept[f"W{i}"], kept[f"b{i}"]) for i in range(len(hidden) + 1)]
         return _fit(layers, samples, split)
@@ -146,7 +144,7 @@ def train_network(
     best = min(fits, key=lambda fit: fit.validation_error)
     weights = {f"W{i}": W for i, (W, _) in enumerate(best.layers)}
     biases = {f"b{i}": b for i, (_, b) in enumerate(best.layers)}
-    _save(path, settings, **weights, **biases)
+    stored.save(path, settings, **weights, **biases)
     return best
 
 
@@ -204,31 +202,6 @@ def _train(x, u, hidden, seed, penalty, steps, learning_rate, restarts, progress
 def _fit(layers, samples, split) -> Fit:
     squares = np.sum((evaluate(layers, samples.states) - samples.inputs) ** 2, axis=1)
     return Fit(layers, float(squares[:split].mean() ** 0.5), float(squares[split:].mean() ** 0.5))
-
-
-def _load(path, settings):
-    """The arrays at `path` if `settings` made them, else None."""
-    if path is None or not Path(path).exists():
-        return None
-    with np.load(path) as file:
-        arrays = dict(file)
-    found = json.loads(str(arrays.pop("settings")))
-    if found == settings:
-        return arrays
-    changed = [name for name in settings | found if settings.get(name) != found.get(name)]
-    rich.print(f"{path} was made with other settings ({', '.join(changed)}): making it anew")
-    return None
-
-
-def _save(path, settings, **arrays):
-    """Write `path` whole or not at all: an interruption leaves the file that was there."""
-    if path is None:
-        return
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    unfinished = Path(f"{path}.unfinished")
-    with unfinished.open("wb") as file:
-        np.savez(file, settings=json.dumps(settings), **arrays)
-    os.replace(unfinished, path)
 
 
 def _bar(progress):

@@ -94,8 +94,11 @@ OPERATIONS = {
 }
 
 
-@pytest.mark.parametrize("compiled", [False, True])
-@pytest.mark.parametrize("numpy_like", [np, jnp], ids=["numpy", "jax"])
+@pytest.mark.parametrize(
+    ("numpy_like", "compiled"),
+    [(np, False), (jnp, False), (jnp, True)],
+    ids=["numpy", "jax", "compiled"],
+)
 @pytest.mark.parametrize("operation", OPERATIONS.values(), ids=OPERATIONS.keys())
 @pytest.mark.parametrize("data", DATA.values(), ids=DATA.keys())
 def test_the_exact_result_is_enclosed_by_a_small_radius(data, operation, numpy_like, compiled):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any
 
 import jax
@@ -40,7 +41,7 @@ class Numbers:
         except (TypeError, ValueError) as error:
             kind = type(value).__name__
             raise TypeError(f"{expected}, but a {kind} arrived: {error}") from None
-        if array.ndim not in self.ndims:
+        if array.ndim not in self.ndims or array.size == 0:
             raise ValueError(f"{expected}, but one of shape {array.shape} arrived")
         if is_concrete(array) and not np.isfinite(array).all():
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(np.asarray(array)))[0])
@@ -48,10 +49,34 @@ class Numbers:
         return array
 
 
+def whole_number(name: str, value: Any, least: int) -> int:
+    """`value` as an `int` of at least `least`.
+
+    Raises:
+        TypeError: it is no whole number.
+        ValueError: it is smaller.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be a whole number, but {value!r} arrived")
+    if number < least:
+        raise ValueError(f"{name} must be at least {least}, but {number} arrived")
+    return number
+
+
 def same_size(expected: str, arrived: str, sizes: tuple[int | None, int | None]) -> None:
     """Raise a `ValueError` built from both sides when the two sizes differ."""
     if sizes[0] != sizes[1]:
         raise ValueError(f"{arrived} {sizes[1]}, but {expected} {sizes[0]}")
+
+
+def within_time_axis(name: str, t: Any, steps: int) -> None:
+    """Raise a `ValueError` where a number `t` is beyond a time axis: JAX would clamp it."""
+    if isinstance(t, int | np.integer) and not 0 <= t < steps:
+        raise ValueError(f"{name} is given for times 0 .. {steps - 1}, but {t} was asked for")
 
 
 def require_double_precision(**arguments: Any) -> None:

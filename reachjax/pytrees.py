@@ -34,7 +34,8 @@ def pytree(cls: type[T]) -> type[T]:
     def convert_and_check(self) -> None:
         for field in dataclasses.fields(self):
             value, converter = getattr(self, field.name), field.metadata.get("converter")
-            if converter is not None and value is not None:
+            left_out = value is None and field.default is None
+            if converter is not None and not left_out:
                 name = f"{type(self).__name__}.{field.name}"
                 object.__setattr__(self, field.name, converter(value, name=name))
         check(self)

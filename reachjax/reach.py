@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.certificates import Certificate
-from reachjax.checks import require_double_precision, same_size
+from reachjax.checks import require_double_precision, same_size, whole_number
 from reachjax.lmi import step_program
 from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, LocalBounds
-from reachjax.sets import AbstractSet, Box, Polytope, Template
+from reachjax.sets import AbstractSet, Polytope, Template
 from reachjax.solvers import AbstractSolver, Clarabel
 from reachjax.systems import ClosedLoop
 from reachjax.witnesses import initial_states, proposed_states, witnesses
@@ -26,6 +26,14 @@ Progress = Callable[[Iterable[int]], Iterable[int]]
 """Wraps the iteration over time steps, such as `tqdm.tqdm` or `rich.progress.track`."""
 
 SAMPLES = 1000
+
+EXAMPLES = {
+    ClosedLoop: "a ClosedLoop",
+    AbstractSet: "a set such as Box(lower, upper) or Polytope(A, b)",
+    Template: "a Template, such as Template.box(n)",
+    AbstractRelaxation: "a relaxation object, such as LocalBounds()",
+    AbstractSolver: "a solver object, such as Clarabel()",
+}
 
 
 @pytree
@@ -141,7 +149,7 @@ def reach(
 
     Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
     """
-    _check(loop, X0, horizon, template, relaxation, window, solver, start)
+    _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed)
     sets: list[AbstractSet] = [X0]
     certificates: list[Certificate] = []
     steps = range(horizon)
@@ -160,7 +168,7 @@ def reach(
     return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
 
 
-def _check(loop, X0, horizon, template, relaxation, window, solver, start) -> None:
+def _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed) -> None:
     for name, value, kind in (
         ("loop", loop, ClosedLoop),
         ("X0", X0, AbstractSet),
@@ -169,11 +177,8 @@ def _check(loop, X0, horizon, template, relaxation, window, solver, start) -> No
         ("solver", solver, AbstractSolver),
     ):
         if not isinstance(value, kind):
-            hint = " object, not a class" if isinstance(value, type) else ""
-            raise TypeError(f"{name} must be a {kind.__name__}{hint}, but {value!r} arrived")
+            raise TypeError(f"{name} must be {EXAMPLES[kind]}, but {value!r} arrived")
     require_double_precision(loop=loop, X0=X0, template=template)
-    if isinstance(X0, Box) and X0.steps is not None:
-        raise ValueError(f"X0 must be one box, but bounds of shape {X0.lower.shape} arrived")
     same_size(
         "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)
     )
@@ -183,5 +188,11 @@ def _check(loop, X0, horizon, template, relaxation, window, solver, start) -> No
         (loop.states, template.dimension),
     )
     loop.check_horizon(horizon, start)
-    if window != 1:
+    whole_number("samples", samples, 1)
+    whole_number("seed", seed, 0)
+    try:
+        X0.bounding_box()
+    except ValueError as error:
+        raise ValueError(f"X0 cannot start a tube: {error}") from None
+    if whole_number("window", window, 1) != 1:
         raise ValueError(f"window must be 1 (one step at a time), but {window!r} arrived")

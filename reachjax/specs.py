@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.reach import ReachTube
-from reachjax.sets import PolyhedralSet, polyhedra
+from reachjax.sets import Box, PolyhedralSet, polyhedra
 
 AvoidSets = Sequence[PolyhedralSet] | Mapping[int, Sequence[PolyhedralSet]]
 
@@ -125,7 +125,7 @@ class _Requirement:
 def verify(
     tube: ReachTube,
     goal: PolyhedralSet | None = None,
-    avoid: AvoidSets = (),
+    avoid: AvoidSets | None = None,
     safe: PolyhedralSet | None = None,
     *,
     samples: int = 10_000,
@@ -180,14 +180,18 @@ def _counterexample(
 
 
 def _requirements(
-    tube: ReachTube, goal: PolyhedralSet | None, avoid: AvoidSets, safe: PolyhedralSet | None
+    tube: ReachTube, goal: PolyhedralSet | None, avoid: AvoidSets | None, safe: PolyhedralSet | None
 ) -> list[_Requirement]:
+    if not isinstance(tube, ReachTube):
+        raise TypeError(f"tube must be a ReachTube, from reach(...), but {tube!r} arrived")
     everywhere = range(tube.horizon + 1)
-    if isinstance(avoid, PolyhedralSet):
-        raise TypeError(
-            "avoid must be a sequence of sets or a mapping from times: write avoid=[...]"
-        )
-    timed = avoid if isinstance(avoid, Mapping) else dict.fromkeys(everywhere, avoid)
+    timed = avoid if isinstance(avoid, Mapping) else dict.fromkeys(everywhere, avoid or ())
+    for regions in timed.values():
+        if not isinstance(regions, Sequence):
+            raise TypeError(
+                "avoid must be a sequence of sets, avoid=[A, ...], or a mapping from a time to "
+                f"one, avoid={{t: [A, ...]}}, but a {type(regions).__name__} arrived"
+            )
     found = [_Requirement("goal", tube.horizon, goal, True)] if goal is not None else []
     found += [_Requirement("safe", t, safe, True) for t in everywhere if safe is not None]
     for t, regions in timed.items():
@@ -200,6 +204,8 @@ def _requirements(
         if not isinstance(item.region, PolyhedralSet):
             kind = type(item.region).__name__
             raise TypeError(f"{item.name} must be a Box or a Polytope, but a {kind} arrived")
+        if isinstance(item.region, Box) and item.region.steps is not None:
+            raise ValueError(f"{item.name} must be one box, but a time-varying one arrived")
         if item.region.dimension != tube.loop.states:
             raise ValueError(
                 f"{item.name} has dimension {item.region.dimension}, "

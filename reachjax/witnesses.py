@@ -18,13 +18,20 @@ from reachjax.systems import ClosedLoop
 MOST_DIMENSIONS = 12
 """Corners are listed up to this dimension (a box has 4096 of them there)."""
 
+PULL = 1 - 1e-12
+"""How far a rounded point is brought towards the middle of the set."""
+
 
 def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[Array, "c n_x"]:
     """Corners of a polyhedral set of few dimensions and `count` points drawn from it."""
-    drawn = X0.sample(jax.random.key(seed), count)
+    states = X0.sample(jax.random.key(seed), count)
     if isinstance(X0, PolyhedralSet) and X0.dimension <= MOST_DIMENSIONS:
-        return jnp.concatenate([X0.vertices(), drawn])
-    return drawn
+        states = jnp.concatenate([X0.vertices(), states])
+    # corners and points of triangulations are rounded: bring them inside, or a witness could lie
+    center = states.mean(axis=0)
+    inside = jnp.where(X0.contains(states)[:, None], states, center + PULL * (states - center))
+    kept = np.asarray(X0.contains(inside))
+    return inside[kept] if kept.any() else states  # a set without interior contains none exactly
 
 
 def proposed_states(X0: AbstractSet, moments: np.ndarray) -> Float[Array, "f n_x"]:

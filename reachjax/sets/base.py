@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
+from reachjax.checks import Numbers, same_size
 from reachjax.pytrees import Replaceable
 
 if TYPE_CHECKING:
@@ -34,6 +35,21 @@ class AbstractSet(Replaceable, abc.ABC):
     @abc.abstractmethod
     def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
         """The largest value of each direction on the set (rounded up where it is computed)."""
+
+    def _directions(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, "m n"]:
+        rows = Numbers("(m, n)")(directions, "directions")
+        same_size(
+            "the set's dimension is",
+            "the dimension of directions is",
+            (self.dimension, rows.shape[1]),
+        )
+        return rows
+
+    def _points(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch n"]:
+        rows = jnp.asarray(points)
+        arrived = rows.shape[-1] if rows.ndim else None
+        same_size("the set's dimension is", "the dimension of points is", (self.dimension, arrived))
+        return rows
 
     @abc.abstractmethod
     def contains(
@@ -76,4 +92,4 @@ class PolyhedralSet(AbstractSet):
     ) -> Bool[Array, "*batch"]:
         """Whether `A x <= b + tolerance` holds for each point."""
         A, b = self.facets
-        return jnp.all(jnp.asarray(points) @ A.T <= b + tolerance, axis=-1)
+        return jnp.all(self._points(points) @ A.T <= b + tolerance, axis=-1)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from reachjax.checks import Numbers, is_concrete
+from reachjax.checks import Numbers, is_concrete, within_time_axis
 from reachjax.pytrees import converted, pytree
 from reachjax.rounding import gamma
 from reachjax.sets.base import PolyhedralSet
@@ -63,8 +63,15 @@ class Box(PolyhedralSet):
         return self.lower.shape[0] if self.lower.ndim == 2 else None
 
     def at(self, t) -> Box:
-        """The box at time `t`."""
-        return self if self.steps is None else Box(self.lower[t], self.upper[t])
+        """The box at time `t`.
+
+        Raises:
+            ValueError: the box is not given for this time (where the time is a plain number).
+        """
+        if self.steps is None:
+            return self
+        within_time_axis("Box", t, self.steps)
+        return Box(self.lower[t], self.upper[t])
 
     @property
     def center(self) -> Float[Array, " n"]:
@@ -79,12 +86,21 @@ class Box(PolyhedralSet):
     @property
     def facets(self) -> tuple[Float[Array, "2n n"], Float[Array, " 2n"]]:
         """`-x <= -lower`, then `x <= upper`."""
+        self._single()
         eye = jnp.eye(self.dimension)
         return jnp.vstack([-eye, eye]), jnp.concatenate([-self.lower, self.upper])
 
+    def _single(self) -> None:
+        if self.steps is not None:
+            raise ValueError(
+                f"a time-varying box (bounds of shape {self.lower.shape}) is a sequence of sets: "
+                "take one by at(t)"
+            )
+
     def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
         """`max a . x` over the box, attained at a corner; rounded up."""
-        directions = jnp.asarray(directions)
+        self._single()
+        directions = self._directions(directions)
         terms = directions * jnp.where(directions > 0, self.upper, self.lower)
         # along an axis nothing is rounded, and nothing is added
         inexact = jnp.sum(directions != 0, axis=-1) > jnp.max(abs(directions) == 1, axis=-1)
@@ -107,6 +123,7 @@ class Box(PolyhedralSet):
 
     def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
         """Points drawn uniformly."""
+        self._single()
         shape = (count, self.dimension)
         draws = jax.random.uniform(key, shape, dtype=self.lower.dtype)
         return jnp.clip(self.lower + draws * self.widths, self.lower, self.upper)
@@ -117,4 +134,5 @@ class Box(PolyhedralSet):
 
     def bounding_box(self) -> Box:
         """The box itself."""
+        self._single()
         return self

@@ -17,6 +17,15 @@ FLAT = 1e-9
 """A polytope whose largest inscribed ball is smaller than this part of its size is flat."""
 
 
+def balanced(A: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Rows brought to a length between 1/2 and 1 by powers of two, which is exact.
+
+    The linear-programming code drops small coefficients and stops on large ones.
+    """
+    exponents = -np.frexp(np.linalg.norm(A, axis=1))[1]
+    return (np.ldexp(A, exponents[:, None]), *(np.ldexp(other, exponents) for other in others))
+
+
 def dual_multipliers(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Multipliers `y >= 0` of the facets, `A'y ~ direction`, that bound `max direction . x`.
 
@@ -47,6 +56,7 @@ def bounding_box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     With `D = [-I; I]`, multipliers `Y` and residual `E = D - Y A`, every point has
     `D x <= Y b + |E| rho` where `rho = max|x_i| <= max(Y b) / (1 - max row sum of |E|)`.
     """
+    A, b = balanced(A, b)
     n = A.shape[1]
     D = np.vstack([-np.eye(n), np.eye(n)])
     Y = np.stack([dual_multipliers(A, b, d) for d in D])
@@ -64,15 +74,17 @@ def bounding_box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def support(A: np.ndarray, b: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Upper bounds of `max a . x` for each direction, true for the exact polytope."""
+    A, b = balanced(A, b)
     lower, upper = bounding_box(A, b)
     size = np.maximum(np.abs(lower), np.abs(upper))
     error = gamma(len(b) + len(size) + 4)
+    exponents = np.frexp(np.linalg.norm(directions, axis=1))[1]
     values = []
-    for a in directions:
+    for a in np.ldexp(directions, -exponents[:, None]):
         y = dual_multipliers(A, b, a)
         residual = np.abs(a - y @ A) + error * (np.abs(a) + y @ np.abs(A))
         values.append(y @ b + error * (y @ np.abs(b)) + residual @ size * (1 + error))
-    return np.array(values)
+    return np.ldexp(values, exponents)
 
 
 def separation(A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray) -> float:
@@ -82,6 +94,7 @@ def separation(A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray) -> fl
     returned is the dual one, `-(y'b + w'd)` with `y, w >= 0` and `w . |c_i| = 1`, less what its
     residual can cost: a lower bound whatever the solver's accuracy.
     """
+    (A, b), (C, d) = balanced(A, b), balanced(C, d)
     norms = np.linalg.norm(C, axis=1)
     m, n = A.shape
     result = linprog(
@@ -123,11 +136,13 @@ def chebyshev(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
 
 def vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The corners of a bounded polytope `(v, n)`; a flat one is treated in its affine hull."""
+    A, b = balanced(A, b)
     lower, upper = bounding_box(A, b)
     size = max(float(np.max(upper - lower)), np.finfo(float).tiny)
     center, radius = chebyshev(A, b)
     if A.shape[1] == 1:
-        return np.unique(np.array([lower, upper]), axis=0)
+        ends = b / A[:, 0]
+        return np.unique([[ends[A[:, 0] < 0].max()], [ends[A[:, 0] > 0].min()]], axis=0)
     if radius > FLAT * size:
         corners = HalfspaceIntersection(np.hstack([A, -b[:, None]]), center).intersections
         return corners[ConvexHull(corners).vertices]

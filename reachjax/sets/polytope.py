@@ -64,7 +64,8 @@ class Polytope(PolyhedralSet):
         Raises:
             ValueError: the polytope is empty or unbounded.
         """
-        return jnp.asarray(polyhedra.support(*self._host(), np.asarray(directions, dtype=float)))
+        rows = np.asarray(self._directions(directions))
+        return jnp.asarray(polyhedra.support(*self._host(), rows))
 
     def bounding_box(self) -> Box:
         """The smallest box around the polytope.

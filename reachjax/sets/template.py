@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.checks import Numbers, is_concrete
+from reachjax.checks import Numbers, is_concrete, whole_number
 from reachjax.pytrees import Replaceable, converted, pytree
 from reachjax.sets.polytope import Polytope
 
@@ -53,11 +53,13 @@ class Template(Replaceable):
     @classmethod
     def box(cls, dimension: int) -> Template:
         """`+-x_i`: axis-aligned boxes, `2 n` facets."""
+        whole_number("dimension", dimension, 1)
         return cls(_signed(np.eye(dimension)))
 
     @classmethod
     def octagonal(cls, dimension: int) -> Template:
         """`+-x_i` and `+-x_i +- x_j`: `2 n^2` facets; in two dimensions the paper's eight."""
+        whole_number("dimension", dimension, 1)
         eye = np.eye(dimension)
         pairs = [
             row
@@ -73,6 +75,7 @@ class Template(Replaceable):
         Raises:
             ValueError: fewer than three facets, which bound no set.
         """
+        whole_number("facets", facets, 3)
         angles = 2 * np.pi * np.arange(facets) / facets
         return cls(np.stack([np.cos(angles), np.sin(angles)], axis=1))
 

@@ -81,7 +81,7 @@ class _ConicSolver(AbstractSolver, abc.ABC):
         """Propose multipliers for every facet.
 
         Raises:
-            ValueError: cvxpy does not find the solver.
+            ValueError: cvxpy does not find the solver, or it takes no semidefinite programs.
             TypeError: the solver does not know one of the options.
         """
         name, options = self.settings()
@@ -130,9 +130,22 @@ def _run(model: _Model, objective: np.ndarray, name: str, options: dict) -> Solv
         warnings.simplefilter("ignore")  # cvxpy warns of inaccuracy, which the status says
         try:
             model.problem.solve(solver=name, **options)
-        except cp.SolverError:
+        except cp.SolverError as error:
+            if "cannot solve" in str(error):  # not "failed": it takes no such cones
+                raise ValueError(
+                    f"the solver {name!r} cannot solve semidefinite programs"
+                ) from None
             return SolverStatus.FAILED
     return STATUSES.get(model.problem.status, SolverStatus.FAILED)
+
+
+def _require_positive(solver: Any) -> None:
+    for field in dataclasses.fields(solver):
+        value, name = getattr(solver, field.name), f"{type(solver).__name__}.{field.name}"
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise TypeError(f"{name} must be a number, but {value!r} arrived")
+        if not value > 0:
+            raise ValueError(f"{name} must be positive, but {value!r} arrived")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,6 +161,9 @@ class Clarabel(_ConicSolver):
     tolerance: float = 1e-9
     max_iterations: int = 200
     time_limit: float = float("inf")
+
+    def __post_init__(self):
+        _require_positive(self)
 
     def settings(self) -> tuple[str, dict[str, Any]]:
         """Clarabel's own names; a stalled run still returns its last iterate, as inaccurate.
@@ -179,6 +195,9 @@ class SCS(_ConicSolver):
     tolerance: float = 1e-7
     max_iterations: int = 50_000
 
+    def __post_init__(self):
+        _require_positive(self)
+
     def settings(self) -> tuple[str, dict[str, Any]]:
         """SCS's own names."""
         return "SCS", {
@@ -205,5 +224,5 @@ class CvxpySolver(_ConicSolver):
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
 
     def settings(self) -> tuple[str, dict[str, Any]]:
-        """As given."""
-        return self.name, dict(self.options)
+        """As given; the names cvxpy has are in capitals."""
+        return self.name.upper(), dict(self.options)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from reachjax.checks import Numbers, same_size
+from reachjax.checks import Numbers, same_size, whole_number
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.sets import Box
 from reachjax.systems.activations import ReLU, evaluate
@@ -125,10 +125,9 @@ class ClosedLoop(Replaceable):
         return _simulate(self, x0, horizon, start)
 
     def check_horizon(self, horizon: int, start: int = 0) -> None:
-        """Raise a `ValueError` unless the loop is given for all of `start .. start + horizon`."""
-        if isinstance(horizon, bool) or not isinstance(horizon, int) or horizon < 1:
-            raise ValueError(f"horizon must be a positive integer, but {horizon!r} arrived")
-        if self.steps is not None and not 0 <= start <= start + horizon <= self.steps:
+        """Raise an error unless the loop is given for all of `start .. start + horizon`."""
+        horizon, start = whole_number("horizon", horizon, 1), whole_number("start", start, 0)
+        if self.steps is not None and start + horizon > self.steps:
             raise ValueError(
                 f"the loop is given for {self.steps} time steps, "
                 f"but steps {start} to {start + horizon} were asked for"

@@ -1,34 +1,54 @@
 """Reading the weights of flax networks, nnx modules and linen parameters alike.
 
 flax keeps kernels as `(inputs, outputs)`; here a layer is `(W, b)` with `W = kernel.T`.
+
+A module does not say in which order it applies its layers, nor what it does between them. Lists and
+`nnx.Sequential` do; attributes only seem to, for nnx sorts them by name when it rebuilds a module.
+So a module that can be evaluated is compared with the network read from it, and one whose order
+cannot be trusted is refused.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
+from reachjax.checks import is_concrete
 
-def flax_layers(source: Any) -> list[tuple[Any, Any]]:
+ADVICE = "give its layers by MLP.from_layers"
+
+
+def flax_layers(source: Any, activation: Callable) -> list[tuple[Any, Any]]:
     """The pairs `(W, b)` of a flax network in the order of the forward pass.
 
     Raises:
         TypeError: `source` is neither an nnx module nor a mapping of linen parameters.
-        ValueError: a parameter does not belong to a linear layer.
+        ValueError: it holds other parameters than those of linear layers, or their order or what
+            is between them cannot be told.
     """
-    if isinstance(source, nnx.Module):
-        return [_layer(linear.kernel[...], _bias(linear)) for linear in _linears(source, set())]
+    if isinstance(source, nnx.State) or not isinstance(source, nnx.Module | Mapping):
+        raise TypeError(
+            "source must be a flax nnx module or the parameters of a linen module, "
+            f"but {type(source).__name__} arrived"
+        )
     if isinstance(source, Mapping):
-        params = source.get("params", source)
-        return [_linen_layer(name, params[name]) for name in sorted(params, key=_natural)]
-    raise TypeError(
-        "source must be a flax nnx module or the parameters of a linen module, "
-        f"but {type(source).__name__} arrived"
-    )
+        return _linen_layers(source.get("params", source))
+    linears = list(_linears(source, activation, set()))
+    pairs = [_layer(linear.kernel[...], _bias(linear)) for linear in linears]
+    if is_concrete(pairs) and callable(source):
+        _require_same_outputs(source, pairs, activation)
+    elif not _ordered(source):
+        raise ValueError(
+            "source keeps its layers as attributes, whose order is lost inside jit: "
+            f"keep them in nnx.List or nnx.Sequential, or {ADVICE}"
+        )
+    return pairs
 
 
 def _layer(kernel: Any, bias: Any) -> tuple[Any, Any]:
@@ -39,34 +59,106 @@ def _bias(linear: nnx.Linear) -> Any:
     return None if linear.bias is None else linear.bias[...]
 
 
-def _linears(node: Any, seen: set[int]) -> Iterator[nnx.Linear]:
-    """Linear layers in the order of assignment, through lists and submodules."""
+def _linears(node: Any, activation: Callable, seen: set[int]) -> Iterator[nnx.Linear]:
+    """Linear layers as lists, `nnx.Sequential` and attributes hold them."""
     if id(node) in seen:
-        raise ValueError("source uses one layer more than once; give its layers by from_layers")
-    if isinstance(node, nnx.Linear):
+        raise ValueError(f"source uses one layer more than once; {ADVICE}")
+    if type(node) is nnx.Linear:
         seen.add(id(node))
         yield node
-    elif isinstance(node, nnx.Module):
-        seen.add(id(node))
-        for name, child in vars(node).items():
-            if isinstance(child, nnx.Variable):
-                raise ValueError(
-                    f"source holds the parameter {name!r} in {type(node).__name__}, "
-                    "which is not a linear layer; give its layers by from_layers"
-                )
-            yield from _linears(child, seen)
     elif isinstance(node, list | tuple | nnx.List):
         for child in node:
-            yield from _linears(child, seen)
+            yield from _linears(child, activation, seen)
+    elif isinstance(node, Mapping) and any(isinstance(v, nnx.Module) for v in node.values()):
+        raise ValueError(f"source keeps layers in a mapping, which has no order; {ADVICE}")
+    elif isinstance(node, nnx.Module):
+        seen.add(id(node))
+        if isinstance(node, nnx.Sequential):
+            _require_alternating(list(node.layers), activation)
+        for name, child in vars(node).items():
+            if isinstance(child, nnx.Param):
+                raise ValueError(
+                    f"source holds the parameter {name!r} in {type(node).__name__}, "
+                    f"which is not a linear layer; {ADVICE}"
+                )
+            yield from _linears(child, activation, seen)
 
 
-def _natural(name: str) -> tuple[Any, ...]:
+def _require_alternating(layers: list[Any], activation: Callable) -> None:
+    """Linear layers with the activation between them, and nothing else."""
+    points = np.array([-2.0, -0.5, 0.0, 0.5, 2.0])
+    for k, layer in enumerate(layers):
+        if k % 2 == 0:
+            fits = type(layer) is nnx.Linear
+        else:
+            with jax.ensure_compile_time_eval():
+                fits = not isinstance(layer, nnx.Module) and np.allclose(
+                    layer(jnp.asarray(points)), activation(jnp.asarray(points)), atol=1e-6
+                )
+        if not fits or len(layers) % 2 == 0:
+            raise ValueError(
+                f"source must alternate nnx.Linear and {activation}, ending with nnx.Linear, "
+                f"but entry {k} of its {len(layers)} layers is {layer!r}; {ADVICE}"
+            )
+
+
+def _ordered(node: Any) -> bool:
+    """Whether the linear layers stand in one list, or there is but one."""
+    holders = [child for child in vars(node).values() if _holds_layers(child)]
+    if len(holders) != 1 or type(node) is nnx.Linear:
+        return len(holders) == 0
+    return (
+        not isinstance(holders[0], nnx.Module)
+        or isinstance(holders[0], nnx.List)
+        or _ordered(holders[0])
+    )
+
+
+def _holds_layers(value: Any) -> bool:
+    return isinstance(value, nnx.Module | nnx.List) or (
+        isinstance(value, list | tuple) and any(map(_holds_layers, value))
+    )
+
+
+def _require_same_outputs(source: Callable, pairs: list[tuple[Any, Any]], activation) -> None:
+    """Compare the module with the network read from it on a few inputs."""
+    inputs = pairs[0][0].shape[1] if pairs else 1
+    points = np.random.default_rng(0).normal(size=(8, inputs)).astype(np.float32)
+    try:
+        expected = np.asarray(source(jnp.asarray(points)), dtype=float)
+    except Exception as error:
+        raise ValueError(f"source cannot be evaluated, so it cannot be read: {error}") from error
+    z: Any = points.astype(float)
+    for k, (W, b) in enumerate(pairs):
+        z = z @ np.asarray(W, float).T + np.asarray(b, float)
+        z = np.asarray(activation(jnp.asarray(z))) if k < len(pairs) - 1 else z
+    if expected.shape != z.shape or not np.allclose(z, expected, rtol=1e-3, atol=1e-4):
+        raise ValueError(
+            "source computes something else than its linear layers in the order in which they "
+            f"were found, with {activation} between them; {ADVICE}"
+        )
+
+
+def _linen_layers(params: Mapping[str, Any]) -> list[tuple[Any, Any]]:
+    """Layers named `Dense_0`, `Dense_1`, ...: the names must tell the order."""
+    names = {re.sub(r"\d+$", "", name) for name in params}
+    numbered = all(re.search(r"\d+$", name) for name in params)
+    if len(params) > 1 and not (numbered and len(names) == 1):
+        raise ValueError(
+            "linen layers must be named by one word and a number, such as Dense_0, for their order "
+            f"to be known, but {sorted(params)} arrived; {ADVICE}"
+        )
+    return [_linen_layer(name, params[name]) for name in sorted(params, key=_number)]
+
+
+def _number(name: str) -> int:
     """Order `Dense_10` behind `Dense_2`."""
-    return tuple(int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name))
+    found = re.search(r"\d+$", name)
+    return int(found.group()) if found else 0
 
 
 def _linen_layer(name: str, layer: Any) -> tuple[Any, Any]:
-    if not isinstance(layer, Mapping) or not set(layer) <= {"kernel", "bias"}:
+    if not isinstance(layer, Mapping) or not {"kernel"} <= set(layer) <= {"kernel", "bias"}:
         held = sorted(layer) if isinstance(layer, Mapping) else type(layer).__name__
         raise ValueError(
             f"linen layer {name!r} must hold a kernel and perhaps a bias, but it holds {held}"

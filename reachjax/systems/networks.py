@@ -109,7 +109,7 @@ class MLP(Replaceable):
             TypeError: `source` is neither.
             ValueError: it holds something else than a chain of linear layers.
         """
-        return cls(flax_layers(source), activation)
+        return cls(flax_layers(source, activation), activation)
 
     @property
     def inputs(self) -> int:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from reachjax.checks import Numbers
+from reachjax.checks import Numbers, within_time_axis
 from reachjax.pytrees import Replaceable, converted, pytree
 
 
@@ -72,8 +72,14 @@ class AffinePlant(Replaceable):
         return next((array.shape[0] for array in self._varying().values()), None)
 
     def at(self, t: int | jax.Array) -> tuple[Array, Array, Array]:
-        """`(A_t, B_t, c_t)`."""
+        """`(A_t, B_t, c_t)`.
+
+        Raises:
+            ValueError: the plant is not given for this time (where the time is a plain number).
+        """
         varying = self._varying()
+        if self.steps is not None:
+            within_time_axis("AffinePlant", t, self.steps)
         A, B, c = (varying[k][t] if k in varying else getattr(self, k) for k in ("A", "B", "c"))
         return A, B, c
 

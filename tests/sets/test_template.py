@@ -64,12 +64,6 @@ def test_directions_that_bound_no_set_are_refused(directions):
         rj.Template(directions)
 
 
-@pytest.mark.parametrize("facets", [1, 2])
-def test_fewer_than_three_directions_are_refused_in_the_plane(facets):
-    with pytest.raises(ValueError, match=r"Template.directions do not bound a set"):
-        rj.Template.regular(facets)
-
-
 def test_directions_may_be_traced():
     norms = jax.jit(lambda d: jnp.linalg.norm(rj.Template(d).directions, axis=1))
     np.testing.assert_allclose(norms(jnp.array(PAPER, float))[-1], np.sqrt(2))

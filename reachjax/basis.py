@@ -118,6 +118,13 @@ def change_of_basis(loop: ClosedLoop, t: int = 0) -> ChangeOfBasis:
         ValueError: a time-varying loop ends before `t`.
 
     Source: propositions 3, 4 and 5 of Hu, Fazlyab, Morari, Pappas (CDC 2020).
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> change_of_basis(loop).E_out.tolist()  # over x, two neurons, two projections, 1
+        [[1.0, 0.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]
     """
     require_double_precision(loop=loop)
     loop.check_horizon(1, t)

@@ -81,6 +81,16 @@ class Certificate(Replaceable):
 
         Raises:
             ValueError: the multipliers contain NaN or infinity, or have another shape.
+
+        Example:
+            >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach_step
+            >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+            >>> _, certificate = reach_step(loop, Box([1.0], [2.0]), Template.box(1))
+            >>> certificate.recheck().round(6).tolist()
+            [1.0, -0.5]
+            >>> garbage = -certificate.multipliers
+            >>> bool((certificate.replace(multipliers=garbage).recheck() >= [1.0, -0.5]).all())
+            True
         """
         return _proved(self.program, self.multipliers, self.codes, self.solver_offsets)
 

@@ -105,6 +105,14 @@ def reach_step(
         ValueError: dimensions disagree, the set is empty or unbounded, or `t` is beyond the loop.
 
     Source: theorem 1 and problem (sdp::poly) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> following, certificate = reach_step(loop, Box([1.0], [2.0]), Template.box(1))
+        >>> following.b.round(6).tolist()  # x+ = 0.6 x, written as x <= 1.2 and -x <= -0.6
+        [1.2, -0.6]
     """
     tube = reach(loop, X, 1, template, relaxation, 1, solver, start=t, samples=samples, seed=seed)
     following = tube.sets[1]
@@ -148,6 +156,16 @@ def reach(
             or a time-varying loop ends before the horizon.
 
     Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> tube = reach(loop, Box([1.0], [2.0]), 3, Template.box(1))
+        >>> [round(region.volume(), 6) for region in tube.sets[1:]]
+        [0.6, 0.36, 0.216]
+        >>> bool((tube.proof(3).gaps >= 0).all())
+        True
     """
     _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed)
     sets: list[AbstractSet] = [X0]

@@ -148,6 +148,16 @@ def verify(
         ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
 
     Source: equations (reach_avoid) and (reach_avoid_approx) of the paper.
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> tube = reach(loop, Box([1.0], [2.0]), 3, Template.box(1))
+        >>> verify(tube, goal=Box([0.0], [0.5]), safe=Box([0.0], [2.0])).status.name
+        'PROVED'
+        >>> verify(tube, goal=Box([0.0], [0.4])).counterexample.states.ravel().round(3).tolist()
+        [2.0, 1.2, 0.72, 0.432]
     """
     requirements = _requirements(tube, goal, avoid, safe)
     states = [tube.proof(t).witness_states for t in range(1, tube.horizon + 1)]

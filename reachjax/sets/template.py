@@ -82,4 +82,4 @@ class Template(Replaceable):
 
 def _signed(rows: np.ndarray) -> np.ndarray:
     """Each row followed by its negative."""
-    return np.stack([rows, -rows], axis=1).reshape(-1, rows.shape[1])
+    return np.stack([rows, 0.0 - rows], axis=1).reshape(-1, rows.shape[1])  # 0, not -0

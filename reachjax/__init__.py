@@ -13,6 +13,7 @@ from reachjax.certificates import Certificate
 from reachjax.reach import ReachTube, reach, reach_step
 from reachjax.relaxation import AbstractRelaxation, LocalBounds, PaperQC
 from reachjax.sets import AbstractSet, Box, PolyhedralSet, Polytope, Template
+from reachjax.sizes import log_volume, log_widths, volume
 from reachjax.solvers import SCS, AbstractSolver, Clarabel, CvxpySolver, SolverStatus
 from reachjax.specs import Counterexample, Verdict, VerdictStatus, verify
 from reachjax.systems import MLP, AbstractActivation, AffinePlant, ClosedLoop, ReLU
@@ -45,7 +46,10 @@ __all__ = [
     "Verdict",
     "VerdictStatus",
     "change_of_basis",
+    "log_volume",
+    "log_widths",
     "reach",
     "reach_step",
     "verify",
+    "volume",
 ]

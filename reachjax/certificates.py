@@ -7,16 +7,13 @@ trajectories; the true support of the reachable set lies between witness and bou
 
 from __future__ import annotations
 
+import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
-from reachjax.lmi import Program
+from reachjax.lmi import Program, scaling
 from reachjax.pytrees import Replaceable, pytree
-from reachjax.recheck import interval_offsets, sound_offsets
-from reachjax.solvers import Solution, SolverStatus
-
-SHORTFALL = 1e-3
-"""A claim that its multipliers miss by more than this, relatively, is not the optimal value."""
+from reachjax.solvers import Solution, SolverStatus, accepted_offsets
 
 
 @pytree
@@ -47,16 +44,19 @@ class Certificate(Replaceable):
     seconds: Float[np.ndarray, " f"]
 
     @classmethod
-    def from_solution(cls, program: Program, solution: Solution) -> Certificate:
-        """Recheck what a solver proposed; witnesses are not known yet (NaN)."""
+    def from_solution(
+        cls, program: Program, bounds: Float[Array, " f"], solution: Solution
+    ) -> Certificate:
+        """What was proved with what a solver proposed; witnesses are not known yet (NaN)."""
         facets = len(solution.offsets)
+        T = scaling(program.shift, program.scale)
         return cls(
             program=program,
             multipliers=solution.multipliers,
-            moments=solution.moments,
+            moments=T @ solution.moments @ T.T,
             codes=solution.statuses,
             solver_offsets=solution.offsets,
-            bounds=_proved(program, solution.multipliers, solution.statuses, solution.offsets),
+            bounds=bounds,
             witnesses=np.full(facets, np.nan),
             witness_states=np.full((facets, 0), np.nan),
             seconds=solution.seconds,
@@ -72,12 +72,13 @@ class Certificate(Replaceable):
         """`bounds - witnesses`: how much tightness may be left, never negative."""
         return self.bounds - self.witnesses
 
-    def recheck(self) -> Float[np.ndarray, " f"]:
-        """Prove the offsets anew, from the program and the multipliers.
+    def recheck(
+        self, multipliers: Float[np.ndarray, "f K"] | None = None
+    ) -> Float[np.ndarray, " f"]:
+        """Prove the offsets anew, from the program and these or other multipliers.
 
         Sound for any multipliers: negative ones are clipped where the sign matters, and what
-        the matrix inequality misses is paid for. To recheck others:
-        `certificate.replace(multipliers=others).recheck()`.
+        the matrix inequality misses is paid for.
 
         Raises:
             ValueError: the multipliers contain NaN or infinity, or have another shape.
@@ -89,24 +90,9 @@ class Certificate(Replaceable):
             >>> certificate.recheck().round(6).tolist()
             [1.0, -0.5]
             >>> garbage = -certificate.multipliers
-            >>> bool((certificate.replace(multipliers=garbage).recheck() >= [1.0, -0.5]).all())
+            >>> bool((certificate.recheck(garbage) >= [1.0, -0.5]).all())
             True
         """
-        return _proved(self.program, self.multipliers, self.codes, self.solver_offsets)
-
-
-def _proved(
-    program: Program, multipliers: np.ndarray, codes: np.ndarray, claims: np.ndarray
-) -> np.ndarray:
-    """The rechecked offsets, never below what the relaxation itself gives.
-
-    The recheck knows that the basis is bounded, so it may prove less than the program's optimal
-    value. Where the solver has that value, the offset stays there: it means what the relaxation's
-    name says, and its derivative is the program's. Where the solver has none, or its multipliers
-    fall short of it, interval arithmetic is taken if it is better.
-    """
-    offsets = sound_offsets(program, multipliers)
-    answered = np.isin(codes, (SolverStatus.SOLVED, SolverStatus.INACCURATE))
-    borne_out = offsets <= claims + SHORTFALL * (1 + abs(claims))  # False where the claim is NaN
-    relaxed, fallback = np.fmax(offsets, claims), np.fmin(offsets, interval_offsets(program))
-    return np.where(answered & borne_out, relaxed, fallback)
+        proposed = self.multipliers if multipliers is None else multipliers
+        solution = Solution(self.solver_offsets, proposed, self.moments, self.codes, self.seconds)
+        return accepted_offsets(jax.device_get(self.program), solution)

@@ -97,6 +97,7 @@ def weighted_products(program: Program, multipliers: Float[Array | np.ndarray, "
 def step_program(
     loop: ClosedLoop,
     X: AbstractSet,
+    box: Box,
     template: Template,
     t: int,
     relaxation: AbstractRelaxation,
@@ -104,8 +105,16 @@ def step_program(
     """Theorem 1 for every facet of the successors of `X` at time `t`, over the scaled basis.
 
     Compiled once for a loop's shape, a number of facets and a relaxation.
+
+    Args:
+        loop: the closed loop.
+        X: the set of states at time `t`.
+        box: a box around it.
+        template: the facet directions.
+        t: the time.
+        relaxation: which products of facts are used.
     """
-    return _step_program(loop, X.facts(), X.bounding_box(), template.directions, t, relaxation)
+    return _step_program(loop, X.facts(), box, template.directions, t, relaxation)
 
 
 @partial(jax.jit, static_argnames="relaxation")
@@ -124,7 +133,8 @@ def _step_program(
     one = columns(size - 1, 1, size)
     of_the_set = set_facts[:, :-1] @ rows.state + set_facts[:, -1]
     facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts)
-    shift, scale = basis_box(bounds, relaxation.remove_stable)
+    # the optimal value does not depend on the scaling, so neither does its derivative
+    shift, scale = jax.lax.stop_gradient(basis_box(bounds, relaxation.remove_stable))
     T = scaling(shift, scale)
     return Program(
         facts=facts @ T,
@@ -133,3 +143,18 @@ def _step_program(
         shift=shift,
         scale=scale,
     )
+
+
+def lagrangian(
+    program: Program, multipliers: Float[Array, "f K"], moments: Float[Array, "f n n"]
+) -> Float[Array, " f"]:
+    """`<X / 2, F' Gamma F + p e' + e p'>` of each facet, over the scaled basis.
+
+    With multipliers and moments held at their optimal values, its derivative is that of the optimal
+    offset (the envelope theorem).
+    """
+    F, products = program.facts.mid, program.products
+    values = F @ moments @ F.T
+    pairs = values[:, products.left, products.right]
+    weighted = jnp.sum(multipliers[:, products.multiplier] * pairs, axis=1) / 2
+    return weighted + jnp.einsum("fi,fi->f", program.objective.mid, moments[:, :, -1])

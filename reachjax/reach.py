@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.certificates import Certificate
-from reachjax.checks import require_double_precision, same_size, whole_number
+from reachjax.checks import is_concrete, require_double_precision, same_size, whole_number
 from reachjax.lmi import step_program
 from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, LocalBounds
 from reachjax.sets import AbstractSet, Polytope, Template
-from reachjax.solvers import AbstractSolver, Clarabel
+from reachjax.solvers import AbstractSolver, Clarabel, bounding_box, proved_offsets
 from reachjax.systems import ClosedLoop
 from reachjax.witnesses import initial_states, proposed_states, witnesses
 
@@ -172,18 +171,25 @@ def reach(
     certificates: list[Certificate] = []
     steps = range(horizon)
     for k in steps if progress is None else progress(steps):
-        program = jax.device_get(step_program(loop, sets[-1], template, start + k, relaxation))
-        certificates.append(Certificate.from_solution(program, solver.solve(program)))
-        sets.append(template.polytope(jnp.asarray(certificates[-1].bounds)))
+        X = sets[-1]
+        program = step_program(loop, X, bounding_box(X), template, start + k, relaxation)
+        bounds, solution = proved_offsets(program, solver)
+        certificates.append(Certificate.from_solution(program, bounds, solution))
+        sets.append(template.polytope(bounds))
+    if is_concrete(loop, X0):
+        certificates = _with_witnesses(certificates, loop, X0, template, start, samples, seed)
+    return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
 
+
+def _with_witnesses(certificates, loop, X0, template, start, samples, seed) -> list[Certificate]:
+    """Simulate what the certificates bound, from the initial set."""
     states = initial_states(X0, samples, seed)
     states = jnp.concatenate([states, proposed_states(X0, certificates[0].moments)])
-    values, origins = witnesses(loop, states, template.directions, horizon, start)
-    certificates = [
+    values, origins = witnesses(loop, states, template.directions, len(certificates), start)
+    return [
         certificate.replace(witnesses=values[k], witness_states=origins[k])
         for k, certificate in enumerate(certificates)
     ]
-    return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
 
 
 def _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed) -> None:
@@ -209,7 +215,7 @@ def _check(loop, X0, horizon, template, relaxation, window, solver, start, sampl
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     try:
-        X0.bounding_box()
+        bounding_box(X0)
     except ValueError as error:
         raise ValueError(f"X0 cannot start a tube: {error}") from None
     if whole_number("window", window, 1) != 1:

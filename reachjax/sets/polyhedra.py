@@ -7,6 +7,8 @@ what is used in a certificate is rebuilt from the dual solution: for any `y >= 0
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, Delaunay, HalfspaceIntersection, QhullError
@@ -26,8 +28,8 @@ def balanced(A: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
     return (np.ldexp(A, exponents[:, None]), *(np.ldexp(other, exponents) for other in others))
 
 
-def dual_multipliers(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Multipliers `y >= 0` of the facets, `A'y ~ direction`, that bound `max direction . x`.
+def maximiser(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Multipliers `y >= 0` of the facets, `A'y ~ direction`, that bound `max direction . x`, and x.
 
     Raises:
         ValueError: the polytope is empty, or unbounded in this direction.
@@ -42,7 +44,7 @@ def dual_multipliers(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> np.
         )
     if result.status != 0:
         raise RuntimeError(f"a linear program over the polytope failed: {result.message}")
-    return np.maximum(-result.ineqlin.marginals, 0.0)
+    return np.maximum(-result.ineqlin.marginals, 0.0), result.x
 
 
 def _is_empty(A: np.ndarray, b: np.ndarray) -> bool:
@@ -51,15 +53,26 @@ def _is_empty(A: np.ndarray, b: np.ndarray) -> bool:
 
 
 def bounding_box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds of each coordinate, true for the exact polytope."""
+    lower, upper, _, _ = bounding_box_and_multipliers(A, b)
+    return lower, upper
+
+
+def bounding_box_and_multipliers(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, ...]:
     """Lower and upper bounds of each coordinate, true for the exact polytope.
 
     With `D = [-I; I]`, multipliers `Y` and residual `E = D - Y A`, every point has
     `D x <= Y b + |E| rho` where `rho = max|x_i| <= max(Y b) / (1 - max row sum of |E|)`.
+
+    Returns:
+        Lower and upper bounds `(n,)`, the multipliers `Y` `(2 n, m)` and where the maxima are
+        attained `(2 n, n)`, both for `-x_i` and then for `x_i`.
     """
+    lengths = np.frexp(np.linalg.norm(A, axis=1))[1]
     A, b = balanced(A, b)
     n = A.shape[1]
     D = np.vstack([-np.eye(n), np.eye(n)])
-    Y = np.stack([dual_multipliers(A, b, d) for d in D])
+    Y, points = (np.stack(part) for part in zip(*(maximiser(A, b, d) for d in D), strict=True))
     error = gamma(len(b) + 2)
     residual = np.abs(D - Y @ A) + error * (np.abs(D) + Y @ np.abs(A))
     values = Y @ b + error * (Y @ np.abs(b))
@@ -69,7 +82,8 @@ def bounding_box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     radius = max(values.max(), 0.0) / (1 - leak.max())
     values = values + leak * radius * (1 + error)
     lower = -values[:n]
-    return np.minimum(lower, values[n:]), np.maximum(lower, values[n:])
+    ends = np.minimum(lower, values[n:]), np.maximum(lower, values[n:])
+    return *ends, np.ldexp(Y, -lengths), points
 
 
 def support(A: np.ndarray, b: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -81,7 +95,7 @@ def support(A: np.ndarray, b: np.ndarray, directions: np.ndarray) -> np.ndarray:
     exponents = np.frexp(np.linalg.norm(directions, axis=1))[1]
     values = []
     for a in np.ldexp(directions, -exponents[:, None]):
-        y = dual_multipliers(A, b, a)
+        y, _ = maximiser(A, b, a)
         residual = np.abs(a - y @ A) + error * (np.abs(a) + y @ np.abs(A))
         values.append(y @ b + error * (y @ np.abs(b)) + residual @ size * (1 + error))
     return np.ldexp(values, exponents)
@@ -184,6 +198,35 @@ def volume(A: np.ndarray, b: np.ndarray) -> float:
         return float(ConvexHull(corners).volume)
     except QhullError:  # the corners span fewer than n dimensions
         return 0.0
+
+
+def facet_areas(A: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """The volume, and of each facet the `(n-1)`-volume `(m,)` and the centroid `(m, n)`.
+
+    Moving facet `i` outwards by `db_i` sweeps the volume `area_i db_i / |a_i|`. A facet that does
+    not bound the polytope has area zero.
+    """
+    n, norms = A.shape[1], np.linalg.norm(A, axis=1)
+    corners = vertices(A, b)
+    areas, centroids = np.zeros(len(b)), np.zeros((len(b), n))
+    if n == 1:
+        for side in (A[:, 0] < 0, A[:, 0] > 0):
+            facet = np.flatnonzero(side)[np.argmin((b / abs(A[:, 0]))[side])]
+            areas[facet], centroids[facet] = 1.0, b[facet] / A[facet, 0]
+        return float(np.ptp(corners)), areas, centroids
+    if len(corners) <= n:
+        return 0.0, areas, centroids
+    try:
+        hull = ConvexHull(corners)
+    except QhullError:  # the corners span fewer than n dimensions
+        return 0.0, areas, centroids
+    for simplex, equation in zip(corners[hull.simplices], hull.equations, strict=True):
+        facet = int(np.argmin(np.linalg.norm(A / norms[:, None] - equation[:-1], axis=1)))
+        edges = simplex[1:] - simplex[0]
+        area = np.sqrt(max(np.linalg.det(edges @ edges.T), 0.0)) / math.factorial(n - 1)
+        areas[facet] += area
+        centroids[facet] += area * simplex.mean(axis=0)
+    return float(hull.volume), areas, centroids / np.where(areas > 0, areas, 1)[:, None]
 
 
 def uniform(A: np.ndarray, b: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:

@@ -10,6 +10,7 @@ import abc
 import enum
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -53,7 +54,7 @@ class Solution(NamedTuple):
     Attributes:
         offsets: `(f,)`, its own optimal values, NaN where it has none. Not bounds.
         multipliers: `(f, K)`, zero where it has none.
-        moments: `(f, n, n)`, the dual matrices over the unscaled basis with corner 1, NaN where
+        moments: `(f, n, n)`, the dual matrices over the scaled basis with corner 1, NaN where
             it has none.
         statuses: `(f,)`, values of `SolverStatus`.
         seconds: `(f,)`, wall time of each facet.
@@ -64,6 +65,12 @@ class Solution(NamedTuple):
     moments: Float[np.ndarray, "f n n"]
     statuses: Int[np.ndarray, " f"]
     seconds: Float[np.ndarray, " f"]
+
+    @classmethod
+    def shapes(cls, facets: int, multipliers: int, size: int) -> Solution:
+        """The shapes and types of all fields, as JAX wants to know them beforehand."""
+        blank = cls.blank(facets, multipliers, size)
+        return jax.tree.map(lambda field: jax.ShapeDtypeStruct(field.shape, field.dtype), blank)
 
     @classmethod
     def blank(cls, facets: int, multipliers: int, size: int) -> Solution:

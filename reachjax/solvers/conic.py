@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from reachjax.lmi import Program, scaling
+from reachjax.lmi import Program
 from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
 from reachjax.solvers.compact import CompactProgram, compact
 
@@ -90,7 +90,6 @@ class _ConicSolver(AbstractSolver, abc.ABC):
         model = _Model(reduced)
         facets, size = program.objective.mid.shape
         solution = Solution.blank(facets, len(program.products.free), size)
-        T = np.asarray(scaling(program.shift, program.scale))[:, reduced.columns]
         for i in range(facets):
             began = time.perf_counter()
             status = _run(model, reduced.objective[i], name, options)
@@ -105,7 +104,9 @@ class _ConicSolver(AbstractSolver, abc.ABC):
             solution.multipliers[i, reduced.kept] = multipliers
             moment = np.asarray(model.lmi.dual_value, dtype=float)
             if moment.ndim == 2 and moment[-1, -1] > 0:
-                solution.moments[i] = T @ (moment / moment[-1, -1]) @ T.T
+                solution.moments[i] = 0.0
+                used = np.ix_(reduced.columns, reduced.columns)
+                solution.moments[i][used] = moment / moment[-1, -1]
         return solution
 
 

@@ -1,0 +1,52 @@
+"""How large sets are, as numbers that can be differentiated and penalised.
+
+Up to four dimensions the volume of a polytope is exact (Qhull), with the derivative
+`d vol / d b_i = (area of facet i) / |a_i|`. Beyond that, corners multiply too fast, and the size of
+a polytope is that of its bounding box.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from reachjax.reach import ReachTube
+from reachjax.sets import AbstractSet, Polytope
+from reachjax.solvers import bounding_box, polytope_volume
+
+EXACT_DIMENSIONS = 4
+
+
+def volume(X: AbstractSet) -> Float[Array, ""]:
+    """The `n`-dimensional volume of a set, or of its bounding box beyond four dimensions.
+
+    Differentiable, also inside `jax.jit`, `jax.vmap` and `jax.lax.scan`.
+
+    Example:
+        >>> import jax
+        >>> from reachjax import Template
+        >>> area = lambda b: volume(Template.box(2).polytope(b))
+        >>> jax.grad(area)(jnp.array([2.0, 0.0, 3.0, 0.0])).tolist()  # facets x <= 2, -x <= 0, ...
+        [3.0, 3.0, 2.0, 2.0]
+    """
+    if isinstance(X, Polytope) and X.dimension <= EXACT_DIMENSIONS:
+        return polytope_volume(X)
+    return jnp.prod(bounding_box(X).widths)
+
+
+def log_widths(X: AbstractSet) -> Float[Array, " n"]:
+    """Logarithms of the widths of a set along each coordinate."""
+    return jnp.log(bounding_box(X).widths)
+
+
+def log_volume(X: AbstractSet | ReachTube) -> Float[Array, ""]:
+    """The logarithm of a set's volume; of a tube, the sum over `t = 1 .. horizon`.
+
+    Example:
+        >>> from reachjax import Box
+        >>> round(float(log_volume(Box([0.0, 0.0], [1.0, 2.0]))), 6)
+        0.693147
+    """
+    if isinstance(X, ReachTube):
+        return sum((log_volume(region) for region in X.sets[1:]), start=jnp.zeros(()))
+    return jnp.log(volume(X))

@@ -1,0 +1,187 @@
+"""Gradients through the seam: right, alike in every mode of JAX, and refused where they are not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from reachjax.lmi import lagrangian, step_program
+from reachjax.solvers import bounding_box, proved_offsets
+from tests.loops import closed_loop, random_loop
+from tests.networks import box_region, simplex_region
+
+TEMPLATE = rj.Template.octagonal(2)
+WEIGHTS = jnp.linspace(0.5, 2.0, len(TEMPLATE))
+
+
+def planar(seed, polytope=False, hidden=(5, 3)):
+    """A loop and a set in the plane, at a generic point."""
+    data = random_loop(2, hidden=hidden, seed=seed)
+    region = simplex_region(2, seed) if polytope else box_region(2, seed)
+    low, high = region.corners.min(axis=0), region.corners.max(axis=0)
+    X0 = rj.Polytope(region.A, region.b) if polytope else rj.Box(low, high)
+    return closed_loop(data), X0
+
+
+def value(loop, X0, horizon=1, relaxation=rj.LocalBounds()):  # noqa: B008  (immutable)
+    tube = rj.reach(loop, X0, horizon, TEMPLATE, relaxation)
+    return sum(WEIGHTS @ region.b for region in tube.sets[1:])
+
+
+def dot(left, right):
+    return float(sum(map(jnp.vdot, jax.tree.leaves(left), jax.tree.leaves(right))))
+
+
+PARTS = {
+    "weights": lambda loop, X0: loop.controller,
+    "A": lambda loop, X0: loop.plant.A,
+    "B": lambda loop, X0: loop.plant.B,
+    "c": lambda loop, X0: loop.plant.c,
+    "initial set": lambda loop, X0: X0 if isinstance(X0, rj.Box) else X0.b,
+    "input limits": lambda loop, X0: loop.input_box,
+}
+
+
+def along(part, loop, X0, seed):
+    """A random direction in one part of the arguments, zero in the others."""
+    rng = np.random.default_rng(seed)
+    chosen = {id(leaf) for leaf in jax.tree.leaves(PARTS[part](loop, X0))}
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)) * (id(leaf) in chosen), (loop, X0)
+    )
+
+
+def central_difference(f, args, direction, h):
+    """Fourth order in `h`."""
+
+    def shifted(s):
+        return float(f(*jax.tree.map(lambda leaf, d: leaf + s * h * d, args, direction)))
+
+    return (8 * (shifted(1) - shifted(-1)) - (shifted(2) - shifted(-2))) / (12 * h)
+
+
+@pytest.fixture(scope="module", params=[(0, False), (1, True), (3, False)], ids=str)
+def one_step(request):
+    """(compiled value, arguments, their gradient)."""
+    args = planar(*request.param)
+    return jax.jit(value), args, jax.grad(value, argnums=(0, 1))(*args)
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_the_gradient_of_a_step_is_the_central_difference(one_step, part):
+    f, args, gradient = one_step
+    for seed in range(2):
+        direction = along(part, *args, seed)
+        exact = dot(gradient, direction)
+        # the solver's 1e-9 over a step of 1e-4 leaves some 1e-4 of these values of order one
+        difference = central_difference(f, args, direction, h=1e-4)
+        assert abs(exact - difference) <= 1e-3 * max(abs(difference), 0.1)
+
+
+def test_the_lagrangian_at_the_solution_is_the_offset():
+    loop, X = planar(0)
+    program = step_program(loop, X, bounding_box(X), TEMPLATE, 0, rj.LocalBounds())
+    offsets, solution = proved_offsets(program, rj.Clarabel())
+    values = lagrangian(program, solution.multipliers, solution.moments)
+    np.testing.assert_allclose(values, offsets, atol=1e-6)
+
+
+def test_compiled_and_plain_gradients_agree():
+    args = planar(0)
+    plain = jax.grad(value, argnums=(0, 1))(*args, 2)
+    compiled = jax.jit(jax.grad(value, argnums=(0, 1)), static_argnums=2)(*args, 2)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8), plain, compiled
+    )
+
+
+def test_a_batch_of_networks_and_sets_equals_one_at_a_time():
+    loop, X0 = planar(0)
+    nets = [jax.tree.map(lambda w, s=s: w * (1 + s), loop.controller) for s in (0.0, 0.1, 0.2)]
+    boxes = [rj.Box(X0.lower - s, X0.upper + s) for s in (0.0, 0.05, 0.1)]
+    stack = lambda trees: jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)  # noqa: E731
+
+    def of(net, box):
+        return value(loop.replace(controller=net), box)
+
+    both = jax.vmap(jax.value_and_grad(of, argnums=(0, 1)))(stack(nets), stack(boxes))
+    single = stack(
+        [jax.value_and_grad(of, argnums=(0, 1))(*pair) for pair in zip(nets, boxes, strict=True)]
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8), both, single)
+
+
+def test_scan_and_remat_give_the_same_gradient():
+    loop, X0 = planar(0)
+    plain = jax.grad(value)(loop, X0)
+    again = jax.jit(jax.grad(jax.remat(value)))(loop, X0)
+
+    def descend(net, _):
+        gradient = jax.grad(lambda net: value(loop.replace(controller=net), X0))(net)
+        return jax.tree.map(lambda w, g: w - 1e-3 * g, net, gradient), gradient
+
+    _, first = jax.jit(lambda net: jax.lax.scan(descend, net, length=2))(loop.controller)
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8)  # noqa: E731
+    jax.tree.map(close, again, plain)
+    jax.tree.map(lambda a, b: close(a[0], b), first, plain.controller)
+
+
+def test_a_training_loop_compiles_once_while_neurons_become_stable():
+    loop, X0 = planar(0)
+    compiled = []
+
+    @jax.jit
+    def gradient(net):
+        compiled.append(net)
+        return jax.value_and_grad(lambda net: value(loop.replace(controller=net), X0))(net)
+
+    stable = set()
+    for shift in (0.0, 3.0, -3.0):
+        layers = loop.controller.layers
+        moved = ((layers[0][0], layers[0][1] + shift), *layers[1:])
+        net = loop.controller.replace(layers=moved)
+        assert np.isfinite(gradient(net)[0])
+        program = step_program(loop.replace(controller=net), X0, X0, TEMPLATE, 0, rj.LocalBounds())
+        stable.add(tuple((np.asarray(program.scale) == 0).tolist()))
+    assert len(stable) > 1
+    assert len(compiled) == 1
+
+
+def test_forward_mode_and_second_derivatives_raise():
+    loop, X0 = planar(0)
+    of = lambda c: value(loop.replace(plant=loop.plant.replace(c=c)), X0)  # noqa: E731
+    with pytest.raises(TypeError, match="forward-mode"):
+        jax.jvp(of, (loop.plant.c,), (loop.plant.c,))
+    with pytest.raises((TypeError, ValueError), match=r"JVP|forward-mode"):
+        jax.hessian(of)(loop.plant.c)
+
+
+def test_a_failed_solve_has_no_number_for_a_gradient(monkeypatch):
+    import cvxpy as cp
+
+    def fail(problem, **_):
+        raise cp.SolverError("broken")
+
+    loop, X0 = planar(0)
+    monkeypatch.setattr(cp.Problem, "solve", fail)
+    bound, gradient = jax.value_and_grad(value)(loop, X0)
+    assert np.isfinite(bound)  # the interval bound
+    assert all(np.isnan(leaf).any() for leaf in jax.tree.leaves(gradient.controller.layers[-1]))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_the_bounding_box_of_a_polytope_has_its_derivative(n):
+    region = simplex_region(n, seed=n)
+    weights = jnp.linspace(1.0, 2.0, 2 * n)
+
+    def of(A, b):
+        box = bounding_box(rj.Polytope(A, b))
+        return weights @ jnp.concatenate([box.lower, box.upper])
+
+    args = (jnp.asarray(region.A), jnp.asarray(region.b))
+    gradient = jax.jit(jax.grad(of, argnums=(0, 1)))(*args)
+    rng = np.random.default_rng(0)
+    direction = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), args)
+    difference = central_difference(of, args, direction, 1e-4)
+    assert dot(gradient, direction) == pytest.approx(difference, rel=1e-6)

@@ -76,6 +76,28 @@ class Settings:
     output: Path = Path("results/double_integrator")
     """Where everything is written."""
 
+    def __post_init__(self):
+        at_least = {
+            "horizon": 1,
+            "facets": 3,
+            "samples": 2,
+            "training_steps": 1,
+            "simulations": 1,
+            "seed": 0,
+        }
+        for name, least in at_least.items():
+            if getattr(self, name) < least:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} must be at least {least}, "
+                    f"but {getattr(self, name)} arrived"
+                )
+        if not 0 <= self.margin < 1:
+            raise ValueError(f"--margin must be in [0, 1), but {self.margin} arrived")
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"--hidden must be numbers of neurons, but {self.hidden} arrived")
+        if not self.relaxation:
+            raise ValueError("--relaxation must name at least one relaxation, but none arrived")
+
 
 def controller(name: str, margin: float, settings: Settings) -> Fit:
     """Sample the MPC whose state constraint is tightened by `margin`, and fit a network to it."""
@@ -143,6 +165,7 @@ def certify(name: str, fit: Fit, relaxation: str, settings: Settings) -> report.
 
 def main(settings: Settings) -> None:
     """Train, certify, print, and write the figure and the results."""
+    settings.output.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", str(settings.output.parent / "jax_cache"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
@@ -168,4 +191,9 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    try:
+        main(tyro.cli(Settings))
+    except (ValueError, OSError) as error:
+        raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted: run again to continue with what is stored") from None

@@ -6,6 +6,7 @@ A file is used again when the settings agree, and made anew, with a word about i
 import json
 import os
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import rich
@@ -15,9 +16,13 @@ def load(path, settings):
     """The arrays at `path` if `settings` made them, else None."""
     if path is None or not Path(path).exists():
         return None
-    with np.load(path) as file:
-        arrays = dict(file)
-    found = json.loads(str(arrays.pop("settings")))
+    try:
+        with np.load(path) as file:
+            arrays = dict(file)
+        found = json.loads(str(arrays.pop("settings")))
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        rich.print(f"{path} cannot be read ({type(error).__name__}): making it anew")
+        return None
     if found == settings:
         return arrays
     changed = [name for name in settings | found if settings.get(name) != found.get(name)]

@@ -62,6 +62,9 @@ class Certificate(Replaceable):
             seconds=solution.seconds,
         )
 
+    def __repr__(self) -> str:
+        return f"Certificate(facets={len(self.bounds)}, products={self.multipliers.shape[-1]})"
+
     @property
     def statuses(self) -> tuple[SolverStatus, ...]:
         """How the solver ended on each facet; each has a sentence of `advice`."""

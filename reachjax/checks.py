@@ -38,7 +38,7 @@ class Numbers:
         expected = f"{name} must be an array of shape {self.expected}"
         try:
             array = jnp.asarray(value, dtype=float)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RuntimeError) as error:
             kind = type(value).__name__
             raise TypeError(f"{expected}, but a {kind} arrived: {error}") from None
         if array.ndim not in self.ndims or array.size == 0:
@@ -65,6 +65,14 @@ def whole_number(name: str, value: Any, least: int) -> int:
     if number < least:
         raise ValueError(f"{name} must be at least {least}, but {number} arrived")
     return number
+
+
+def described(value: Any) -> str:
+    """A short word for what arrived: classes and plain values as they are, objects by kind."""
+    if isinstance(value, type | str | int | float | list | None):
+        return repr(value) if len(repr(value)) < 80 else type(value).__name__
+    kind = type(value).__name__
+    return f"{'an' if kind == 'MLP' or kind[0] in 'AEIO' else 'a'} {kind}"
 
 
 def same_size(expected: str, arrived: str, sizes: tuple[int | None, int | None]) -> None:

@@ -12,7 +12,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.certificates import Certificate
-from reachjax.checks import is_concrete, require_double_precision, same_size, whole_number
+from reachjax.checks import (
+    described,
+    is_concrete,
+    require_double_precision,
+    same_size,
+    whole_number,
+)
 from reachjax.lmi import step_program
 from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, LocalBounds
@@ -52,6 +58,10 @@ class ReachTube(Replaceable):
     sets: tuple[AbstractSet, ...]
     certificates: tuple[Certificate | None, ...]
     start: int = static(default=0)
+
+    def __repr__(self) -> str:
+        size = f"horizon={self.horizon}, facets={len(self.template)}, states={self.loop.states}"
+        return f"ReachTube({size})"
 
     @property
     def horizon(self) -> int:
@@ -166,7 +176,7 @@ def reach(
         >>> bool((tube.proof(3).gaps >= 0).all())
         True
     """
-    _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed)
+    _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
     sets: list[AbstractSet] = [X0]
     certificates: list[Certificate] = []
     steps = range(horizon)
@@ -192,7 +202,9 @@ def _with_witnesses(certificates, loop, X0, template, start, samples, seed) -> l
     ]
 
 
-def _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed) -> None:
+def _check(
+    loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress
+) -> None:
     for name, value, kind in (
         ("loop", loop, ClosedLoop),
         ("X0", X0, AbstractSet),
@@ -201,7 +213,7 @@ def _check(loop, X0, horizon, template, relaxation, window, solver, start, sampl
         ("solver", solver, AbstractSolver),
     ):
         if not isinstance(value, kind):
-            raise TypeError(f"{name} must be {EXAMPLES[kind]}, but {value!r} arrived")
+            raise TypeError(f"{name} must be {EXAMPLES[kind]}, but {described(value)} arrived")
     require_double_precision(loop=loop, X0=X0, template=template)
     same_size(
         "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)
@@ -212,6 +224,10 @@ def _check(loop, X0, horizon, template, relaxation, window, solver, start, sampl
         (loop.states, template.dimension),
     )
     loop.check_horizon(horizon, start)
+    if progress is not None and not callable(progress):
+        raise TypeError(
+            f"progress must wrap an iterable, as tqdm.tqdm does, but {progress!r} arrived"
+        )
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     try:

@@ -25,9 +25,9 @@ def volume(X: AbstractSet) -> Float[Array, ""]:
     Example:
         >>> import jax
         >>> from reachjax import Template
-        >>> area = lambda b: volume(Template.box(2).polytope(b))
-        >>> jax.grad(area)(jnp.array([2.0, 0.0, 3.0, 0.0])).tolist()  # facets x <= 2, -x <= 0, ...
-        [3.0, 3.0, 2.0, 2.0]
+        >>> template = Template.box(2)  # facets x <= 2, -x <= 0, y <= 3, -y <= 0
+        >>> jax.grad(lambda b: volume(template.polytope(b)))(jnp.array([2.0, 0, 3, 0])).round(9)
+        Array([3., 3., 2., 2.], dtype=float64)
     """
     if isinstance(X, Polytope) and X.dimension <= EXACT_DIMENSIONS:
         return polytope_volume(X)

@@ -16,8 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from reachjax.checks import described, whole_number
 from reachjax.reach import ReachTube
 from reachjax.sets import Box, PolyhedralSet, polyhedra
+from reachjax.solvers import SolverStatus
 
 AvoidSets = Sequence[PolyhedralSet] | Mapping[int, Sequence[PolyhedralSet]]
 
@@ -62,12 +64,15 @@ class Verdict:
             nothing is required. Negative: not proved.
         simulated: the same for the sampled trajectories. Negative: broken.
         counterexample: the trajectory, when refuted.
+        unsolved: how many of the tube's facets the solver did not solve to its tolerance: their
+            bounds hold, but may be loose.
     """
 
     status: VerdictStatus
     margins: dict[str, Float[np.ndarray, " h+1"]]
     simulated: dict[str, Float[np.ndarray, " h+1"]]
     counterexample: Counterexample | None = None
+    unsolved: int = 0
 
     def __bool__(self) -> bool:
         raise TypeError("a verdict has three values: compare verdict.status with VerdictStatus")
@@ -87,7 +92,14 @@ class Verdict:
                 f"  counterexample: from {np.round(e.states[0], 4).tolist()} it breaks "
                 f"{e.requirement} at t = {e.time} by {e.violation:.4g}"
             )
+        if self.unsolved:
+            lines.append(
+                f"  {self.unsolved} facets were not solved to tolerance: their bounds hold, but "
+                "may be loose (see certificate.statuses)"
+            )
         return "\n".join(lines)
+
+    __repr__ = __str__
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,8 +172,12 @@ def verify(
         [2.0, 1.2, 0.72, 0.432]
     """
     requirements = _requirements(tube, goal, avoid, safe)
-    states = [tube.proof(t).witness_states for t in range(1, tube.horizon + 1)]
-    witnessed = tube.loop.simulate(jnp.concatenate(states), tube.horizon, tube.start)
+    whole_number("samples", samples, 1)
+    whole_number("seed", seed, 0)
+    proofs = [tube.proof(t) for t in range(1, tube.horizon + 1)]
+    unsolved = sum(s is not SolverStatus.SOLVED for proof in proofs for s in proof.statuses)
+    states = jnp.concatenate([proof.witness_states for proof in proofs])
+    witnessed = tube.loop.simulate(states, tube.horizon, tube.start)
     trajectories = np.concatenate([witnessed, tube.simulate(samples, seed)])
     margins: dict[str, np.ndarray] = {}
     simulated: dict[str, np.ndarray] = {}
@@ -177,9 +193,9 @@ def verify(
             worst = (float(rooms.min()), item, trajectories[rooms.argmin()])
     if worst is not None:
         example = _counterexample(tube, *worst)
-        return Verdict(VerdictStatus.REFUTED, margins, simulated, example)
+        return Verdict(VerdictStatus.REFUTED, margins, simulated, example, unsolved)
     status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
-    return Verdict(status, margins, simulated)
+    return Verdict(status, margins, simulated, None, unsolved)
 
 
 def _counterexample(
@@ -193,7 +209,9 @@ def _requirements(
     tube: ReachTube, goal: PolyhedralSet | None, avoid: AvoidSets | None, safe: PolyhedralSet | None
 ) -> list[_Requirement]:
     if not isinstance(tube, ReachTube):
-        raise TypeError(f"tube must be a ReachTube, from reach(...), but {tube!r} arrived")
+        raise TypeError(
+            f"tube must be a ReachTube, as reach(...) returns it, but {described(tube)} arrived"
+        )
     everywhere = range(tube.horizon + 1)
     timed = avoid if isinstance(avoid, Mapping) else dict.fromkeys(everywhere, avoid or ())
     for regions in timed.values():
@@ -206,7 +224,7 @@ def _requirements(
     found += [_Requirement("safe", t, safe, True) for t in everywhere if safe is not None]
     for t, regions in timed.items():
         if t not in everywhere:
-            raise ValueError(f"avoid names time {t}, but the tube is for t = 0 .. {tube.horizon}")
+            raise ValueError(f"avoid names time {t!r}, but the tube is for t = 0 .. {tube.horizon}")
         found += [_Requirement(f"avoid[{i}]", t, A, False) for i, A in enumerate(regions)]
     if not found:
         raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")

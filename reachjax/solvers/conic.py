@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import numbers
 import time
 import warnings
 from collections.abc import Mapping
@@ -142,10 +143,11 @@ def _run(model: _Model, objective: np.ndarray, name: str, options: dict) -> Solv
 
 def _require_positive(solver: Any) -> None:
     for field in dataclasses.fields(solver):
-        value, name = getattr(solver, field.name), f"{type(solver).__name__}.{field.name}"
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        value: Any = getattr(solver, field.name)
+        name = f"{type(solver).__name__}.{field.name}"
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
             raise TypeError(f"{name} must be a number, but {value!r} arrived")
-        if not value > 0:
+        if not float(value) > 0:
             raise ValueError(f"{name} must be positive, but {value!r} arrived")
 
 

@@ -46,7 +46,7 @@ def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Arra
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _proved_offsets(solver, facts, objective, program):
+def _proved_offsets(solver, facts, objective, program) -> tuple[Array, Solution]:
     facets, size = objective.shape
     shapes = Solution.shapes(facets, program.products.free.shape[0], size)
     offsets = jax.ShapeDtypeStruct((facets,), float)
@@ -54,8 +54,8 @@ def _proved_offsets(solver, facts, objective, program):
 
 
 def _forward(solver, facts, objective, program):
-    offsets, solution = _proved_offsets(solver, facts, objective, program)
-    return (offsets, solution), (program, solution)
+    result: Any = _proved_offsets(solver, facts, objective, program)
+    return result, (program, result[1])
 
 
 def _backward(solver, residual, cotangents):

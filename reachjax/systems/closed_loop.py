@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from reachjax.checks import Numbers, same_size, whole_number
+from reachjax.checks import Numbers, described, same_size, whole_number
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.sets import Box
 from reachjax.systems.activations import ReLU, evaluate
@@ -53,8 +53,8 @@ class ClosedLoop(Replaceable):
             value = getattr(self, name)
             if not isinstance(value, kind) and not (name == "input_box" and value is None):
                 raise TypeError(
-                    f"ClosedLoop.{name} must be a {kind.__name__}, "
-                    f"but a {type(value).__name__} arrived"
+                    f"ClosedLoop.{name} must be of type {kind.__name__}, "
+                    f"but {described(value)} arrived"
                 )
         plant, net = self.plant, self.controller
         same_size(
@@ -129,8 +129,9 @@ class ClosedLoop(Replaceable):
         horizon, start = whole_number("horizon", horizon, 1), whole_number("start", start, 0)
         if self.steps is not None and start + horizon > self.steps:
             raise ValueError(
-                f"the loop is given for {self.steps} time steps, "
-                f"but steps {start} to {start + horizon} were asked for"
+                f"the loop is given for {self.steps} time steps (t = 0 .. {self.steps - 1}), "
+                f"but start {start} and horizon {horizon} ask for t = {start} .. "
+                f"{start + horizon - 1}"
             )
 
 

@@ -24,7 +24,7 @@ from reachjax.checks import is_concrete
 ADVICE = "give its layers by MLP.from_layers"
 
 
-def flax_layers(source: Any, activation: Callable) -> list[tuple[Any, Any]]:
+def flax_layers(source: Any, activation: Callable, module: Any = None) -> list[tuple[Any, Any]]:
     """The pairs `(W, b)` of a flax network in the order of the forward pass.
 
     Raises:
@@ -38,7 +38,16 @@ def flax_layers(source: Any, activation: Callable) -> list[tuple[Any, Any]]:
             f"but {type(source).__name__} arrived"
         )
     if isinstance(source, Mapping):
-        return _linen_layers(source.get("params", source))
+        pairs = _linen_layers(source.get("params", source))
+        if module is not None:
+            _require_same_module(module, pairs, activation)
+        elif _orders(pairs) > 1:
+            raise ValueError(
+                "the layers chain in more than one order, and linen numbers them as they are "
+                "constructed, not as they are applied: pass module=, the linen module, to have "
+                f"the order checked, or {ADVICE}"
+            )
+        return pairs
     linears = list(_linears(source, activation, set()))
     pairs = [_layer(linear.kernel[...], _bias(linear)) for linear in linears]
     if is_concrete(pairs) and callable(source):
@@ -149,6 +158,39 @@ def _linen_layers(params: Mapping[str, Any]) -> list[tuple[Any, Any]]:
             f"to be known, but {sorted(params)} arrived; {ADVICE}"
         )
     return [_linen_layer(name, params[name]) for name in sorted(params, key=_number)]
+
+
+def _orders(pairs: list[tuple[Any, Any]]) -> int:
+    """In how many orders the layers chain, by their shapes; two stands for more."""
+    shapes = [W.shape[::-1] for W, _ in pairs if W.ndim == 2]
+
+    def count(last: int | None, left: list[tuple[int, int]]) -> int:
+        if not left:
+            return 1
+        total = 0
+        for k, (inputs, outputs) in enumerate(left):
+            if last in (None, inputs):
+                total += count(outputs, left[:k] + left[k + 1 :])
+            if total > 1:
+                return 2
+        return total
+
+    return count(None, shapes)
+
+
+def _require_same_module(module: Any, pairs: list[tuple[Any, Any]], activation: Callable) -> None:
+    """Read a fresh set of weights of the linen module and compare outputs: values do not matter."""
+    with jax.ensure_compile_time_eval():
+        key, x = jax.random.key(0), jnp.zeros(pairs[0][0].shape[1], jnp.float32)
+        fresh = module.init(key, x)
+        leaves, structure = jax.tree.flatten(fresh)
+        keys = jax.random.split(key, len(leaves))  # biases are zero at first: make them count
+        drawn = [jax.random.normal(k, leaf.shape) for k, leaf in zip(keys, leaves, strict=True)]
+        fresh = jax.tree.unflatten(structure, drawn)
+        read = _linen_layers(fresh["params"])
+        if [W.shape for W, _ in read] != [W.shape for W, _ in pairs]:
+            raise ValueError("source holds other layers than module has when it is initialised")
+        _require_same_outputs(lambda points: module.apply(fresh, points), read, activation)
 
 
 def _number(name: str) -> int:

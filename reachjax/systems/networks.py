@@ -11,10 +11,9 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from reachjax.checks import Numbers
+from reachjax.checks import Numbers, same_size
 from reachjax.pytrees import Replaceable, converted, pytree, static
 from reachjax.systems.activations import AbstractActivation, ReLU, evaluate
 from reachjax.systems.flax_layers import flax_layers
@@ -64,7 +63,7 @@ class MLP(Replaceable):
 
     Example:
         >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[1.0, 1.0]], [0.0])])
-        >>> net(jnp.array([-3.0])).tolist()  # |x|
+        >>> net([-3.0]).tolist()  # |x|
         [3.0]
     """
 
@@ -95,7 +94,12 @@ class MLP(Replaceable):
         return cls(layers, activation)
 
     @classmethod
-    def from_flax(cls, source: Any, activation: AbstractActivation = ReLU()) -> MLP:  # noqa: B008
+    def from_flax(
+        cls,
+        source: Any,
+        activation: AbstractActivation = ReLU(),  # noqa: B008
+        module: Any = None,
+    ) -> MLP:
         """A network from a flax nnx module, or from the parameters of a linen module.
 
         The parameters may be traced, so this may be called inside a loss.
@@ -103,13 +107,16 @@ class MLP(Replaceable):
         Args:
             source: an `nnx.Module` whose linear layers are applied in the order in which they
                 were assigned, or linen's `{"params": {"Dense_0": {"kernel", "bias"}, ...}}`.
-            activation: applied between the layers; parameters do not tell which one it is.
+            activation: applied between the layers; linen's parameters do not tell which one it is,
+                and their names do not always tell the order of the layers.
+            module: the linen module itself: what is read is then compared with its output.
 
         Raises:
             TypeError: `source` is neither.
-            ValueError: it holds something else than a chain of linear layers.
+            ValueError: it holds something else than a chain of linear layers, or computes something
+                else, or the order of its layers cannot be told.
         """
-        return cls(flax_layers(source, activation), activation)
+        return cls(flax_layers(source, activation, module), activation)
 
     @property
     def inputs(self) -> int:
@@ -129,5 +136,9 @@ class MLP(Replaceable):
         return W @ x + b
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """The output for one input vector."""
-        return self.propagate(jnp.asarray(x), evaluate)
+        """The output for one input vector; `jax.vmap(net)` takes a batch."""
+        x = Numbers("(n,)")(x, "x")
+        same_size(
+            "the network's number of inputs is", "the dimension of x is", (self.inputs, len(x))
+        )
+        return self.propagate(x, evaluate)

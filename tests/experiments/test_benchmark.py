@@ -1,0 +1,111 @@
+"""The benchmark's table: the same program gives the same bounds, and ratios are of one run."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import reachjax as rj
+from experiments import benchmark
+from experiments.benchmark import REFERENCE, Case, Settings, he_network
+from experiments.double_integrator import INITIAL_BOX
+
+QUICK = {"networks": ("random",), "widths": (3,), "repetitions": 1, "patience": 1e3}
+COLUMNS = 80
+
+
+def case():
+    """A tiny network, some of whose neurons switch on the set and none of which is constant."""
+    return Case("random 2x3", he_network((2, 3, 3, 1), seed=3), np.array([[-0.25] * 2, [0.25] * 2]))
+
+
+def measured(settings):
+    return benchmark.compare(
+        [
+            benchmark.measure(case(), name, method, settings)
+            for name, method in benchmark.methods(settings).items()
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return measured(Settings(**QUICK))
+
+
+def test_the_reference_comes_first_and_every_method_has_a_row(rows):
+    assert [row["method"] for row in rows] == list(benchmark.methods(Settings(**QUICK)))
+    assert rows[0]["method"] == REFERENCE
+
+
+def test_the_same_program_has_the_same_size_and_bounds(rows):
+    reference, kept, *others = rows
+    assert (kept["n"], kept["multipliers"]) == (reference["n"], reference["multipliers"])
+    assert kept["difference"] < 1e-5
+    assert [row["difference"] for row in others] == [None, None]
+
+
+def test_no_bound_is_below_what_was_simulated_and_removal_never_loosens(rows):
+    reference, kept, removed, local = (row["slack"] for row in rows)
+    assert 0 < local <= removed + 1e-6 <= kept + 2e-6
+    assert kept == pytest.approx(reference, abs=1e-4)
+    support = case().support(seed=0)
+    assert all((row["bounds"] >= support - 1e-7).all() for row in rows)
+
+
+def test_ratios_are_of_the_seconds_of_the_same_run(rows):
+    assert rows[0]["ratio"] == 1
+    for row in rows:
+        assert row["ratio"] == rows[0]["seconds"] / row["seconds"]
+        assert row["seconds"] == pytest.approx(np.median(row["calls"]))
+
+
+@pytest.mark.parametrize("limit", [{"reference_facets": 1}, {"reference_facets": 8}])
+def test_a_reference_of_few_facets_is_scaled_up_and_says_so(limit):
+    settings = Settings(**QUICK | limit | {"patience": 0.0})  # ends after its first facet
+    row = benchmark.measure(case(), REFERENCE, benchmark.methods(settings)[REFERENCE], settings)
+    assert row["facets"] == 1
+    assert row["calls"] == []  # longer than the patience: not called again
+    assert row["seconds"] == row["first"]
+    assert np.isnan(row["slack"])
+    assert np.isnan(row["bounds"][1:]).all()
+    assert "~*" in text(benchmark.compare([row]))
+
+
+def test_the_table_fits_in_eighty_columns(rows):
+    lines = text(rows).splitlines()
+    assert max(map(len, lines)) <= COLUMNS
+    assert all(len(line) <= COLUMNS for line in benchmark.NOTE.splitlines())
+    assert all(any(name in line for line in lines) for name in benchmark.methods(Settings()))
+
+
+def text(rows):
+    from rich.console import Console
+
+    console = Console(width=COLUMNS, record=True)
+    with console.capture() as capture:
+        console.print(benchmark.table(rows))
+    return re.sub(r"\x1b\[[0-9;]*m", "", capture.get())
+
+
+def test_the_command_prints_its_tables_and_writes_strict_json(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(benchmark, "cases", lambda settings: [case()])
+    settings = Settings(**QUICK, reference_facets=1, output=tmp_path)
+    benchmark.main(settings)
+    assert "random 2x3" in capsys.readouterr().out
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    written = json.loads((tmp_path / "benchmark.json").read_text(), parse_constant=refuse)
+    assert written["settings"]["widths"] == [3]
+    assert [row["method"] for row in written["rows"]] == list(benchmark.methods(settings))
+    assert written["rows"][0]["bounds"][1:] == [None] * 7
+
+
+def test_random_networks_have_the_widths_asked_for():
+    (found,) = benchmark.cases(Settings(**QUICK))
+    assert [W.shape for W, _ in found.layers] == [(3, 2), (3, 3), (1, 3)]
+    assert found.initial.shape == INITIAL_BOX.shape
+    assert isinstance(found.loop, rj.ClosedLoop)

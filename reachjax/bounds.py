@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from reachjax.pytrees import pytree
-from reachjax.rounding import Ball
+from reachjax.rounding import Ball, gamma
 from reachjax.sets import Box
 from reachjax.systems import AbstractActivation, ClosedLoop
 
@@ -45,6 +45,8 @@ def loop_bounds(loop: ClosedLoop, box: Box, t: int | jax.Array) -> LoopBounds:
 
     def unit(activation: AbstractActivation, y: Ball) -> Ball:
         z = Ball.between(*activation.interval(y.lower, y.upper))
+        # the ends of `y` may be rounded differently where the midpoint and the radius are formed
+        z = Ball(z.mid, z.rad + gamma(8) * (abs(y.mid) + y.rad))
         units.append((y, z, *activation.phases(y.lower, y.upper)))
         return z
 
@@ -54,6 +56,13 @@ def loop_bounds(loop: ClosedLoop, box: Box, t: int | jax.Array) -> LoopBounds:
     units.insert(0, (Ball.exact(empty), Ball.exact(empty), empty > 0, empty > 0))
     y, z, passing, blocking = jax.tree.map(_concatenate, *units)
     return LoopBounds(state, y, z, passing, blocking, successor)
+
+
+@jax.jit
+def successor_box(loop: ClosedLoop, box: Box, t: int) -> Box:
+    """A box that surely holds the successors of a box of states, rounding included."""
+    successor = loop_bounds(loop, box, t).successor
+    return Box(successor.lower, successor.upper)
 
 
 def _concatenate(*arrays: Any) -> Array:

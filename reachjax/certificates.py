@@ -34,14 +34,14 @@ class Certificate(Replaceable):
     """
 
     program: Program
-    multipliers: Float[np.ndarray, "f K"]
-    moments: Float[np.ndarray, "f n n"]
-    codes: Int[np.ndarray, " f"]
-    solver_offsets: Float[np.ndarray, " f"]
-    bounds: Float[np.ndarray, " f"]
-    witnesses: Float[np.ndarray, " f"]
-    witness_states: Float[np.ndarray, "f n_x"]
-    seconds: Float[np.ndarray, " f"]
+    multipliers: Float[Array | np.ndarray, "f K"]
+    moments: Float[Array | np.ndarray, "f n n"]
+    codes: Int[Array | np.ndarray, " f"]
+    solver_offsets: Float[Array | np.ndarray, " f"]
+    bounds: Float[Array | np.ndarray, " f"]
+    witnesses: Float[Array | np.ndarray, " f"]
+    witness_states: Float[Array | np.ndarray, "f n_x"]
+    seconds: Float[Array | np.ndarray, " f"]
 
     @classmethod
     def from_solution(
@@ -72,7 +72,7 @@ class Certificate(Replaceable):
 
     @property
     def gaps(self) -> Float[np.ndarray, " f"]:
-        """`bounds - witnesses`: how much tightness may be left, never negative."""
+        """`bounds - witnesses`: how much tightness may be left; negative by rounding at most."""
         return self.bounds - self.witnesses
 
     def recheck(

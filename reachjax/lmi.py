@@ -29,6 +29,9 @@ from reachjax.rounding import Ball, gamma
 from reachjax.sets import AbstractSet, Box, Template
 from reachjax.systems import ClosedLoop
 
+CONSTANT = 1e-9
+"""An output whose radius is a smaller part than this of its input's size has a single value."""
+
 
 @pytree
 class Program(Replaceable):
@@ -60,7 +63,8 @@ def basis_box(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " n"], Floa
     """Midpoint and radius of each entry of the basis `[x, z, 1]`.
 
     A unit that has left the basis gets radius zero. One that stays although its output has a single
-    value (a dead neuron that the paper keeps) is scaled by its input, so that it does stay.
+    value (a dead neuron that the paper keeps) is scaled by its input, so that it does stay: a
+    radius at rounding level would tell the solver what the paper's constraints do not.
     """
     z = bounds.output
     if prune:
@@ -69,7 +73,8 @@ def basis_box(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " n"], Floa
     else:
         y = bounds.preactivation
         size = abs(y.mid) + y.rad
-        mid, rad = z.mid, jnp.where(z.rad > 0, z.rad, jnp.where(size > 0, size, 1.0))
+        constant = z.rad <= CONSTANT * size
+        mid, rad = z.mid, jnp.where(constant, jnp.where(size > 0, size, 1.0), z.rad)
     one = jnp.ones(1)
     return (
         jnp.concatenate([bounds.state.mid, mid, 0 * one]),
@@ -135,6 +140,8 @@ def _step_program(
     facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts)
     # the optimal value does not depend on the scaling, so neither does its derivative
     shift, scale = jax.lax.stop_gradient(basis_box(bounds, relaxation.remove_stable))
+    # one rounding of the scaling for all rows, whatever the compiler fuses
+    shift, scale = jax.lax.optimization_barrier((shift, scale))
     T = scaling(shift, scale)
     return Program(
         facts=facts @ T,

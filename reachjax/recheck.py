@@ -46,7 +46,10 @@ def sound_offsets(program: Program, multipliers: np.ndarray) -> np.ndarray:
         )
     clipped = np.where(program.products.free, multipliers, np.maximum(multipliers, 0.0))
     with np.errstate(over="ignore", invalid="ignore"):  # overflow ends in the interval bound
-        return np.array([_sound_offset(program, i, clipped[i]) for i in range(facets)])
+        by_intervals = interval_offsets(program)
+        return np.array(
+            [_sound_offset(program, i, clipped[i], float(by_intervals[i])) for i in range(facets)]
+        )
 
 
 def interval_offsets(program: Program) -> np.ndarray:
@@ -57,8 +60,9 @@ def interval_offsets(program: Program) -> np.ndarray:
     return p.mid[:, -1] + size + 2 * rounding
 
 
-def _sound_offset(program: Program, facet: int, multipliers: np.ndarray) -> float:
-    by_intervals = float(interval_offsets(program)[facet])
+def _sound_offset(
+    program: Program, facet: int, multipliers: np.ndarray, by_intervals: float
+) -> float:
     used = program.scale > 0
     matrix = _facet_matrix(program, facet, multipliers)
     mid, rad = matrix.mid[np.ix_(used, used)], matrix.rad[np.ix_(used, used)]
@@ -102,7 +106,7 @@ def _best_offset(matrix: np.ndarray) -> tuple[float, float]:
         return float(np.sum((w / (shift - values)) ** 2) - len(v))
 
     if excess(least) > 0 > excess(most):
-        shift = root_scalar(excess, bracket=(least, most)).root
+        shift = root_scalar(excess, bracket=(least, most), xtol=1e-6 * tiny, rtol=1e-12).root
     else:
         shift = least
     return (s + float(np.sum(w**2 / (shift - values)))) / 2, float(shift)

@@ -52,10 +52,14 @@ class Ball:
 
     @classmethod
     def between(cls, lower, upper) -> Self:
-        """The smallest ball that surely holds `[lower, upper]`."""
+        """A ball that surely holds `[lower, upper]`; a single point is held exactly.
+
+        A compiler may evaluate an expression in several places and round it differently in each,
+        so the radius holds for every rounding of the midpoint.
+        """
         mid = lower + (upper - lower) / 2
-        rad = jnp.maximum(upper - mid, mid - lower)
-        return cls(mid, rad * (1 + gamma(2)))
+        rad = jnp.maximum(upper - mid, mid - lower) * (1 + gamma(4)) + gamma(4) * abs(mid)
+        return cls(mid, jnp.where(lower == upper, 0.0, rad))
 
     def lift(self, other) -> Ball:
         """`other` as a ball of this kind; plain numbers are taken to be exact."""

@@ -16,15 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from reachjax.bounds import successor_box
 from reachjax.checks import described, whole_number
 from reachjax.reach import ReachTube
+from reachjax.rounding import gamma
 from reachjax.sets import Box, PolyhedralSet, polyhedra
 from reachjax.solvers import SolverStatus
 
 AvoidSets = Sequence[PolyhedralSet] | Mapping[int, Sequence[PolyhedralSet]]
 
-ROUNDING = 1e-9
-"""A trajectory must break a requirement by more than this part of the state's size to refute it."""
+SUSPECTS = 5
+"""So many of the worst trajectories of each requirement are examined with their rounding."""
 
 
 class VerdictStatus(enum.Enum):
@@ -181,28 +183,47 @@ def verify(
     trajectories = np.concatenate([witnessed, tube.simulate(samples, seed)])
     margins: dict[str, np.ndarray] = {}
     simulated: dict[str, np.ndarray] = {}
-    proved, worst = True, None
+    proved, suspects = True, []
     for item in requirements:
         blank = np.full(tube.horizon + 1, np.nan)
         margin, rooms = item.certified(tube), item.simulated(trajectories)
         margins.setdefault(item.name, blank.copy())[item.time] = margin
         simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min()
         proved = proved and item.proved(margin)
-        size = 1.0 + abs(trajectories[:, item.time]).max()
-        if rooms.min() < -ROUNDING * size and (worst is None or rooms.min() < worst[0]):
-            worst = (float(rooms.min()), item, trajectories[rooms.argmin()])
-    if worst is not None:
-        example = _counterexample(tube, *worst)
-        return Verdict(VerdictStatus.REFUTED, margins, simulated, example, unsolved)
+        worst = np.argsort(rooms)[:SUSPECTS]
+        suspects += [(rooms[k], item, trajectories[k]) for k in worst if rooms[k] <= 0]
+    for room, item, states in sorted(suspects, key=lambda suspect: suspect[0]):
+        if _surely_broken(tube, item, states[0]):
+            if proved:
+                raise RuntimeError("a proved specification is broken: please report this defect")
+            example = _counterexample(tube, room, item, states)
+            return Verdict(VerdictStatus.REFUTED, margins, simulated, example, unsolved)
     status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
     return Verdict(status, margins, simulated, None, unsolved)
+
+
+def _surely_broken(tube: ReachTube, item: _Requirement, x0: np.ndarray) -> bool:
+    """Whether the exact trajectory from `x0` breaks a requirement, rounding accounted for."""
+    X0 = tube.sets[0]
+    assert isinstance(X0, PolyhedralSet)
+    if not X0.surely_contains(x0):
+        return False
+    reached = Box(x0, x0)
+    for t in range(item.time):
+        reached = successor_box(tube.loop, reached, tube.start + t)
+    x, spread = np.asarray(reached.center), np.asarray(reached.widths)
+    C, d = (np.asarray(part) for part in item.region.facets)
+    error = abs(C) @ spread + gamma(len(x)) * (abs(C) @ abs(x) + abs(d))
+    if item.inside:
+        return bool(np.any(d - C @ x + error < 0))
+    return bool(np.all(d - C @ x - error >= 0))
 
 
 def _counterexample(
     tube: ReachTube, room: float, item: _Requirement, states: np.ndarray
 ) -> Counterexample:
     inputs = [tube.loop.input(jnp.asarray(x), tube.start + t) for t, x in enumerate(states[:-1])]
-    return Counterexample(item.name, item.time, -room, states, np.stack(inputs))
+    return Counterexample(item.name, item.time, -float(room), states, np.stack(inputs))
 
 
 def _requirements(

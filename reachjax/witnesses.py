@@ -7,6 +7,8 @@ the dual of a semidefinite program proposes.
 
 from __future__ import annotations
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +28,8 @@ def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[Array, "c n_
     """Corners of a polyhedral set of few dimensions and `count` points drawn from it."""
     states = X0.sample(jax.random.key(seed), count)
     if isinstance(X0, PolyhedralSet) and X0.dimension <= MOST_DIMENSIONS:
-        states = jnp.concatenate([X0.vertices(), states])
+        with contextlib.suppress(RuntimeError):  # too thin to have corners: do without
+            states = jnp.concatenate([X0.vertices(), states])
     # corners and points of triangulations are rounded: bring them inside, or a witness could lie
     center = states.mean(axis=0)
     inside = jnp.where(X0.contains(states)[:, None], states, center + PULL * (states - center))

@@ -75,6 +75,7 @@ BAD_VALUES = {
     "X0 cannot start a tube: .* empty: no point satisfies": lambda: reach(X0=EMPTY),
     "template is 3, but .* states is 2": lambda: reach(template=rj.Template.box(3)),
     "'MOSCOW' is not among .*CLARABEL": lambda: reach(solver=rj.CvxpySolver("MOSCOW")),
+    "dimension of x is 3, but the network's number of inputs is": lambda: NET([1, 2, 3]),
     "window must be at least 1, but 0 arrived": lambda: reach(window=0),
     "horizon must be at least 1, but 0 arrived": lambda: reach(horizon=0),
     "horizon must be at least 1, but -1 arrived": lambda: LOOP.simulate(jnp.zeros(2), -1),
@@ -94,9 +95,9 @@ BAD_VALUES = {
     r"SCS\.max_iterations must be positive": lambda: rj.SCS(max_iterations=0),
     "'OSQP' cannot solve semidefinite programs": lambda: reach(solver=rj.CvxpySolver("OSQP")),
     "window must be 1 .*, but 2 arrived": lambda: reach(window=2),
-    "3 time steps, but steps 0 to 4 were": lambda: reach(loop=LTV, horizon=4),
-    "3 time steps, but steps 2 to 4 were": lambda: reach(loop=LTV, horizon=2, start=2),
-    "3 time steps, but steps 3 to 4 were": lambda: rj.change_of_basis(LTV, t=3),
+    "3 time steps .*, but start 0 and horizon 4": lambda: reach(loop=LTV, horizon=4),
+    "3 time steps .*, but start 2 and horizon 2": lambda: reach(loop=LTV, horizon=2, start=2),
+    "3 time steps .*, but start 3 and horizon 1": lambda: rj.change_of_basis(LTV, t=3),
 }
 
 BAD_TYPES = {
@@ -105,7 +106,7 @@ BAD_TYPES = {
     r"MLP\.layers must be pairs .*ArrayImpl": lambda: rj.MLP.from_layers(jnp.ones((2, 2))),
     r"MLP\.activation must .*class.*ReLU'": lambda: NET.replace(activation=rj.ReLU),
     r"MLP\.activation must be an activation obj": lambda: NET.replace(activation=jax.nn.relu),
-    r"ClosedLoop\.plant must be .* a MLP arrived": lambda: rj.ClosedLoop(NET, PLANT),
+    r"ClosedLoop\.plant must be of type AffinePlant, but an MLP": lambda: rj.ClosedLoop(NET, PLANT),
     r"ClosedLoop\.input_box must .* a tuple": lambda: rj.ClosedLoop(PLANT, NET, (-1, 1)),
     r"X0 must be .*\[\[0, 0\], \[1, 1\]\]": lambda: reach(X0=[[0, 0], [1, 1]]),
     "loop must be a ClosedLoop": lambda: reach(loop=NET),
@@ -127,6 +128,8 @@ BAD_TYPES = {
     r"AffinePlant\.A must .* a NoneType arrived": lambda: rj.AffinePlant(None, None),
     r"MLP\.layers must be pairs .*NoneType": lambda: rj.MLP.from_layers(None),
     r"Clarabel\.tolerance must be a number": lambda: rj.Clarabel(tolerance="a"),
+    "progress must wrap an iterable": lambda: reach(progress=True),
+    "loop must be a ClosedLoop, but an AffinePlant": lambda: reach(loop=PLANT),
     "tube must be a ReachTube": lambda: rj.verify(LOOP, goal=X0),
     # misspelt options
     "tolerence": lambda: rj.Clarabel(tolerence=1e-8),

@@ -7,7 +7,7 @@ import pytest
 
 import reachjax as rj
 from tests.loops import closed_loop, random_loop
-from tests.networks import box_region, simplex_region, simulate
+from tests.networks import box_region, he_network, simplex_region, simulate
 
 RELAXATIONS = [rj.PaperQC(repeated=False), rj.PaperQC(), rj.LocalBounds()]
 
@@ -163,3 +163,43 @@ def test_networks_from_flax_certify_like_the_same_layers():
     u = np.asarray(jax.vmap(model)(states.astype(jnp.float32)), dtype=float)
     # flax computes in single precision
     assert np.all(following.contains(np.asarray(states) + u, 1e-6))
+
+
+def test_a_bound_holds_where_the_compiler_rounds_one_interval_in_two_ways():
+    """Weights and states at which midpoint and radius once came from differently rounded ends."""
+    low, high, x, width = (
+        -0.7649749052306714,
+        -0.6883266959269972,
+        -122253.08195867075,
+        1862861.6770764177,
+    )
+    net = rj.MLP.from_layers([([[1.0]], [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[1.0]]), net, rj.Box([low], [high]))
+    for solver in (rj.Clarabel(max_iterations=1), rj.Clarabel()):
+        for relaxation in RELAXATIONS:
+            tube = rj.reach(
+                loop, rj.Box([x], [x + width]), 1, rj.Template.box(1), relaxation, solver=solver
+            )
+            assert tube.proof(1).bounds[0] >= high  # attained: the input is clipped there
+            assert tube.proof(1).bounds[1] >= -low
+
+
+@pytest.mark.parametrize("scale", [1e-10, 1e-6, 1e-2, 1e3, 1e6])
+def test_bounds_are_as_tight_for_small_and_large_units_of_the_state(scale):
+    layers = he_network((2, 6, 1), seed=1)
+    scaled = [(layers[0][0] / scale, layers[0][1]), (scale * layers[1][0], scale * layers[1][1])]
+    B, box = np.array([[0.1], [0.5]]), rj.Box([-0.4 * scale], [0.3 * scale])
+    loop = rj.ClosedLoop(
+        rj.AffinePlant([[1.0, 0.5], [0.0, 1.0]], B), rj.MLP.from_layers(scaled), box
+    )
+    X0 = rj.Box([-0.2 * scale, 0.1 * scale], [0.3 * scale, 0.4 * scale])
+    tube = rj.reach(loop, X0, 2, rj.Template.octagonal(2))
+    one = rj.reach(
+        rj.ClosedLoop(loop.plant, rj.MLP.from_layers(layers), rj.Box([-0.4], [0.3])),
+        rj.Box([-0.2, 0.1], [0.3, 0.4]),
+        2,
+        rj.Template.octagonal(2),
+    )
+    for t in (1, 2):
+        np.testing.assert_allclose(tube.sets[t].b / scale, one.sets[t].b, rtol=1e-5, atol=1e-6)
+        assert np.all(tube.proof(t).gaps >= -1e-12 * scale)

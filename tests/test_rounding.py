@@ -137,7 +137,8 @@ def test_a_ball_between_two_bounds_holds_both_and_little_more(data):
     assert (fractions(upper) <= mid + rad).all()
     size = abs(fractions(lower)) + abs(fractions(upper))
     half = (fractions(upper) - fractions(lower)) / 2
-    assert (rad <= half * (1 + Fraction(40 * UNIT)) + Fraction(2 * UNIT) * size).all()
+    # the radius covers every rounding of the midpoint, not only the one seen here
+    assert (rad <= half * (1 + Fraction(40 * UNIT)) + Fraction(16 * UNIT) * size).all()
 
 
 def test_a_ball_between_equal_bounds_is_that_number():

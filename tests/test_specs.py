@@ -136,3 +136,14 @@ def test_a_verdict_is_no_truth_value(tube):
     verdict = rj.verify(tube, safe=rj.Box([0, 0], [1, 1]))
     with pytest.raises(TypeError, match=r"compare verdict\.status"):
         bool(verdict)
+
+
+def test_a_violation_that_rounding_makes_is_no_counterexample():
+    """Exactly `u = x`, but the simulation rounds upwards over large intermediate numbers."""
+    K, high = 2.0**30, 1 + 2.0**-22 * 0.9
+    net = rj.MLP.from_layers([([[1.0], [0.0]], [K, K]), ([[1.0, -1.0]], [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[1.0]]), net)
+    tube = rj.reach(loop, rj.Box([0.0], [high]), 1, rj.Template.box(1))
+    verdict = rj.verify(tube, goal=rj.Box([-1.0], [high]))
+    assert np.nanmin(verdict.simulated["goal"]) < -1e-9
+    assert verdict.status is not rj.VerdictStatus.REFUTED

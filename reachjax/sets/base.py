@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from reachjax.checks import Numbers, same_size
 from reachjax.pytrees import Replaceable
+from reachjax.rounding import gamma
 
 if TYPE_CHECKING:
     from reachjax.sets.box import Box
@@ -81,6 +82,12 @@ class PolyhedralSet(AbstractSet):
     @abc.abstractmethod
     def vertices(self) -> Float[Array, "v n"]:
         """The corners; their convex hull is the set."""
+
+    def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
+        """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
+        A, b = self.facets
+        x = self._points(point)
+        return bool(jnp.all(A @ x + gamma(self.dimension) * (abs(A) @ abs(x)) <= b))
 
     def facts(self) -> Float[Array, "m n+1"]:
         """The rows `[-a, b]`: a facet's slack `b - a . x` is never negative."""

@@ -107,12 +107,18 @@ class Box(PolyhedralSet):
         rounding = gamma(self.dimension) * jnp.sum(abs(terms), axis=-1)
         return jnp.sum(terms, axis=-1) + jnp.where(inexact, rounding, 0.0)
 
+    def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
+        """Whether a point lies in the box: comparisons are exact."""
+        x = self._points(point)
+        return bool(jnp.all((self.lower <= x) & (x <= self.upper)))
+
     def vertices(self) -> Float[Array, "2**n n"]:
         """All corners, flat coordinates included.
 
         Raises:
             ValueError: there are more than 65536 of them.
         """
+        self._single()
         if 2**self.dimension > MOST_CORNERS:
             raise ValueError(
                 f"a box of dimension {self.dimension} has {2**self.dimension} corners, "
@@ -130,6 +136,7 @@ class Box(PolyhedralSet):
 
     def volume(self) -> Float[Array, ""]:
         """The product of the widths."""
+        self._single()
         return jnp.prod(self.widths)
 
     def bounding_box(self) -> Box:

@@ -15,8 +15,10 @@ from scipy.spatial import ConvexHull, Delaunay, HalfspaceIntersection, QhullErro
 
 from reachjax.rounding import gamma
 
+TOO_THIN = "the polytope is too thin for its corners to be told apart"
+
 FLAT = 1e-9
-"""A polytope whose largest inscribed ball is smaller than this part of its size is flat."""
+"""Scaled to a unit box, a polytope whose largest inscribed ball is smaller than this is flat."""
 
 
 def balanced(A: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -149,18 +151,30 @@ def chebyshev(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The corners of a bounded polytope `(v, n)`; a flat one is treated in its affine hull."""
-    A, b = balanced(A, b)
-    lower, upper = bounding_box(A, b)
-    size = max(float(np.max(upper - lower)), np.finfo(float).tiny)
-    center, radius = chebyshev(A, b)
+    """The corners of a bounded polytope `(v, n)`; a flat one is treated in its affine hull.
+
+    Raises:
+        RuntimeError: the polytope is too thin for its corners to be told apart.
+    """
     if A.shape[1] == 1:
         ends = b / A[:, 0]
         return np.unique([[ends[A[:, 0] < 0].max()], [ends[A[:, 0] > 0].min()]], axis=0)
-    if radius > FLAT * size:
+    lower, upper = bounding_box(A, b)
+    middle, radii = (lower + upper) / 2, (upper - lower) / 2
+    radii = np.where(radii > FLAT * radii.max(), radii, radii.max() or 1.0)
+    try:
+        return middle + radii * _unit_vertices(*balanced(A * radii, b - A @ middle))
+    except QhullError as error:
+        raise RuntimeError(f"{TOO_THIN}: {str(error).splitlines()[0]}") from None
+
+
+def _unit_vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The corners of a polytope whose bounding box is the unit box, or flat in some coordinates."""
+    center, radius = chebyshev(A, b)
+    if radius > FLAT:
         corners = HalfspaceIntersection(np.hstack([A, -b[:, None]]), center).intersections
         return corners[ConvexHull(corners).vertices]
-    basis = _affine_hull(A, b, center, FLAT * size)
+    basis = _affine_hull(A, b, center, FLAT)
     if basis.shape[1] == 0:
         return center[None]
     reduced = A @ basis
@@ -169,13 +183,24 @@ def vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     return center + vertices(reduced[kept], slack[kept]) @ basis.T
 
 
+def extreme_points(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The corners, or where they cannot be told apart, points that linear programs find."""
+    try:
+        return vertices(A, b)
+    except RuntimeError:
+        A, b = balanced(A, b)
+        n = A.shape[1]
+        draws = np.random.default_rng(0).normal(size=(8 * n, n))
+        return np.stack([maximiser(A, b, d)[1] for d in np.vstack([np.eye(n), -np.eye(n), draws])])
+
+
 def _affine_hull(A: np.ndarray, b: np.ndarray, point: np.ndarray, tolerance: float) -> np.ndarray:
     """An orthonormal basis `(n, k)` of the directions in which a flat polytope extends."""
     norms = np.linalg.norm(A, axis=1)
     extent = [-_least(A, b, a) for a in A / norms[:, None]]
     tight = np.array(extent) + b / norms <= 4 * tolerance
     if not tight.any():
-        raise RuntimeError("the polytope is too thin for its corners to be told apart")
+        raise RuntimeError(TOO_THIN)
     _, values, rows = np.linalg.svd(A[tight] / norms[tight, None])
     rank = int(np.sum(values > 1e-6))
     return rows[rank:].T
@@ -231,7 +256,7 @@ def facet_areas(A: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.nda
 
 def uniform(A: np.ndarray, b: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
     """`count` points drawn uniformly, by a triangulation of the corners `(count, n)`."""
-    corners = vertices(A, b)
+    corners = extreme_points(A, b)
     center = corners.mean(axis=0)
     _, values, rows = np.linalg.svd(corners - center, full_matrices=False)
     spanned = rows[values > FLAT * max(values.max(initial=0.0), np.finfo(float).tiny)]

@@ -10,20 +10,21 @@ from reachjax.recheck import interval_offsets, sound_offsets
 from reachjax.solvers.base import Solution, SolverStatus
 
 SHORTFALL = 1e-3
-"""A claim that its multipliers miss by more than this, relatively, is not the optimal value."""
+"""A claim that its multipliers miss by more than this part of the interval's radius is none."""
 
 
 def accepted_offsets(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
     """The rechecked offsets, never below what the relaxation itself gives.
 
     The recheck knows that the basis is bounded, so it may prove less than the program's optimal
-    value. Where the solver has that value, the offset stays there: it means what the relaxation's
-    name says, and its derivative is the program's. Where the solver has none, or its multipliers
-    fall short of it, interval arithmetic is taken if it is better.
+    value. Where the solver solved the program, the offset stays at that value: it means what the
+    relaxation's name says, and its derivative is the program's. Elsewhere, or where the multipliers
+    fall short of the claim, it is what is proved, by multipliers or by intervals.
     """
-    offsets = sound_offsets(program, solution.multipliers)
+    by_intervals = interval_offsets(program)
+    offsets = np.fmin(sound_offsets(program, solution.multipliers), by_intervals)
     claims = np.asarray(solution.offsets)
-    answered = np.isin(solution.statuses, (SolverStatus.SOLVED, SolverStatus.INACCURATE))
-    borne_out = offsets <= claims + SHORTFALL * (1 + abs(claims))  # False where the claim is NaN
-    relaxed, fallback = np.fmax(offsets, claims), np.fmin(offsets, interval_offsets(program))
-    return np.where(answered & borne_out, relaxed, fallback)
+    solved = (np.asarray(solution.statuses) == SolverStatus.SOLVED) & np.isfinite(claims)
+    size = by_intervals - np.asarray(program.objective.mid)[:, -1]
+    borne_out = offsets <= claims + SHORTFALL * size  # False where the claim is NaN
+    return np.where(solved & borne_out, np.fmax(offsets, claims), offsets)

@@ -26,7 +26,9 @@ class CompactProgram(NamedTuple):
 
     Attributes:
         generators: sparse `(n * n, K')`, the flattened `G_k`.
-        objective: `(f, n)`.
+        objective: `(f, n)`, of unit 1-norm and without a constant.
+        centers: `(f,)`, the constants; a facet's offset is `centers + units b`.
+        units: `(f,)`; the program's multipliers are those of the scaled objective times this.
         free: `(K',)`, multipliers of either sign.
         columns: `(n,)`, numbers of the columns kept.
         kept: `(K',)`, numbers of the multipliers kept.
@@ -35,6 +37,8 @@ class CompactProgram(NamedTuple):
 
     generators: sp.csc_array
     objective: np.ndarray
+    centers: np.ndarray
+    units: np.ndarray
     free: np.ndarray
     columns: np.ndarray
     kept: np.ndarray
@@ -52,9 +56,17 @@ def compact(program: Program) -> CompactProgram:
     generators, norms = _generators(program, facts)
     kept = np.flatnonzero(norms > 0)
     unit_size = sp.diags_array(1 / norms[kept])
+    # solvers' tolerances are absolute, objectives come in the size of the set of states
+    objective = np.asarray(program.objective.mid)[:, columns].copy()
+    centers = objective[:, -1].copy()
+    objective[:, -1] = 0.0
+    sizes = abs(objective).sum(axis=1)
+    units = np.where(sizes > 0, sizes, 1.0)
     return CompactProgram(
         generators=sp.csc_array(generators[:, kept] @ unit_size),
-        objective=np.asarray(program.objective.mid)[:, columns],
+        objective=objective / units[:, None],
+        centers=centers,
+        units=units,
         free=np.asarray(program.products.free)[kept],
         columns=columns,
         kept=kept,

@@ -94,14 +94,15 @@ class _ConicSolver(AbstractSolver, abc.ABC):
         for i in range(facets):
             began = time.perf_counter()
             status = _run(model, reduced.objective[i], name, options)
+            center, unit = reduced.centers[i], reduced.units[i]
             solution.statuses[i] = status
             solution.seconds[i] = time.perf_counter() - began
             if model.offset.value is None or model.signed.value is None:
                 continue
-            multipliers = model.multipliers(reduced)
+            multipliers = unit * model.multipliers(reduced)
             if not np.isfinite(multipliers).all():
                 continue
-            solution.offsets[i] = model.offset.value
+            solution.offsets[i] = center + unit * float(model.offset.value)
             solution.multipliers[i, reduced.kept] = multipliers
             moment = np.asarray(model.lmi.dual_value, dtype=float)
             if moment.ndim == 2 and moment[-1, -1] > 0:
@@ -137,6 +138,12 @@ def _run(model: _Model, objective: np.ndarray, name: str, options: dict) -> Solv
                 raise ValueError(
                     f"the solver {name!r} cannot solve semidefinite programs"
                 ) from None
+            return SolverStatus.FAILED
+        except Exception:
+            raise
+        except BaseException as error:  # a panic of compiled code is no Exception
+            if isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit):
+                raise
             return SolverStatus.FAILED
     return STATUSES.get(model.problem.status, SolverStatus.FAILED)
 

@@ -16,7 +16,6 @@ from jaxtyping import Array, ArrayLike, Float
 from reachjax.checks import Numbers, same_size
 from reachjax.pytrees import Replaceable, converted, pytree, static
 from reachjax.systems.activations import AbstractActivation, ReLU, evaluate
-from reachjax.systems.flax_layers import flax_layers
 
 Unit = Callable[[AbstractActivation, Any], Any]
 """What is done at a nonlinear layer: `(activation, inputs) -> outputs`."""
@@ -116,6 +115,8 @@ class MLP(Replaceable):
             ValueError: it holds something else than a chain of linear layers, or computes something
                 else, or the order of its layers cannot be told.
         """
+        from reachjax.systems.flax_layers import flax_layers
+
         return cls(flax_layers(source, activation, module), activation)
 
     @property

@@ -143,7 +143,7 @@ def test_a_network_from_linen_parameters_maps_as_the_module_does(use_bias, wrap)
     module = Linen(use_bias=use_bias)
     x = jax.random.normal(jax.random.key(1), (20, 4))
     variables = module.init(jax.random.key(0), x)
-    net = rj.MLP.from_flax(wrap(variables))
+    net = rj.MLP.from_flax(wrap(variables), module=module)
     assert len(net.layers) == 13
     np.testing.assert_allclose(jax.vmap(net)(x), module.apply(variables, x), rtol=1e-6, atol=1e-7)
 
@@ -217,6 +217,30 @@ def test_attributes_are_refused_where_their_order_cannot_be_checked():
     graph, weights = nnx.split(Around(nnx.relu))
     with pytest.raises(ValueError, match=r"whose order is lost inside jit: keep them in nnx\.List"):
         jax.jit(lambda w: rj.MLP.from_flax(nnx.merge(graph, w))(jnp.ones(2)))(weights)
+
+
+class Nested(linen.Module):
+    """The outer layer is constructed first, so linen numbers it 0."""
+
+    @linen.compact
+    def __call__(self, x):
+        return linen.Dense(2)(linen.relu(linen.Dense(2)(x)))
+
+
+def test_linen_layers_that_chain_in_several_orders_are_refused_without_their_module():
+    variables = Nested().init(jax.random.key(0), jnp.ones(2))
+    with pytest.raises(ValueError, match=r"chain in more than one order.*pass module="):
+        rj.MLP.from_flax(variables)
+    with pytest.raises(ValueError, match="computes something else than its linear layers"):
+        rj.MLP.from_flax(variables, module=Nested())
+    assert (
+        len(
+            rj.MLP.from_flax(
+                Linen(sizes=(2, 2)).init(jax.random.key(0), jnp.ones(2)), module=Linen(sizes=(2, 2))
+            ).layers
+        )
+        == 2
+    )
 
 
 def test_linen_layers_whose_names_do_not_tell_their_order_are_refused():

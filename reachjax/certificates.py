@@ -71,7 +71,7 @@ class Certificate(Replaceable):
         return tuple(SolverStatus(int(code)) for code in self.codes)
 
     @property
-    def gaps(self) -> Float[np.ndarray, " f"]:
+    def gaps(self) -> Float[Array | np.ndarray, " f"]:
         """`bounds - witnesses`: how much tightness may be left; negative by rounding at most."""
         return self.bounds - self.witnesses
 

@@ -22,7 +22,7 @@ def accepted_offsets(program: Program, solution: Solution) -> Float[np.ndarray, 
     fall short of the claim, it is what is proved, by multipliers or by intervals.
     """
     by_intervals = interval_offsets(program)
-    offsets = np.fmin(sound_offsets(program, solution.multipliers), by_intervals)
+    offsets = np.fmin(sound_offsets(program, np.asarray(solution.multipliers)), by_intervals)
     claims = np.asarray(solution.offsets)
     solved = (np.asarray(solution.statuses) == SolverStatus.SOLVED) & np.isfinite(claims)
     size = by_intervals - np.asarray(program.objective.mid)[:, -1]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from reachjax.lmi import Program
 
@@ -60,11 +60,11 @@ class Solution(NamedTuple):
         seconds: `(f,)`, wall time of each facet.
     """
 
-    offsets: Float[np.ndarray, " f"]
-    multipliers: Float[np.ndarray, "f K"]
-    moments: Float[np.ndarray, "f n n"]
-    statuses: Int[np.ndarray, " f"]
-    seconds: Float[np.ndarray, " f"]
+    offsets: Float[Array | np.ndarray, " f"]
+    multipliers: Float[Array | np.ndarray, "f K"]
+    moments: Float[Array | np.ndarray, "f n n"]
+    statuses: Int[Array | np.ndarray, " f"]
+    seconds: Float[Array | np.ndarray, " f"]
 
     @classmethod
     def shapes(cls, facets: int, multipliers: int, size: int) -> Solution:

@@ -6,6 +6,7 @@ the reference's step from the set before it, so every step is a comparison of on
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -174,3 +175,26 @@ def test_a_box_and_the_polytope_of_its_facets_give_the_same_bounds(n_x):
         for initial in (box, rj.Polytope(region.A, region.b))
     ]
     np.testing.assert_allclose(*bounds, rtol=1e-5, atol=1e-5)
+
+
+def test_neurons_whose_output_is_constant_do_not_tell_the_solver_their_value():
+    """A dead layer makes the next one constant to rounding; the paper's program does not know."""
+    rng = np.random.default_rng(0)
+    sizes = (2, 3, 3, 1)
+    layers = [
+        (rng.normal(size=(out, into)) * np.sqrt(2 / into), 0.1 * rng.normal(size=out))
+        for into, out in pairwise(sizes)
+    ]
+    layers[0][1][:] = -20.0
+    A, B, c = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]]), np.zeros(2)
+    loop = LoopData(layers, A, B, c, np.array([-1.0]), np.array([1.0]))
+    X0, a = rj.Box([0.25, -0.25], [0.75, 0.25]), directions(2, extra=2)
+    following, certificate = rj.reach_step(
+        closed_loop(loop), X0, rj.Template(a), relaxation=rj.PaperQC(repeated=True)
+    )
+    facets = map(np.asarray, X0.facets)
+    reference, _ = paper_step(
+        layers, A, B, c, loop.u_lower, loop.u_upper, *facets, a, repeated=True
+    )
+    np.testing.assert_allclose(following.b, reference, rtol=1e-5, atol=1e-5)
+    assert set(certificate.statuses) == {rj.SolverStatus.SOLVED}

@@ -17,14 +17,15 @@ def accepted_offsets(program: Program, solution: Solution) -> Float[np.ndarray, 
     """The rechecked offsets, never below what the relaxation itself gives.
 
     The recheck knows that the basis is bounded, so it may prove less than the program's optimal
-    value. Where the solver solved the program, the offset stays at that value: it means what the
-    relaxation's name says, and its derivative is the program's. Elsewhere, or where the multipliers
-    fall short of the claim, it is what is proved, by multipliers or by intervals.
+    value. Where the solver has that value, the offset stays there: it means what the relaxation's
+    name says, and its derivative is the program's. Elsewhere, or where the multipliers fall short
+    of the claim, it is what is proved, by multipliers or by intervals.
     """
     by_intervals = interval_offsets(program)
     offsets = np.fmin(sound_offsets(program, np.asarray(solution.multipliers)), by_intervals)
     claims = np.asarray(solution.offsets)
-    solved = (np.asarray(solution.statuses) == SolverStatus.SOLVED) & np.isfinite(claims)
+    answers = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
+    answered = np.isin(solution.statuses, answers) & np.isfinite(claims)
     size = by_intervals - np.asarray(program.objective.mid)[:, -1]
     borne_out = offsets <= claims + SHORTFALL * size  # False where the claim is NaN
-    return np.where(solved & borne_out, np.fmax(offsets, claims), offsets)
+    return np.where(answered & borne_out, np.fmax(offsets, claims), offsets)

@@ -21,6 +21,9 @@ from reachjax.lmi import Program
 from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
 from reachjax.solvers.compact import CompactProgram, compact
 
+RESCALINGS = (1.0, 8.0, 0.125, 64.0, 1.0)
+"""Factors on the objective, tried in turn while a solver stalls: another scale often helps it."""
+
 STATUSES = {
     "optimal": SolverStatus.SOLVED,
     "optimal_inaccurate": SolverStatus.INACCURATE,
@@ -91,18 +94,22 @@ class _ConicSolver(AbstractSolver, abc.ABC):
         model = _Model(reduced)
         facets, size = program.objective.mid.shape
         solution = Solution.blank(facets, len(program.products.free), size)
-        for i in range(facets):
+        for i, (row, center, unit) in enumerate(
+            zip(reduced.objective, reduced.centers, reduced.units, strict=True)
+        ):
             began = time.perf_counter()
-            status = _run(model, reduced.objective[i], name, options)
-            center, unit = reduced.centers[i], reduced.units[i]
+            for factor in RESCALINGS:
+                status = _run(model, factor * row, name, options)
+                if status not in (SolverStatus.INACCURATE, SolverStatus.FAILED):
+                    break
             solution.statuses[i] = status
             solution.seconds[i] = time.perf_counter() - began
             if model.offset.value is None or model.signed.value is None:
                 continue
-            multipliers = unit * model.multipliers(reduced)
+            multipliers = unit / factor * model.multipliers(reduced)
             if not np.isfinite(multipliers).all():
                 continue
-            solution.offsets[i] = center + unit * float(model.offset.value)
+            solution.offsets[i] = center + unit / factor * float(model.offset.value)
             solution.multipliers[i, reduced.kept] = multipliers
             moment = np.asarray(model.lmi.dual_value, dtype=float)
             if moment.ndim == 2 and moment[-1, -1] > 0:

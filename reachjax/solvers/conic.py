@@ -98,11 +98,7 @@ class _ConicSolver(AbstractSolver, abc.ABC):
             zip(reduced.objective, reduced.centers, reduced.units, strict=True)
         ):
             began = time.perf_counter()
-            for factor in RESCALINGS:
-                status = _run(model, factor * row, name, options)
-                if status not in (SolverStatus.INACCURATE, SolverStatus.FAILED):
-                    break
-            solution.statuses[i] = status
+            solution.statuses[i], factor = _run_scaled(model, row, name, options)
             solution.seconds[i] = time.perf_counter() - began
             if model.offset.value is None or model.signed.value is None:
                 continue
@@ -127,6 +123,18 @@ def _require_installed(name: str) -> None:
             f"the solver {name!r} is not among those that cvxpy finds here: "
             f"{', '.join(cp.installed_solvers())}"
         )
+
+
+def _run_scaled(
+    model: _Model, row: np.ndarray, name: str, options: dict
+) -> tuple[SolverStatus, float]:
+    """Solve for one objective row, at other scales while the solver stalls; the scale used last."""
+    status, factor = SolverStatus.FAILED, 1.0
+    for factor in RESCALINGS:
+        status = _run(model, factor * row, name, options)
+        if status not in (SolverStatus.INACCURATE, SolverStatus.FAILED):
+            break
+    return status, factor
 
 
 def _run(model: _Model, objective: np.ndarray, name: str, options: dict) -> SolverStatus:

@@ -12,11 +12,19 @@ from reachjax.basis import ChangeOfBasis, change_of_basis
 from reachjax.certificates import Certificate
 from reachjax.reach import ReachTube, reach, reach_step
 from reachjax.relaxation import AbstractRelaxation, LocalBounds, PaperQC
+from reachjax.requirements import shortfall
 from reachjax.sets import AbstractSet, Box, PolyhedralSet, Polytope, Template
 from reachjax.sizes import log_volume, log_widths, volume
 from reachjax.solvers import SCS, AbstractSolver, Clarabel, CvxpySolver, SolverStatus
 from reachjax.specs import Counterexample, Verdict, VerdictStatus, verify
 from reachjax.systems import MLP, AbstractActivation, AffinePlant, ClosedLoop, ReLU
+from reachjax.training import (
+    PenaltySchedule,
+    failures,
+    skip_failures,
+    specification_penalty,
+    volume_penalty,
+)
 
 __version__ = "0.1.0"
 
@@ -37,6 +45,7 @@ __all__ = [
     "CvxpySolver",
     "LocalBounds",
     "PaperQC",
+    "PenaltySchedule",
     "PolyhedralSet",
     "Polytope",
     "ReLU",
@@ -46,10 +55,15 @@ __all__ = [
     "Verdict",
     "VerdictStatus",
     "change_of_basis",
+    "failures",
     "log_volume",
     "log_widths",
     "reach",
     "reach_step",
+    "shortfall",
+    "skip_failures",
+    "specification_penalty",
     "verify",
     "volume",
+    "volume_penalty",
 ]

@@ -98,4 +98,4 @@ class Certificate(Replaceable):
         """
         proposed = self.multipliers if multipliers is None else multipliers
         solution = Solution(self.solver_offsets, proposed, self.moments, self.codes, self.seconds)
-        return accepted_offsets(jax.device_get(self.program), solution)
+        return accepted_offsets(jax.device_get(self.program), solution)[0]

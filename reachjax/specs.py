@@ -10,20 +10,18 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from reachjax.bounds import successor_box
-from reachjax.checks import described, whole_number
+from reachjax.checks import whole_number
 from reachjax.reach import ReachTube
+from reachjax.requirements import AvoidSets, Requirement, requirements
 from reachjax.rounding import gamma
-from reachjax.sets import Box, PolyhedralSet, polyhedra
+from reachjax.sets import Box, PolyhedralSet
 from reachjax.solvers import SolverStatus
-
-AvoidSets = Sequence[PolyhedralSet] | Mapping[int, Sequence[PolyhedralSet]]
 
 SUSPECTS = 5
 """So many of the worst trajectories of each requirement are examined with their rounding."""
@@ -104,38 +102,6 @@ class Verdict:
     __repr__ = __str__
 
 
-@dataclasses.dataclass(frozen=True)
-class _Requirement:
-    """A set to be inside of, or to stay out of, at one time."""
-
-    name: str
-    time: int
-    region: PolyhedralSet
-    inside: bool
-
-    def certified(self, tube: ReachTube) -> float:
-        """How far every state surely is on the right side."""
-        reached = tube.sets[self.time]
-        C, d = (np.asarray(part) for part in self.region.facets)
-        if self.inside:
-            norms = np.linalg.norm(C, axis=1)
-            return float(np.min((d - np.asarray(reached.support(C))) / norms))
-        assert isinstance(reached, PolyhedralSet)
-        A, b = (np.asarray(part) for part in reached.facets)
-        return polyhedra.separation(A, b, C, d)
-
-    def simulated(self, trajectories: np.ndarray) -> np.ndarray:
-        """How far each trajectory `(c,)` is on the right side; negative on the wrong one."""
-        C, d = (np.asarray(part) for part in self.region.facets)
-        room = (d - trajectories[:, self.time] @ C.T) / np.linalg.norm(C, axis=1)
-        depth = room.min(axis=1)
-        return depth if self.inside else -depth
-
-    def proved(self, margin: float) -> bool:
-        """Sets are closed: touching is inside."""
-        return margin >= 0 if self.inside else margin > 0
-
-
 def verify(
     tube: ReachTube,
     goal: PolyhedralSet | None = None,
@@ -173,7 +139,7 @@ def verify(
         >>> verify(tube, goal=Box([0.0], [0.4])).counterexample.states.ravel().round(3).tolist()
         [2.0, 1.2, 0.72, 0.432]
     """
-    requirements = _requirements(tube, goal, avoid, safe)
+    required = requirements(tube, goal, avoid, safe)
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     proofs = [tube.proof(t) for t in range(1, tube.horizon + 1)]
@@ -184,9 +150,9 @@ def verify(
     margins: dict[str, np.ndarray] = {}
     simulated: dict[str, np.ndarray] = {}
     proved, suspects = True, []
-    for item in requirements:
+    for item in required:
         blank = np.full(tube.horizon + 1, np.nan)
-        margin, rooms = item.certified(tube), item.simulated(trajectories)
+        margin, rooms = float(item.margins(tube).min()), item.simulated(trajectories)
         margins.setdefault(item.name, blank.copy())[item.time] = margin
         simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min()
         proved = proved and item.proved(margin)
@@ -202,7 +168,7 @@ def verify(
     return Verdict(status, margins, simulated, None, unsolved)
 
 
-def _surely_broken(tube: ReachTube, item: _Requirement, x0: np.ndarray) -> bool:
+def _surely_broken(tube: ReachTube, item: Requirement, x0: np.ndarray) -> bool:
     """Whether the exact trajectory from `x0` breaks a requirement, rounding accounted for."""
     X0 = tube.sets[0]
     assert isinstance(X0, PolyhedralSet)
@@ -220,44 +186,7 @@ def _surely_broken(tube: ReachTube, item: _Requirement, x0: np.ndarray) -> bool:
 
 
 def _counterexample(
-    tube: ReachTube, room: float, item: _Requirement, states: np.ndarray
+    tube: ReachTube, room: float, item: Requirement, states: np.ndarray
 ) -> Counterexample:
     inputs = [tube.loop.input(jnp.asarray(x), tube.start + t) for t, x in enumerate(states[:-1])]
     return Counterexample(item.name, item.time, -float(room), states, np.stack(inputs))
-
-
-def _requirements(
-    tube: ReachTube, goal: PolyhedralSet | None, avoid: AvoidSets | None, safe: PolyhedralSet | None
-) -> list[_Requirement]:
-    if not isinstance(tube, ReachTube):
-        raise TypeError(
-            f"tube must be a ReachTube, as reach(...) returns it, but {described(tube)} arrived"
-        )
-    everywhere = range(tube.horizon + 1)
-    timed = avoid if isinstance(avoid, Mapping) else dict.fromkeys(everywhere, avoid or ())
-    for regions in timed.values():
-        if not isinstance(regions, Sequence):
-            raise TypeError(
-                "avoid must be a sequence of sets, avoid=[A, ...], or a mapping from a time to "
-                f"one, avoid={{t: [A, ...]}}, but a {type(regions).__name__} arrived"
-            )
-    found = [_Requirement("goal", tube.horizon, goal, True)] if goal is not None else []
-    found += [_Requirement("safe", t, safe, True) for t in everywhere if safe is not None]
-    for t, regions in timed.items():
-        if t not in everywhere:
-            raise ValueError(f"avoid names time {t!r}, but the tube is for t = 0 .. {tube.horizon}")
-        found += [_Requirement(f"avoid[{i}]", t, A, False) for i, A in enumerate(regions)]
-    if not found:
-        raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")
-    for item in found:
-        if not isinstance(item.region, PolyhedralSet):
-            kind = type(item.region).__name__
-            raise TypeError(f"{item.name} must be a Box or a Polytope, but a {kind} arrived")
-        if isinstance(item.region, Box) and item.region.steps is not None:
-            raise ValueError(f"{item.name} must be one box, but a time-varying one arrived")
-        if item.region.dimension != tube.loop.states:
-            raise ValueError(
-                f"{item.name} has dimension {item.region.dimension}, "
-                f"but the loop has {tube.loop.states} states"
-            )
-    return found

@@ -1,4 +1,4 @@
-"""Polytopes on the host: linear programs by HiGHS, hulls and triangulations by Qhull (scipy).
+"""Linear programs over polytopes, on the host by HiGHS (scipy).
 
 An optimal value that comes out of a linear-programming code is only as good as its tolerance, so
 what is used in a certificate is rebuilt from the dual solution: for any `y >= 0`,
@@ -7,18 +7,10 @@ what is used in a certificate is rebuilt from the dual solution: for any `y >= 0
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from scipy.optimize import linprog
-from scipy.spatial import ConvexHull, Delaunay, HalfspaceIntersection, QhullError
 
 from reachjax.rounding import gamma
-
-TOO_THIN = "the polytope is too thin for its corners to be told apart"
-
-FLAT = 1e-9
-"""Scaled to a unit box, a polytope whose largest inscribed ball is smaller than this is flat."""
 
 
 def balanced(A: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -90,26 +82,51 @@ def bounding_box_and_multipliers(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarr
 
 def support(A: np.ndarray, b: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Upper bounds of `max a . x` for each direction, true for the exact polytope."""
+    return support_and_multipliers(A, b, directions)[0]
+
+
+def support_and_multipliers(
+    A: np.ndarray, b: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Upper bounds of `max a . x` for each of `k` directions, true for the exact polytope.
+
+    Returns:
+        The bounds `(k,)`, the multipliers `(k, m)` and where the maxima are attained `(k, n)`.
+    """
+    lengths = np.frexp(np.linalg.norm(A, axis=1))[1]
     A, b = balanced(A, b)
     lower, upper = bounding_box(A, b)
     size = np.maximum(np.abs(lower), np.abs(upper))
     error = gamma(len(b) + len(size) + 4)
     exponents = np.frexp(np.linalg.norm(directions, axis=1))[1]
-    values = []
+    values, Y, points = [], [], []
     for a in np.ldexp(directions, -exponents[:, None]):
-        y, _ = maximiser(A, b, a)
+        y, x = maximiser(A, b, a)
         residual = np.abs(a - y @ A) + error * (np.abs(a) + y @ np.abs(A))
         values.append(y @ b + error * (y @ np.abs(b)) + residual @ size * (1 + error))
-    return np.ldexp(values, exponents)
+        Y.append(y)
+        points.append(x)
+    multipliers = np.ldexp(np.stack(Y), exponents[:, None] - lengths)
+    return np.ldexp(values, exponents), multipliers, np.stack(points)
 
 
 def separation(A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray) -> float:
     """How far the facets of `C x <= d` may move outward before it meets the bounded `A x <= b`.
 
-    Minimises `s` over `A x <= b`, `C x - s |c_i| <= d`; positive means disjoint. The value
-    returned is the dual one, `-(y'b + w'd)` with `y, w >= 0` and `w . |c_i| = 1`, less what its
-    residual can cost: a lower bound whatever the solver's accuracy.
+    A lower bound whatever the linear program's accuracy; positive means disjoint.
     """
+    return separation_and_multipliers(A, b, C, d)[0]
+
+
+def separation_and_multipliers(
+    A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """The separation, the multipliers of `A x <= b` and `C x <= d`, and the nearest point.
+
+    Minimises `s` over `A x <= b`, `C x - s |c_i| <= d`. The value returned is the dual one,
+    `-(y'b + w'd)` with `y, w >= 0` and `w . |c_i| = 1`, less what its residual can cost.
+    """
+    lengths = [np.frexp(np.linalg.norm(rows, axis=1))[1] for rows in (A, C)]
     (A, b), (C, d) = balanced(A, b), balanced(C, d)
     norms = np.linalg.norm(C, axis=1)
     m, n = A.shape
@@ -130,7 +147,8 @@ def separation(A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray) -> fl
     error = gamma(m + len(d) + n + 8)
     residual = np.abs(y @ A + w @ C) + error * (y @ np.abs(A) + w @ np.abs(C))
     cost = error * (y @ np.abs(b) + w @ np.abs(d)) + residual @ size * (1 + error)
-    return float(-(y @ b + w @ d) - cost)
+    value = float(-(y @ b + w @ d) - cost)
+    return value, np.ldexp(y, -lengths[0]), np.ldexp(w, -lengths[1]), result.x[:n]
 
 
 def chebyshev(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
@@ -148,126 +166,3 @@ def chebyshev(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
     if result.status != 0:
         raise ValueError("the polytope A x <= b is unbounded")
     return result.x[:-1], float(result.x[-1])
-
-
-def vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The corners of a bounded polytope `(v, n)`; a flat one is treated in its affine hull.
-
-    Raises:
-        RuntimeError: the polytope is too thin for its corners to be told apart.
-    """
-    if A.shape[1] == 1:
-        ends = b / A[:, 0]
-        return np.unique([[ends[A[:, 0] < 0].max()], [ends[A[:, 0] > 0].min()]], axis=0)
-    lower, upper = bounding_box(A, b)
-    middle, radii = (lower + upper) / 2, (upper - lower) / 2
-    radii = np.where(radii > FLAT * radii.max(), radii, radii.max() or 1.0)
-    try:
-        return middle + radii * _unit_vertices(*balanced(A * radii, b - A @ middle))
-    except QhullError as error:
-        raise RuntimeError(f"{TOO_THIN}: {str(error).splitlines()[0]}") from None
-
-
-def _unit_vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The corners of a polytope whose bounding box is the unit box, or flat in some coordinates."""
-    center, radius = chebyshev(A, b)
-    if radius > FLAT:
-        corners = HalfspaceIntersection(np.hstack([A, -b[:, None]]), center).intersections
-        return corners[ConvexHull(corners).vertices]
-    basis = _affine_hull(A, b, center, FLAT)
-    if basis.shape[1] == 0:
-        return center[None]
-    reduced = A @ basis
-    kept = np.linalg.norm(reduced, axis=1) > FLAT
-    slack = np.maximum(b - A @ center, 0.0)
-    return center + vertices(reduced[kept], slack[kept]) @ basis.T
-
-
-def extreme_points(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The corners, or where they cannot be told apart, points that linear programs find."""
-    try:
-        return vertices(A, b)
-    except RuntimeError:
-        A, b = balanced(A, b)
-        n = A.shape[1]
-        draws = np.random.default_rng(0).normal(size=(8 * n, n))
-        return np.stack([maximiser(A, b, d)[1] for d in np.vstack([np.eye(n), -np.eye(n), draws])])
-
-
-def _affine_hull(A: np.ndarray, b: np.ndarray, point: np.ndarray, tolerance: float) -> np.ndarray:
-    """An orthonormal basis `(n, k)` of the directions in which a flat polytope extends."""
-    norms = np.linalg.norm(A, axis=1)
-    extent = [-_least(A, b, a) for a in A / norms[:, None]]
-    tight = np.array(extent) + b / norms <= 4 * tolerance
-    if not tight.any():
-        raise RuntimeError(TOO_THIN)
-    _, values, rows = np.linalg.svd(A[tight] / norms[tight, None])
-    rank = int(np.sum(values > 1e-6))
-    return rows[rank:].T
-
-
-def _least(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> float:
-    result = linprog(direction, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
-    return float(result.fun)
-
-
-def volume(A: np.ndarray, b: np.ndarray) -> float:
-    """The volume of a bounded polytope, zero for a flat one."""
-    corners = vertices(A, b)
-    n = A.shape[1]
-    if n == 1:
-        return float(np.ptp(corners))
-    if len(corners) <= n:
-        return 0.0
-    try:
-        return float(ConvexHull(corners).volume)
-    except QhullError:  # the corners span fewer than n dimensions
-        return 0.0
-
-
-def facet_areas(A: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """The volume, and of each facet the `(n-1)`-volume `(m,)` and the centroid `(m, n)`.
-
-    Moving facet `i` outwards by `db_i` sweeps the volume `area_i db_i / |a_i|`. A facet that does
-    not bound the polytope has area zero.
-    """
-    n, norms = A.shape[1], np.linalg.norm(A, axis=1)
-    corners = vertices(A, b)
-    areas, centroids = np.zeros(len(b)), np.zeros((len(b), n))
-    if n == 1:
-        for side in (A[:, 0] < 0, A[:, 0] > 0):
-            facet = np.flatnonzero(side)[np.argmin((b / abs(A[:, 0]))[side])]
-            areas[facet], centroids[facet] = 1.0, b[facet] / A[facet, 0]
-        return float(np.ptp(corners)), areas, centroids
-    if len(corners) <= n:
-        return 0.0, areas, centroids
-    try:
-        hull = ConvexHull(corners)
-    except QhullError:  # the corners span fewer than n dimensions
-        return 0.0, areas, centroids
-    for simplex, equation in zip(corners[hull.simplices], hull.equations, strict=True):
-        facet = int(np.argmin(np.linalg.norm(A / norms[:, None] - equation[:-1], axis=1)))
-        edges = simplex[1:] - simplex[0]
-        area = np.sqrt(max(np.linalg.det(edges @ edges.T), 0.0)) / math.factorial(n - 1)
-        areas[facet] += area
-        centroids[facet] += area * simplex.mean(axis=0)
-    return float(hull.volume), areas, centroids / np.where(areas > 0, areas, 1)[:, None]
-
-
-def uniform(A: np.ndarray, b: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
-    """`count` points drawn uniformly, by a triangulation of the corners `(count, n)`."""
-    corners = extreme_points(A, b)
-    center = corners.mean(axis=0)
-    _, values, rows = np.linalg.svd(corners - center, full_matrices=False)
-    spanned = rows[values > FLAT * max(values.max(initial=0.0), np.finfo(float).tiny)]
-    flat = (corners - center) @ spanned.T
-    if flat.shape[1] == 0:
-        return np.repeat(center[None], count, axis=0)
-    if flat.shape[1] == 1:
-        ends = np.array([flat.min(), flat.max()])
-        return center + rng.uniform(*ends, size=(count, 1)) @ spanned
-    simplices = flat[Delaunay(flat).simplices]
-    volumes = np.abs(np.linalg.det(simplices[:, 1:] - simplices[:, :1]))
-    chosen = rng.choice(len(simplices), size=count, p=volumes / volumes.sum())
-    weights = rng.dirichlet(np.ones(flat.shape[1] + 1), size=count)
-    return center + np.einsum("cv,cvk->ck", weights, simplices[chosen]) @ spanned

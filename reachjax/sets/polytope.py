@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from reachjax.checks import Numbers, is_concrete, same_size
 from reachjax.pytrees import converted, pytree
-from reachjax.sets import polyhedra
+from reachjax.sets import hulls, polyhedra
 from reachjax.sets.base import PolyhedralSet
 from reachjax.sets.box import Box
 
@@ -82,14 +82,14 @@ class Polytope(PolyhedralSet):
         Raises:
             ValueError: the polytope is empty or unbounded.
         """
-        return jnp.asarray(polyhedra.vertices(*self._host()))
+        return jnp.asarray(hulls.vertices(*self._host()))
 
     def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
         """Points drawn uniformly, by a triangulation of the corners."""
         seed = np.asarray(jax.random.bits(key, (4,), dtype=jnp.uint32))
         rng = np.random.default_rng(seed.tolist())
-        return jnp.asarray(polyhedra.uniform(*self._host(), rng, count))
+        return jnp.asarray(hulls.uniform(*self._host(), rng, count))
 
     def volume(self) -> float:
         """The `n`-dimensional volume; zero for a flat polytope (Qhull)."""
-        return polyhedra.volume(*self._host())
+        return hulls.volume(*self._host())

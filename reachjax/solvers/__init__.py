@@ -3,7 +3,8 @@
 from reachjax.solvers.accepted import accepted_offsets
 from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
 from reachjax.solvers.conic import SCS, Clarabel, CvxpySolver
-from reachjax.solvers.differentiable import bounding_box, polytope_volume, proved_offsets
+from reachjax.solvers.differentiable import proved_offsets
+from reachjax.solvers.geometry import bounding_box, polytope_volume, separation, support
 
 __all__ = [
     "SCS",
@@ -16,4 +17,6 @@ __all__ = [
     "bounding_box",
     "polytope_volume",
     "proved_offsets",
+    "separation",
+    "support",
 ]

@@ -111,7 +111,7 @@ def test_bounds_are_sound_under_every_status_that_cvxpy_has(setting, monkeypatch
     monkeypatch.setattr(cp.Problem, "solve", solve)
     solution = rj.Clarabel().solve(program)
     assert set(solution.statuses) == {STATUSES[word]}
-    bounds = accepted_offsets(program, solution)
+    bounds, _ = accepted_offsets(program, solution)
     certificate = rj.Certificate.from_solution(program, bounds, solution)
     states = np.vstack([region.corners, region.sample(20_000, seed=0)])
     attained = (simulate(data, states, 1)[1] @ directions(3, extra=1).T).max(axis=0)

@@ -1,0 +1,133 @@
+"""Corners, volumes and points of polytopes, on the host by Qhull (scipy)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.spatial import ConvexHull, Delaunay, HalfspaceIntersection, QhullError
+
+from reachjax.sets.polyhedra import balanced, bounding_box, chebyshev, maximiser
+
+TOO_THIN = "the polytope is too thin for its corners to be told apart"
+
+FLAT = 1e-9
+"""Scaled to a unit box, a polytope whose largest inscribed ball is smaller than this is flat."""
+
+
+def vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The corners of a bounded polytope `(v, n)`; a flat one is treated in its affine hull.
+
+    Raises:
+        RuntimeError: the polytope is too thin for its corners to be told apart.
+    """
+    if A.shape[1] == 1:
+        ends = b / A[:, 0]
+        return np.unique([[ends[A[:, 0] < 0].max()], [ends[A[:, 0] > 0].min()]], axis=0)
+    lower, upper = bounding_box(A, b)
+    middle, radii = (lower + upper) / 2, (upper - lower) / 2
+    radii = np.where(radii > FLAT * radii.max(), radii, radii.max() or 1.0)
+    try:
+        return middle + radii * _unit_vertices(*balanced(A * radii, b - A @ middle))
+    except QhullError as error:
+        raise RuntimeError(f"{TOO_THIN}: {str(error).splitlines()[0]}") from None
+
+
+def _unit_vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The corners of a polytope whose bounding box is the unit box, or flat in some coordinates."""
+    center, radius = chebyshev(A, b)
+    if radius > FLAT:
+        corners = HalfspaceIntersection(np.hstack([A, -b[:, None]]), center).intersections
+        return corners[ConvexHull(corners).vertices]
+    basis = _affine_hull(A, b, center, FLAT)
+    if basis.shape[1] == 0:
+        return center[None]
+    reduced = A @ basis
+    kept = np.linalg.norm(reduced, axis=1) > FLAT
+    slack = np.maximum(b - A @ center, 0.0)
+    return center + vertices(reduced[kept], slack[kept]) @ basis.T
+
+
+def extreme_points(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The corners, or where they cannot be told apart, points that linear programs find."""
+    try:
+        return vertices(A, b)
+    except RuntimeError:
+        A, b = balanced(A, b)
+        n = A.shape[1]
+        draws = np.random.default_rng(0).normal(size=(8 * n, n))
+        return np.stack([maximiser(A, b, d)[1] for d in np.vstack([np.eye(n), -np.eye(n), draws])])
+
+
+def _affine_hull(A: np.ndarray, b: np.ndarray, point: np.ndarray, tolerance: float) -> np.ndarray:
+    """An orthonormal basis `(n, k)` of the directions in which a flat polytope extends."""
+    norms = np.linalg.norm(A, axis=1)
+    extent = [-a @ maximiser(A, b, -a)[1] for a in A / norms[:, None]]
+    tight = np.array(extent) + b / norms <= 4 * tolerance
+    if not tight.any():
+        raise RuntimeError(TOO_THIN)
+    _, values, rows = np.linalg.svd(A[tight] / norms[tight, None])
+    rank = int(np.sum(values > 1e-6))
+    return rows[rank:].T
+
+
+def volume(A: np.ndarray, b: np.ndarray) -> float:
+    """The volume of a bounded polytope, zero for a flat one."""
+    corners = vertices(A, b)
+    n = A.shape[1]
+    if n == 1:
+        return float(np.ptp(corners))
+    if len(corners) <= n:
+        return 0.0
+    try:
+        return float(ConvexHull(corners).volume)
+    except QhullError:  # the corners span fewer than n dimensions
+        return 0.0
+
+
+def facet_areas(A: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """The volume, and of each facet the `(n-1)`-volume `(m,)` and the centroid `(m, n)`.
+
+    Moving facet `i` outwards by `db_i` sweeps the volume `area_i db_i / |a_i|`. A facet that does
+    not bound the polytope has area zero.
+    """
+    n, norms = A.shape[1], np.linalg.norm(A, axis=1)
+    corners = vertices(A, b)
+    areas, centroids = np.zeros(len(b)), np.zeros((len(b), n))
+    if n == 1:
+        for side in (A[:, 0] < 0, A[:, 0] > 0):
+            facet = np.flatnonzero(side)[np.argmin((b / abs(A[:, 0]))[side])]
+            areas[facet], centroids[facet] = 1.0, b[facet] / A[facet, 0]
+        return float(np.ptp(corners)), areas, centroids
+    if len(corners) <= n:
+        return 0.0, areas, centroids
+    try:
+        hull = ConvexHull(corners)
+    except QhullError:  # the corners span fewer than n dimensions
+        return 0.0, areas, centroids
+    for simplex, equation in zip(corners[hull.simplices], hull.equations, strict=True):
+        facet = int(np.argmin(np.linalg.norm(A / norms[:, None] - equation[:-1], axis=1)))
+        edges = simplex[1:] - simplex[0]
+        area = np.sqrt(max(np.linalg.det(edges @ edges.T), 0.0)) / math.factorial(n - 1)
+        areas[facet] += area
+        centroids[facet] += area * simplex.mean(axis=0)
+    return float(hull.volume), areas, centroids / np.where(areas > 0, areas, 1)[:, None]
+
+
+def uniform(A: np.ndarray, b: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
+    """`count` points drawn uniformly, by a triangulation of the corners `(count, n)`."""
+    corners = extreme_points(A, b)
+    center = corners.mean(axis=0)
+    _, values, rows = np.linalg.svd(corners - center, full_matrices=False)
+    spanned = rows[values > FLAT * max(values.max(initial=0.0), np.finfo(float).tiny)]
+    flat = (corners - center) @ spanned.T
+    if flat.shape[1] == 0:
+        return np.repeat(center[None], count, axis=0)
+    if flat.shape[1] == 1:
+        ends = np.array([flat.min(), flat.max()])
+        return center + rng.uniform(*ends, size=(count, 1)) @ spanned
+    simplices = flat[Delaunay(flat).simplices]
+    volumes = np.abs(np.linalg.det(simplices[:, 1:] - simplices[:, :1]))
+    chosen = rng.choice(len(simplices), size=count, p=volumes / volumes.sum())
+    weights = rng.dirichlet(np.ones(flat.shape[1] + 1), size=count)
+    return center + np.einsum("cv,cvk->ck", weights, simplices[chosen]) @ spanned

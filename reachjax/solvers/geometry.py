@@ -1,0 +1,97 @@
+"""Supports, separations and volumes of polytopes, with their derivatives.
+
+All are optimal values of linear programs, or volumes, found in numpy on the host together with
+their slopes: hold the multipliers `y` and the optimal point `x` fixed and differentiate the
+Lagrangian (the envelope theorem). Where a maximum is attained at more than one point, the slope is
+one of several generalised gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.sets import AbstractSet, Box, PolyhedralSet, Polytope, hulls, polyhedra
+from reachjax.solvers.host import on_host
+
+Slopes = tuple[np.ndarray, ...]
+Values = Callable[..., tuple[np.ndarray, Slopes]]
+"""From arrays to values `(k,)` and, for each array, their derivatives `(k, *shape)`."""
+
+
+def bounding_box(X: AbstractSet) -> Box:
+    """The smallest box around a set; differentiable, also inside `jax.jit`."""
+    if not isinstance(X, Polytope):
+        return X.bounding_box()
+    ends = _differentiable(_box, 2 * X.dimension, X.A, X.b)
+    return Box(-ends[: X.dimension], ends[X.dimension :])
+
+
+def support(X: AbstractSet, directions: Float[Array, "m n"]) -> Float[Array, " m"]:
+    """The largest value of each direction on a set, rounded up; differentiable, also in `jit`."""
+    if not isinstance(X, Polytope):
+        return X.support(directions)
+    return _differentiable(_support, len(directions), X.A, X.b, directions)
+
+
+def separation(X: PolyhedralSet, Y: PolyhedralSet) -> Float[Array, ""]:
+    """How far the facets of `Y` may move outward before it meets `X`; negative if they overlap.
+
+    A lower bound, rounding included; differentiable, also inside `jax.jit`. `X` is bounded.
+    """
+    return _differentiable(_separation, 1, *X.facets, *Y.facets)[0]
+
+
+def polytope_volume(X: Polytope) -> Float[Array, ""]:
+    """The volume; differentiable: moving facet `i` by `db_i` sweeps `area_i db_i / |a_i|`."""
+    return _differentiable(_volume, 1, X.A, X.b)[0]
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _differentiable(compute: Values, count: int, *arrays: Array) -> Array:
+    return _forward(compute, count, *arrays)[0]
+
+
+def _forward(compute, count, *arrays):
+    values = jax.ShapeDtypeStruct((count,), float)
+    slopes = tuple(jax.ShapeDtypeStruct((count, *array.shape), float) for array in arrays)
+    return on_host(lambda arguments: compute(*arguments), (values, slopes), arrays)
+
+
+def _backward(compute, count, slopes, cotangent):
+    return tuple(jnp.tensordot(cotangent, slope, 1) for slope in slopes)
+
+
+_differentiable.defvjp(_forward, _backward)
+
+
+def _box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, Slopes]:
+    lower, upper, Y, points = polyhedra.bounding_box_and_multipliers(A, b)
+    return np.concatenate([-lower, upper]), (-Y[:, :, None] * points[:, None, :], Y)
+
+
+def _support(A: np.ndarray, b: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, Slopes]:
+    values, Y, points = polyhedra.support_and_multipliers(A, b, D)
+    own = np.eye(len(D))[:, :, None] * points[:, None, :]  # a value depends on its own direction
+    return values, (-Y[:, :, None] * points[:, None, :], Y, own)
+
+
+def _separation(
+    A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray
+) -> tuple[np.ndarray, Slopes]:
+    """From the Lagrangian `s + y . (A x - b) + w . (C x - s |c| - d)`."""
+    value, y, w, x = polyhedra.separation_and_multipliers(A, b, C, d)
+    units = C / np.linalg.norm(C, axis=1)[:, None]
+    slopes = (y[:, None] * x, -y, w[:, None] * (x - value * units), -w)
+    return np.array([value]), tuple(slope[None] for slope in slopes)
+
+
+def _volume(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, Slopes]:
+    volume, areas, centroids = hulls.facet_areas(A, b)
+    swept = areas / np.linalg.norm(A, axis=1)
+    return np.array([volume]), ((-swept[:, None] * centroids)[None], swept[None])

@@ -22,8 +22,9 @@ from rich.progress import track
 
 import reachjax as rj
 from experiments import report
-from experiments.imitation import Fit, sample_policy, train_network
+from experiments.imitation import Fit, train_network
 from experiments.mpc import LinearMPC
+from experiments.sampling import sample_policy
 
 RELAXATIONS = {
     "local-bounds": rj.LocalBounds(),

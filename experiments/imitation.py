@@ -1,4 +1,4 @@
-"""Learning a controller from its own decisions: samples of a policy, and a network fitted to them.
+"""Learning a controller from a policy's decisions: networks fitted to its samples.
 
 The network is `pi(x) = W_L relu(... relu(W_0 x + b_0) ...) + b_L`, its output affine and not
 projected, and its weights minimise over the samples `(x_i, u_i)`
@@ -6,13 +6,13 @@ projected, and its weights minimise over the samples `(x_i, u_i)`
     mean_i |pi(x_i) - u_i|^2  +  penalty * sum_l |W_l|_F^2 .
 
 A small penalty costs little accuracy and keeps the gain of the network low, and with it the
-looseness of convex bounds on the network. Samples and weights can be kept in a file together with
-the settings that made them: it is used again when the settings agree, and made anew, with a word
-about it, when they do not.
+looseness of convex bounds on the network. Weights can be kept in a file together with the settings
+that made them: it is used again when the settings agree, and made anew, with a word about it, when
+they do not.
 """
 
 import hashlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,23 +23,13 @@ import optax
 from flax import nnx
 from jaxtyping import Float
 from numpy import ndarray
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from experiments import stored
-from experiments.mpc import LinearMPC
+from experiments.progress import at_least_one, bar
+from experiments.sampling import Samples
 
-# Candidate states are drawn, and training steps compiled, in blocks of these sizes. The file of
-# samples is written after each block, so an interruption loses a fraction of a second.
-CANDIDATES = 200
+# Training steps are compiled in blocks of this size.
 STEPS = 500
-
-
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """What a policy does: `inputs[i]` at `states[i]`."""
-
-    states: Float[ndarray, "count n"]
-    inputs: Float[ndarray, "count m"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,53 +41,13 @@ class Fit:
     validation_error: float
 
 
-def sample_policy(
-    mpc: LinearMPC,
-    count: int,
-    seed: int,
-    *,
-    lower: Float[ndarray, " n"] | None = None,
-    upper: Float[ndarray, " n"] | None = None,
-    path: str | Path | None = None,
-    progress: bool = True,
-) -> Samples:
-    """`count` pairs of the MPC, uniform over the states of `lower <= x <= upper` it can steer.
-
-    The box is the MPC's own `X` unless given. Candidates are drawn in blocks, block `k` from the
-    seed `(seed, k)`, and infeasible ones left out; so a larger `count` only adds pairs, and a
-    file at `path` that holds too few, as an interrupted run leaves it, is continued.
-    """
-    _at_least_one(count=count)
-    lower = np.asarray(mpc.state_lower if lower is None else lower, float)
-    upper = np.asarray(mpc.state_upper if upper is None else upper, float)
-    n, m = mpc.B.shape
-    if not lower.shape == upper.shape == (n,) or not np.all(upper - lower >= 0):
-        raise ValueError(f"lower <= upper must bound {n} states, got lower {lower}, upper {upper}")
-    settings = {f.name: np.asarray(getattr(mpc, f.name)).tolist() for f in fields(mpc)}
-    settings |= {"seed": int(seed), "lower": lower.tolist(), "upper": upper.tolist()}
-    nothing = {"states": np.empty((0, n)), "inputs": np.empty((0, m)), "block": 0}
-    kept = stored.load(path, settings) or nothing
-    states, inputs, block = kept["states"], kept["inputs"], int(kept["block"])
-    with _bar(progress) as bar:
-        task = bar.add_task("sampling the MPC", total=count, completed=min(count, len(states)))
-        while len(states) < count:
-            if block == 10 and not len(states):
-                raise ValueError(
-                    f"lower and upper must meet the states that the MPC can steer; of the first "
-                    f"{block * CANDIDATES} drawn between {lower} and {upper}, none was feasible"
-                )
-            draws = np.random.default_rng([seed, block]).uniform(lower, upper, (CANDIDATES, n))
-            decisions = mpc.batch(draws)
-            feasible = ~np.isnan(decisions[:, 0])
-            states = np.vstack([states, draws[feasible]])
-            inputs = np.vstack([inputs, decisions[feasible]])
-            block += 1
-            stored.save(path, settings, states=states, inputs=inputs, block=block)
-            bar.update(task, completed=min(count, len(states)))
-    return Samples(states[:count], inputs[:count])
+def train_network(samples: Samples, hidden: tuple[int, ...] = (10, 5), seed: int = 0, **options):
+    """The network of least validation error among `restarts`; options as in `train_networks`."""
+    fits = train_networks(samples, hidden, seed, **options)
+    return min(fits, key=lambda fit: fit.validation_error)
 
 
-def train_network(
+def train_networks(
     samples: Samples,
     hidden: tuple[int, ...] = (10, 5),
     seed: int = 0,
@@ -110,19 +60,16 @@ def train_network(
     path: str | Path | None = None,
     retrain: bool = False,
     progress: bool = True,
-) -> Fit:
+) -> list[Fit]:
     """Adam on full batches, its rate decaying from `learning_rate` to 0 along a cosine.
 
-    `restarts` networks are trained side by side from different random weights, and the one of
-    least validation error is returned. The last `validation` share of the samples is never
-    trained on. `retrain` ignores the file at `path` and replaces it.
+    `restarts` networks are trained side by side from different random weights. The last
+    `validation` share of the samples is never trained on. `retrain` ignores the file at `path` and
+    replaces it.
     """
     widths = {f"hidden[{i}]": width for i, width in enumerate(hidden)}
-    _at_least_one(steps=steps, restarts=restarts, **widths)
-    count = len(samples.states)
-    split = round(count * (1 - validation))
-    if not 0 < split < count:
-        raise ValueError(f"validation must leave two sets of {count} samples, got {validation}")
+    at_least_one(steps=steps, restarts=restarts, **widths)
+    split = training_share(samples, validation)
     settings = {
         "samples": hashlib.sha256(samples.states.tobytes() + samples.inputs.tobytes()).hexdigest(),
         "hidden": list(hidden),
@@ -134,18 +81,31 @@ def train_network(
         "validation": validation,
     }
     kept = None if retrain else stored.load(path, settings)
-    if kept is not None:
-        layers = [(kept[f"W{i}"], kept[f"b{i}"]) for i in range(len(hidden) + 1)]
-        return _fit(layers, samples, split)
-    # Single precision whatever JAX's global setting is: the fit needs no more.
-    x, u = (np.asarray(a[:split], np.float32) for a in (samples.states, samples.inputs))
-    trained = _train(x, u, hidden, seed, penalty, steps, learning_rate, restarts, progress)
-    fits = [_fit(layers, samples, split) for layers in trained]
-    best = min(fits, key=lambda fit: fit.validation_error)
-    weights = {f"W{i}": W for i, (W, _) in enumerate(best.layers)}
-    biases = {f"b{i}": b for i, (_, b) in enumerate(best.layers)}
-    stored.save(path, settings, **weights, **biases)
-    return best
+    if kept is None:
+        # Single precision whatever JAX's global setting is: the fit needs no more.
+        x, u = (np.asarray(a[:split], np.float32) for a in (samples.states, samples.inputs))
+        trained = _train(x, u, hidden, seed, penalty, steps, learning_rate, restarts, progress)
+        kept = {f"W{i}": W for i, (W, _) in enumerate(trained)}
+        kept |= {f"b{i}": b for i, (_, b) in enumerate(trained)}
+        stored.save(path, settings, **kept)
+    pairs = [(kept[f"W{i}"], kept[f"b{i}"]) for i in range(len(hidden) + 1)]
+    return [fit([(W[r], b[r]) for W, b in pairs], samples, validation) for r in range(restarts)]
+
+
+def training_share(samples: Samples, validation: float) -> int:
+    """How many of the samples are trained on."""
+    count = len(samples.states)
+    split = round(count * (1 - validation))
+    if not 0 < split < count:
+        raise ValueError(f"validation must leave two sets of {count} samples, got {validation}")
+    return split
+
+
+def fit(layers, samples: Samples, validation: float = 0.1) -> Fit:
+    """The network `layers` with its errors on the samples trained on and on the others."""
+    split = training_share(samples, validation)
+    squares = np.sum((evaluate(layers, samples.states) - samples.inputs) ** 2, axis=1)
+    return Fit(layers, float(squares[:split].mean() ** 0.5), float(squares[split:].mean() ** 0.5))
 
 
 def evaluate(layers, states: Float[ndarray, "count n"]) -> Float[ndarray, "count m"]:
@@ -168,7 +128,7 @@ class _Policy(nnx.Module):
 
 
 def _train(x, u, hidden, seed, penalty, steps, learning_rate, restarts, progress):
-    """The layers of every restart."""
+    """Pairs `(W, b)`, one a layer, with a leading axis for the restarts."""
     sizes = [x.shape[1], *hidden, u.shape[1]]
     structure, _ = nnx.split(_Policy(sizes, nnx.Rngs(0)))
     optimiser = optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
@@ -191,25 +151,9 @@ def _train(x, u, hidden, seed, penalty, steps, learning_rate, restarts, progress
     # The last block may run past `steps`, where the rate is 0 and nothing moves.
     advance = jax.jit(jax.vmap(lambda carry: jax.lax.scan(step, carry, length=STEPS)[0]))
     carry = start(jax.random.split(jax.random.key(seed), restarts))
-    with _bar(progress) as bar:
-        for _ in bar.track(range(0, steps, STEPS), description="training the network"):
+    with bar(progress) as shown:
+        for _ in shown.track(range(0, steps, STEPS), description="training networks"):
             carry = jax.block_until_ready(advance(carry))
     named = jax.tree.map(lambda w: np.asarray(w, float), nnx.to_pure_dict(carry[0]))["layers"]
     pairs = [(named[i]["kernel"], named[i]["bias"]) for i in range(len(sizes) - 1)]
-    return [[(kernel[r].T, bias[r]) for kernel, bias in pairs] for r in range(restarts)]
-
-
-def _fit(layers, samples, split) -> Fit:
-    squares = np.sum((evaluate(layers, samples.states) - samples.inputs) ** 2, axis=1)
-    return Fit(layers, float(squares[:split].mean() ** 0.5), float(squares[split:].mean() ** 0.5))
-
-
-def _bar(progress):
-    text = TextColumn("{task.description}")
-    return Progress(text, BarColumn(), MofNCompleteColumn(), disable=not progress)
-
-
-def _at_least_one(**counts):
-    for name, value in counts.items():
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    return [(kernel.swapaxes(1, 2), bias) for kernel, bias in pairs]

@@ -149,9 +149,7 @@ class PenaltySchedule:
 
     def __post_init__(self):
         if not isinstance(self.weight, numbers.Real) or isinstance(self.weight, bool):
-            raise TypeError(
-                f"PenaltySchedule.weight must be a number, but {self.weight!r} arrived"
-            )
+            raise TypeError(f"PenaltySchedule.weight must be a number, but {self.weight!r} arrived")
         if not (math.isfinite(self.weight) and self.weight >= 0):
             raise ValueError(
                 f"PenaltySchedule.weight must be at least 0, but {self.weight} arrived"

@@ -100,9 +100,9 @@ class Settings:
             raise ValueError("--relaxation must name at least one relaxation, but none arrived")
 
 
-def controller(name: str, margin: float, settings: Settings) -> Fit:
-    """Sample the MPC whose state constraint is tightened by `margin`, and fit a network to it."""
-    mpc = LinearMPC(
+def linear_mpc(margin: float) -> LinearMPC:
+    """The paper's MPC with its state constraint tightened by `margin`."""
+    return LinearMPC(
         A,
         B,
         Q=np.eye(2),
@@ -113,10 +113,14 @@ def controller(name: str, margin: float, settings: Settings) -> Fit:
         input_lower=INPUT_BOX[0],
         input_upper=INPUT_BOX[1],
     )
+
+
+def controller(name: str, margin: float, settings: Settings) -> Fit:
+    """Sample the MPC whose state constraint is tightened by `margin`, and fit a network to it."""
     rich.print(f"[bold]controller {name}[/bold]")
     folder = settings.output / name.replace(" ", "_")
     samples = sample_policy(
-        mpc,
+        linear_mpc(margin),
         settings.samples,
         settings.seed,
         lower=STATE_BOX[0],

@@ -1,0 +1,176 @@
+"""Controllers that are trained to be verifiable, against the same ones trained plainly.
+
+Networks imitate the double integrator's MPC as the paper prints it, which rides on its constraint
+`x_2 >= -1`: plain copies undershoot. Each is then trained on for equally many steps in three ways:
+*plain*; with a penalty on what its certified sets lack of the *specification*; with that and a
+penalty on their *volume*. Compared are imitation errors, verdicts, and areas of the certified sets
+and of simulated hulls: the latter tell whether the loop improved, or only the relaxation's slack.
+
+    python -m experiments.verified_training --help
+"""
+
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes run side by side
+
+import jax
+import rich
+import tyro
+
+from experiments import training_report
+from experiments.double_integrator import Settings as Teacher
+from experiments.double_integrator import linear_mpc
+from experiments.fine_tuning import Outcome, Tuning, run
+from experiments.imitation import train_networks
+from experiments.progress import at_least_one, bar
+from experiments.sampling import Samples, sample_policy
+from experiments.step_cost import step_cost
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Train controllers of the double integrator with and without penalties, and certify them.
+
+    Everything is kept under `output`; an interrupted run continues with what is there.
+    """
+
+    seeds: int = 10
+    """Networks, from different random weights."""
+    samples: int = Teacher.samples
+    """State-input pairs of the MPC that each network learns from."""
+    hidden: tuple[int, ...] = Teacher.hidden
+    """Neurons of each hidden layer."""
+    pretraining_steps: int = Teacher.training_steps
+    """Steps of Adam on imitation alone, before the three ways part."""
+    steps: int = 800
+    """Steps of Adam with penalties, or without."""
+    every: int = 10
+    """Penalties are computed at one step in so many."""
+    learning_rate: float = 1e-3
+    """Of these steps; it decays to 0 along a cosine."""
+    specification: float = 0.1
+    """Weight of what the certified sets lack of the specification."""
+    margin: float = 0.005
+    """How far they should be from breaking it."""
+    volume: float = 0.005
+    """Weight of their mean log-volume."""
+    decay: float = Teacher.penalty
+    """Weight of the squared weights."""
+    goals: tuple[float, ...] = (0.25, 0.15, 0.1, 0.08, 0.07, 0.06, 0.05, 0.04)
+    """Half-widths of goal boxes to verify as well."""
+    simulations: int = 10_000
+    """Trajectories simulated for hulls, witnesses and counterexamples."""
+    seed: int = 0
+    """Of samples and initial weights."""
+    workers: int = os.cpu_count() or 1
+    """Processes side by side."""
+    output: Path = Path("results/verified_training")
+    """Where everything is written."""
+
+    def __post_init__(self):
+        for name in ("seeds", "samples", "pretraining_steps", "steps", "every", "simulations"):
+            at_least_one(**{f"--{name.replace('_', '-')}": getattr(self, name)})
+        at_least_one(**{"--workers": self.workers})
+        for name in ("learning_rate", "specification", "volume"):
+            if not getattr(self, name) > 0:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} must be above 0, got {getattr(self, name)}"
+                )
+        if not self.goals or min(self.goals) <= 0:
+            raise ValueError(f"--goals must be half-widths above 0, got {self.goals}")
+
+
+def ways(settings: Settings) -> dict[str, Tuning]:
+    """The three ways to train on."""
+    plain = Tuning(
+        steps=settings.steps,
+        learning_rate=settings.learning_rate,
+        every=settings.every,
+        specification=0.0,
+        margin=settings.margin,
+        volume=0.0,
+        decay=settings.decay,
+        simulations=settings.simulations,
+        goals=settings.goals,
+    )
+    specification = replace(plain, specification=settings.specification)
+    return {
+        "plain": plain,
+        "specification": specification,
+        "volume": replace(specification, volume=settings.volume),
+    }
+
+
+def configure(cache: Path) -> None:
+    """JAX as every process needs it."""
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def train_on(networks, samples: Samples, settings: Settings) -> dict[str, list[Outcome]]:
+    """Every network in every way, in processes side by side."""
+    pool = ProcessPoolExecutor(
+        settings.workers,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=configure,
+        initargs=(settings.output.parent / "jax_cache",),
+    )
+    with bar() as shown, pool:
+        jobs = {
+            pool.submit(run, layers, samples, tuning, settings.output / way / f"{k}.npz"): (way, k)
+            for way, tuning in ways(settings).items()
+            for k, layers in enumerate(networks)
+        }
+        task = shown.add_task("training on and certifying", total=len(jobs))
+        try:
+            for done in as_completed(jobs):
+                done.result()
+                shown.advance(task)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    outcomes = {job: done.result() for done, job in jobs.items()}
+    return {way: [outcomes[way, k] for k in range(len(networks))] for way in ways(settings)}
+
+
+def main(settings: Settings) -> None:
+    """Sample, train, certify, print, and write figures and results."""
+    settings.output.mkdir(parents=True, exist_ok=True)
+    configure(settings.output.parent / "jax_cache")
+    mpc = linear_mpc(margin=0.0)
+    lower, upper = mpc.state_lower, mpc.state_upper
+    path = settings.output / "samples.npz"
+    samples = sample_policy(
+        mpc, settings.samples, settings.seed, lower=lower, upper=upper, path=path
+    )
+    fits = train_networks(
+        samples,
+        settings.hidden,
+        settings.seed,
+        penalty=settings.decay,
+        steps=settings.pretraining_steps,
+        restarts=settings.seeds,
+        path=settings.output / "networks.npz",
+    )
+    outcomes = train_on([fit.layers for fit in fits], samples, settings)
+    cost = step_cost(fits[0].layers)
+    for table in training_report.tables(outcomes, settings.goals, cost):
+        rich.print(table)
+    training_report.draw_tubes(outcomes, settings.output / "tubes.png")
+    training_report.draw_seeds(outcomes, settings.output / "seeds.png")
+    training_report.write(settings, outcomes, cost, settings.output / "results.json")
+    rich.print(f"written: {settings.output}/tubes.png, seeds.png, results.json and the networks")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Settings))
+    except (ValueError, OSError) as error:
+        raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted: run again to continue with what is stored") from None

@@ -146,7 +146,7 @@ def paper_step(
     for i, a in enumerate(directions):
         start = time.perf_counter()
         b = cp.Variable()
-        M, constraints = _lmi(layers, A, B, c, u_lower, u_upper, set_A, set_b, a, b, repeated)
+        M, constraints = paper_lmi(layers, A, B, c, u_lower, u_upper, set_A, set_b, a, b, repeated)
         problem = cp.Problem(cp.Minimize(b), [M << 0, *constraints])
         problem.solve(**(CLARABEL_TIGHT if options is None else options))
         seconds[i] = time.perf_counter() - start
@@ -156,7 +156,7 @@ def paper_step(
     return offsets, seconds
 
 
-def _lmi(layers, A, B, c, u_lower, u_upper, set_A, set_b, a, b, repeated):
+def paper_lmi(layers, A, B, c, u_lower, u_upper, set_A, set_b, a, b, repeated):
     """Theorem 1: the left-hand side M_in(P) + M_mid(Q) + M_out(S), and its multipliers' signs."""
     boxed = u_lower is not None
     E_in = paper_E_in(layers, boxed)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +35,7 @@ def verdict_table(outcomes: Outcomes) -> Table:
     table.add_column("trained", no_wrap=True)
     for status in COLOURS:
         table.add_column(status.lower(), justify="right")
-    for heading in ("error: least", "median", "largest", "skipped steps"):
+    for heading in ("error: least", "median", "largest", "skipped"):
         table.add_column(heading, justify="right")
     for way, group in outcomes.items():
         errors = [outcome.validation_error for outcome in group]
@@ -48,25 +47,25 @@ def verdict_table(outcomes: Outcomes) -> Table:
 
 
 def seed_table(outcomes: Outcomes) -> Table:
-    """Each network: error and certified margin of the constraint."""
-    table = _table("each network: imitation error, certified margin of the constraint, verdict")
+    """Each network: error, and certified margin of the constraint in the colour of the verdict."""
+    table = _table("each network: imitation error, certified margin of the constraint and verdict")
     table.add_column("\nseed", justify="right")
-    for way in outcomes:
-        for k, column in enumerate(("error", "margin", "verdict")):
-            justify = "left" if column == "verdict" else "right"
-            table.add_column(f"{way if k == 0 else ''}\n{column}", justify=justify, no_wrap=True)
+    for heading in ("error", "margin"):
+        for k, way in enumerate(outcomes):
+            table.add_column(f"{heading if k == 0 else ''}\n{way}", justify="right", no_wrap=True)
     for k, row in enumerate(zip(*outcomes.values(), strict=True)):
-        cells = [str(k)]
-        for each in row:
-            verdict = f"[{COLOURS[each.verdict]}]{each.verdict}[/]"
-            cells += [f"{each.validation_error:.4f}", f"{each.safe_margin:+.4f}", verdict]
-        table.add_row(*cells)
+        errors = [f"{each.validation_error:.4f}" for each in row]
+        margins = [
+            f"[{COLOURS[each.verdict]}]{each.safe_margin:+.4f} {each.verdict[0]}[/]" for each in row
+        ]
+        table.add_row(str(k), *errors, *margins)
+    table.caption = "P: proved, R: refuted, U: unknown"
     return table
 
 
 def area_table(outcomes: Outcomes) -> Table:
-    """Areas at each step: certified and simulated, medians over the networks."""
-    table = _table("areas: median over networks; ratio to the same network trained plainly")
+    """Areas at each step: certified and simulated."""
+    table = _table("areas: of plain training, and ratios to it (medians over networks)")
     table.add_column("\nt", justify="right")
     for way in outcomes:
         for k, column in enumerate(("certified", "hull")):
@@ -75,10 +74,10 @@ def area_table(outcomes: Outcomes) -> Table:
         cells = [str(t + 1)]
         for way, group in outcomes.items():
             for of in (_areas, _hulls):
-                values = np.array([of(outcome)[t] for outcome in group])
                 plain = np.array([of(outcome)[t] for outcome in outcomes["plain"]])
-                ratio = "" if way == "plain" else f" ({np.median(values / plain):.2f})"
-                cells.append(f"{np.median(values):.2g}{ratio}")
+                values = np.array([of(outcome)[t] for outcome in group])
+                ratio = f"x {np.median(values / plain):.2f}"
+                cells.append(f"{np.median(plain):.1e}" if way == "plain" else ratio)
         table.add_row(*cells)
     return table
 
@@ -129,7 +128,7 @@ def draw_tubes(outcomes: Outcomes, path: Path) -> None:
         plot_tube(tube, ax)
         ax.axhline(STATE_BOX[0, 1], color="black", linewidth=1)
         ax.set_title(f"{way}: {outcome.verdict}, error {outcome.validation_error:.4f}")
-        _zoom(ax.inset_axes((0.33, 0.62, 0.63, 0.34)), tube, ax)
+        _zoom(ax.inset_axes((0.26, 0.62, 0.5, 0.34)), tube, ax)
         ax.margins(0.05)
         ax.autoscale_view()
     for ax in axes[1:]:
@@ -183,7 +182,7 @@ def draw_seeds(outcomes: Outcomes, path: Path) -> None:
         for k, outcome in enumerate(group):
             label = way if k == 0 else None
             right.semilogy(outcome.imitation, color=WAYS[way], linewidth=0.8, label=label)
-    right.set(xlabel="training step", ylabel="imitation loss with weight decay")
+    right.set(xlabel="training step", ylabel="imitation loss")
     right.legend(frameon=False)
     _save(figure, path)
 
@@ -206,8 +205,7 @@ def write(settings, outcomes: Outcomes, cost: StepCost, path: Path) -> None:
 def _plain(outcome: Outcome) -> dict:
     fields = dataclasses.asdict(outcome)
     del fields["layers"]
-    to_list: Callable = lambda value: value.tolist() if isinstance(value, np.ndarray) else value  # noqa: E731
-    return {name: to_list(value) for name, value in fields.items()}
+    return {name: np.asarray(value).tolist() for name, value in fields.items()}
 
 
 def _areas(outcome: Outcome) -> np.ndarray:

@@ -56,7 +56,7 @@ class Settings:
     """Weight of what the certified sets lack of the specification."""
     margin: float = 0.005
     """How far they should be from breaking it."""
-    volume: float = 0.005
+    volume: float = 0.002
     """Weight of their mean log-volume."""
     decay: float = Teacher.penalty
     """Weight of the squared weights."""

@@ -1,5 +1,8 @@
 """Gradients through the seam: right, alike in every mode of JAX, and refused where they are not."""
 
+import dataclasses
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,8 +27,8 @@ def planar(seed, polytope=False, hidden=(5, 3)):
     return closed_loop(data), X0
 
 
-def value(loop, X0, horizon=1, relaxation=rj.LocalBounds()):  # noqa: B008  (immutable)
-    tube = rj.reach(loop, X0, horizon, TEMPLATE, relaxation)
+def value(loop, X0, horizon=1, **options):
+    tube = rj.reach(loop, X0, horizon, TEMPLATE, **options)
     return sum(WEIGHTS @ region.b for region in tube.sets[1:])
 
 
@@ -61,7 +64,22 @@ def central_difference(f, args, direction, h):
     return (8 * (shifted(1) - shifted(-1)) - (shifted(2) - shifted(-2))) / (12 * h)
 
 
-@pytest.fixture(scope="module", params=[(0, False), (1, True), (3, False)], ids=str)
+def relative_error(f, args, gradient, direction, h):
+    """Against the central difference, or along a level line against the gradient's norm."""
+    exact, difference = dot(gradient, direction), central_difference(f, args, direction, h)
+    part = jax.tree.map(lambda g, d: g * (d != 0), gradient, direction)
+    return abs(exact - difference) / max(abs(difference), np.sqrt(dot(part, part)))
+
+
+# At tolerance 1e-9 a value is good to some 1e-9, and a difference over 1e-4 to some 1e-5; 1e-3 is
+# what is promised. Kinks closer than 2e-4 would show as errors of order one: these points have none
+# along these directions, and every facet is solved.
+STEP, PROMISED = 1e-4, 1e-3
+ONE_STEP = [(0, False), (1, True), (3, False)]
+FIVE_STEPS = [(0, False), (0, True), (1, False), (1, True), (2, True)]
+
+
+@pytest.fixture(scope="module", params=ONE_STEP, ids=str)
 def one_step(request):
     """(compiled value, arguments, their gradient)."""
     args = planar(*request.param)
@@ -72,11 +90,54 @@ def one_step(request):
 def test_the_gradient_of_a_step_is_the_central_difference(one_step, part):
     f, args, gradient = one_step
     for seed in range(2):
-        direction = along(part, *args, seed)
-        exact = dot(gradient, direction)
-        # the solver's 1e-9 over a step of 1e-4 leaves some 1e-4 of these values of order one
-        difference = central_difference(f, args, direction, h=1e-4)
-        assert abs(exact - difference) <= 1e-3 * max(abs(difference), 0.1)
+        assert relative_error(f, args, gradient, along(part, *args, seed), STEP) <= PROMISED
+
+
+@pytest.fixture(scope="module", params=FIVE_STEPS, ids=str)
+def five_steps(request):
+    """(compiled value, arguments, their gradient); neurons leave and enter the basis on the way."""
+    args = planar(*request.param)
+    tube = rj.reach(*args, 5, TEMPLATE, samples=1)
+    kept = {tuple((np.asarray(tube.proof(t).program.scale) > 0).tolist()) for t in range(1, 6)}
+    assert len(kept) > 1
+    assert all(s is rj.SolverStatus.SOLVED for t in range(1, 6) for s in tube.proof(t).statuses)
+    f = jax.jit(partial(value, horizon=5))
+    return f, args, jax.jit(jax.grad(partial(value, horizon=5), argnums=(0, 1)))(*args)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", PARTS)
+def test_the_gradient_of_five_steps_is_the_central_difference(five_steps, part):
+    f, args, gradient = five_steps
+    for seed in range(2):
+        assert relative_error(f, args, gradient, along(part, *args, seed), STEP) <= PROMISED
+
+
+@pytest.mark.slow
+def test_the_gradient_of_a_volume_penalty_is_the_central_difference():
+    args = planar(1)
+
+    def f(loop, X0):
+        return rj.volume_penalty(loop, X0, 5, TEMPLATE)
+
+    gradient = jax.jit(jax.grad(f, argnums=(0, 1)))(*args)
+    for part in PARTS:
+        error = relative_error(jax.jit(f), args, gradient, along(part, *args, 0), STEP)
+        assert error <= PROMISED, part
+
+
+@pytest.mark.slow
+def test_the_gradient_is_as_accurate_as_the_solver():
+    loop, X0 = planar(1)
+    exact = jax.grad(partial(value, horizon=5))(loop, X0)
+    errors = []
+    for tolerance in (1e-4, 1e-6, 1e-8):
+        solver = rj.Clarabel(tolerance=tolerance)
+        gradient = jax.grad(partial(value, horizon=5, solver=solver))(loop, X0)
+        off = jax.tree.map(jnp.subtract, gradient, exact)
+        errors.append(np.sqrt(dot(off, off) / dot(exact, exact)))
+    assert errors[0] > errors[1] > errors[2]
+    assert errors[2] <= PROMISED
 
 
 def test_the_lagrangian_at_the_solution_is_the_offset():
@@ -157,6 +218,37 @@ def test_forward_mode_and_second_derivatives_raise():
         jax.hessian(of)(loop.plant.c)
 
 
+@pytest.mark.parametrize("status", [s for s in rj.SolverStatus if s > rj.SolverStatus.INACCURATE])
+def test_a_status_without_an_optimal_value_has_no_number_for_a_gradient(status):
+    loop, X0 = planar(0)
+    bound, gradient = jax.value_and_grad(value)(loop, X0, solver=Ending(status))
+    assert np.isfinite(bound)
+    assert not any(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient.controller))
+
+
+def test_multipliers_that_do_not_bear_the_claim_out_have_no_number_for_a_gradient():
+    loop, X0 = planar(0)
+    solver = Ending(rj.SolverStatus.SOLVED, times=0.5)
+    bound, gradient = jax.value_and_grad(value)(loop, X0, solver=solver)
+    assert bound > value(loop, X0)
+    assert not any(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient.controller))
+
+
+@dataclasses.dataclass(frozen=True)
+class Ending(rj.AbstractSolver):
+    """Clarabel, reporting another status, its multipliers off by a factor."""
+
+    status: rj.SolverStatus
+    times: float = 1.0
+
+    def solve(self, program):
+        solution = rj.Clarabel().solve(program)
+        return solution._replace(
+            statuses=np.full_like(solution.statuses, self.status),
+            multipliers=self.times * solution.multipliers,
+        )
+
+
 def test_a_failed_solve_has_no_number_for_a_gradient(monkeypatch):
     import cvxpy as cp
 
@@ -168,20 +260,3 @@ def test_a_failed_solve_has_no_number_for_a_gradient(monkeypatch):
     bound, gradient = jax.value_and_grad(value)(loop, X0)
     assert np.isfinite(bound)  # the interval bound
     assert all(np.isnan(leaf).any() for leaf in jax.tree.leaves(gradient.controller.layers[-1]))
-
-
-@pytest.mark.parametrize("n", [1, 2, 3])
-def test_the_bounding_box_of_a_polytope_has_its_derivative(n):
-    region = simplex_region(n, seed=n)
-    weights = jnp.linspace(1.0, 2.0, 2 * n)
-
-    def of(A, b):
-        box = bounding_box(rj.Polytope(A, b))
-        return weights @ jnp.concatenate([box.lower, box.upper])
-
-    args = (jnp.asarray(region.A), jnp.asarray(region.b))
-    gradient = jax.jit(jax.grad(of, argnums=(0, 1)))(*args)
-    rng = np.random.default_rng(0)
-    direction = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), args)
-    difference = central_difference(of, args, direction, 1e-4)
-    assert dot(gradient, direction) == pytest.approx(difference, rel=1e-6)

@@ -1,0 +1,190 @@
+"""Penalties in a training loop: what they are, when they are computed, what a failure does."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+
+import reachjax as rj
+from tests.loops import closed_loop, random_loop
+from tests.networks import box_region
+
+TEMPLATE = rj.Template.octagonal(2)
+GOAL = rj.Box([-0.3, -0.3], [0.3, 0.3])
+
+
+@pytest.fixture(scope="module")
+def case():
+    region = box_region(2, 1)
+    X0 = rj.Box(region.corners.min(axis=0), region.corners.max(axis=0))
+    return closed_loop(random_loop(2, hidden=(5, 3), seed=1)), X0
+
+
+def test_penalties_are_those_of_the_tube(case):
+    tube = rj.reach(*case, 2, TEMPLATE)
+    logs = rj.volume_penalty(*case, 2, TEMPLATE)
+    assert float(logs) == pytest.approx(float(rj.log_volume(tube)) / 2, rel=1e-9)
+    areas = rj.volume_penalty(*case, 2, TEMPLATE, measure=rj.volume)
+    assert float(areas) == pytest.approx(np.mean([s.volume() for s in tube.sets[1:]]), rel=1e-9)
+    missing = rj.specification_penalty(*case, 2, TEMPLATE, goal=GOAL, margin=0.1)
+    assert float(missing) == pytest.approx(float(rj.shortfall(tube, goal=GOAL, margin=0.1)))
+    assert missing > 0
+    paper = rj.volume_penalty(*case, 2, TEMPLATE, relaxation=rj.PaperQC(repeated=False))
+    assert paper > logs
+
+
+def test_a_gradient_step_lowers_each_penalty(case):
+    loop, X0 = case
+    for penalty in (
+        lambda net: rj.volume_penalty(loop.replace(controller=net), X0, 2, TEMPLATE),
+        lambda net: rj.specification_penalty(
+            loop.replace(controller=net), X0, 2, TEMPLATE, goal=GOAL
+        ),
+    ):
+        before, gradient = jax.value_and_grad(penalty)(loop.controller)
+        size = sum(float(jnp.sum(g**2)) for g in jax.tree.leaves(gradient))
+        after = penalty(jax.tree.map(lambda w, g: w - 1e-3 * g, loop.controller, gradient))
+        assert float(before - after) == pytest.approx(1e-3 * size, rel=0.2)
+
+
+def test_misspelt_options_are_errors(case):
+    with pytest.raises(TypeError, match="relaxatoin"):
+        rj.volume_penalty(*case, 1, TEMPLATE, relaxatoin=rj.PaperQC())
+    with pytest.raises(TypeError, match="marign"):
+        rj.specification_penalty(*case, 1, TEMPLATE, goal=GOAL, marign=1.0)
+
+
+def test_a_schedule_warms_up_ramps_and_leaves_steps_out():
+    schedule = rj.PenaltySchedule(weight=3.0, every=2, warmup=4, ramp=6)
+    weights = [float(schedule(step)) for step in range(14)]
+    expected = [0] * 4 + [0.5, 0, 1.5, 0, 2.5, 0, 3, 0, 3, 0]
+    np.testing.assert_allclose(weights, expected)
+    np.testing.assert_allclose(jax.jit(jax.vmap(schedule))(jnp.arange(14)), expected)
+
+
+@dataclasses.dataclass(frozen=True)
+class Counting(rj.AbstractSolver):
+    """Clarabel, which notes the programs that it is asked to solve, and fails on some."""
+
+    asked: list = dataclasses.field(default_factory=list, hash=False, compare=False)
+    failing: tuple[int, ...] = ()
+
+    def solve(self, program):
+        self.asked.append(program)
+        solution = rj.Clarabel().solve(program)
+        if len(self.asked) - 1 in self.failing:
+            return solution._replace(
+                statuses=np.full_like(solution.statuses, rj.SolverStatus.FAILED),
+                multipliers=np.zeros_like(solution.multipliers),
+            )
+        return solution
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_nothing_is_solved_at_steps_without_a_weight(case, compiled):
+    loop, X0 = case
+    solver = Counting()
+    schedule = rj.PenaltySchedule(1.0, every=3, warmup=1)
+
+    def loss(net, step):
+        def penalty(net):
+            return rj.volume_penalty(
+                loop.replace(controller=net), X0, 1, TEMPLATE, solver=solver, samples=1
+            )
+
+        return schedule.apply(step, penalty, net)
+
+    gradient = jax.value_and_grad(loss)
+    gradient = jax.jit(gradient) if compiled else gradient
+    values = [float(gradient(loop.controller, step)[0]) for step in range(6)]
+    assert [value != 0 for value in values] == [False, True, False, False, True, False]
+    assert len(solver.asked) == 2  # one solve for value and gradient together
+
+
+def test_a_failed_solve_is_skipped_and_counted(case):
+    loop, X0 = case
+    optimizer = rj.skip_failures(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-2)))
+
+    def trained(failing):
+        solver = Counting(failing=failing)
+
+        @jax.jit
+        def advance(net, state):
+            gradient = jax.grad(
+                lambda net: rj.volume_penalty(
+                    loop.replace(controller=net), X0, 1, TEMPLATE, solver=solver
+                )
+            )(net)
+            updates, state = optimizer.update(gradient, state, net)
+            return optax.apply_updates(net, updates), state
+
+        nets, state = [loop.controller], optimizer.init(loop.controller)
+        for _ in range(4):
+            net, state = advance(nets[-1], state)
+            nets.append(net)
+        return nets, rj.failures(state)
+
+    same = lambda a, b: all(map(np.array_equal, jax.tree.leaves(a), jax.tree.leaves(b)))  # noqa: E731
+    nets, skipped = trained(failing=(1, 2))
+    assert skipped == 2
+    assert [same(a, b) for a, b in zip(nets, nets[1:], strict=False)] == [False, True, True, False]
+    whole, none = trained(failing=())
+    assert none == 0
+    assert same(nets[-1], whole[2])  # also the optimiser's state was left alone
+
+
+def test_failures_are_counted_in_a_flax_optimiser():
+    model = nnx.Linear(2, 1, rngs=nnx.Rngs(0))
+    optimizer = nnx.Optimizer(model, rj.skip_failures(optax.adam(1e-2)), wrt=nnx.Param)
+    before = model.kernel[...]
+    broken = jax.tree.map(lambda w: w * jnp.nan, nnx.state(model, nnx.Param))
+    optimizer.update(model, broken)
+    np.testing.assert_array_equal(model.kernel[...], before)
+    assert rj.failures(optimizer.opt_state) == 1
+
+
+def test_a_state_without_a_count_is_an_error():
+    with pytest.raises(ValueError, match="state must be that of an optimiser wrapped by skip_fail"):
+        rj.failures(optax.adam(1e-2).init(jnp.zeros(2)))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"weight": -1.0}, ValueError, r"weight must be at least 0, but -1\.0 arrived"),
+        ({"weight": float("nan")}, ValueError, "weight must be at least 0, but nan arrived"),
+        ({"weight": "much"}, TypeError, "weight must be a number, but 'much' arrived"),
+        ({"weight": 1.0, "every": 0}, ValueError, "every must be at least 1, but 0 arrived"),
+        ({"weight": 1.0, "warmup": -1}, ValueError, "warmup must be at least 0, but -1 arrived"),
+        ({"weight": 1.0, "ramp": 0.5}, TypeError, r"ramp must be a whole number, but 0\.5 arrived"),
+        ({"weight": 1.0, "wramup": 5}, TypeError, "wramup"),
+    ],
+)
+def test_bad_schedules_are_named(options, error, message):
+    with pytest.raises(error, match=message):
+        rj.PenaltySchedule(**options)
+
+
+def test_a_batch_of_networks_is_penalised_one_by_one(case):
+    loop, X0 = case
+    penalty = partial(rj.specification_penalty, goal=GOAL, margin=0.1)
+    nets = [jax.tree.map(lambda w, s=s: w * s, loop.controller) for s in (0.9, 1.1)]
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *nets)
+
+    def of(net):
+        return penalty(loop.replace(controller=net), X0, 2, TEMPLATE)
+
+    batch = jax.jit(jax.vmap(jax.grad(of)))(together)
+    for k, net in enumerate(nets):
+        single = jax.grad(of)(net)
+        jax.tree.map(
+            # compiled and plain programs are rounded differently, and solved to 1e-9 each
+            lambda a, b, k=k: np.testing.assert_allclose(a[k], b, rtol=1e-4, atol=1e-6),
+            batch,
+            single,
+        )

@@ -13,6 +13,7 @@ import hashlib
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -163,7 +164,7 @@ def _trained(layers, samples: Samples, tuning: Tuning) -> tuple[list, dict]:
         updates, state = optimizer.update(gradient, state)
         return optax.apply_updates(net, updates), state, parts
 
-    net = rj.MLP.from_layers(layers)
+    net: Any = rj.MLP.from_layers(layers)
     state, parts, seconds = optimizer.init(net), [], []
     for step in range(tuning.steps):
         began = time.perf_counter()

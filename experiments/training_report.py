@@ -48,7 +48,7 @@ def verdict_table(outcomes: Outcomes) -> Table:
 
 def seed_table(outcomes: Outcomes) -> Table:
     """Each network: error, and certified margin of the constraint in the colour of the verdict."""
-    table = _table("each network: imitation error, certified margin of the constraint and verdict")
+    table = _table("each network: imitation error, and certified margin of the constraint")
     table.add_column("\nseed", justify="right")
     for heading in ("error", "margin"):
         for k, way in enumerate(outcomes):
@@ -128,7 +128,7 @@ def draw_tubes(outcomes: Outcomes, path: Path) -> None:
         plot_tube(tube, ax)
         ax.axhline(STATE_BOX[0, 1], color="black", linewidth=1)
         ax.set_title(f"{way}: {outcome.verdict}, error {outcome.validation_error:.4f}")
-        _zoom(ax.inset_axes((0.26, 0.62, 0.5, 0.34)), tube, ax)
+        _zoom(ax.inset_axes((0.34, 0.62, 0.44, 0.34)), tube, ax)
         ax.margins(0.05)
         ax.autoscale_view()
     for ax in axes[1:]:
@@ -155,7 +155,7 @@ def _zoom(inset, tube: rj.ReachTube, ax) -> None:
 
 
 def draw_seeds(outcomes: Outcomes, path: Path) -> None:
-    """Each network's error against its margin, areas step by step, and how penalties fall."""
+    """Each network's error against its margin, areas step by step, and the imitation loss."""
     import matplotlib.pyplot as plt
 
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
@@ -179,10 +179,9 @@ def draw_seeds(outcomes: Outcomes, path: Path) -> None:
     middle.set(xlabel="t", ylabel="area, median over networks")
     middle.legend(frameon=False, fontsize=7)
     for way, group in outcomes.items():
-        for k, outcome in enumerate(group):
-            label = way if k == 0 else None
-            right.semilogy(outcome.imitation, color=WAYS[way], linewidth=0.8, label=label)
-    right.set(xlabel="training step", ylabel="imitation loss")
+        median = np.median([outcome.imitation for outcome in group], axis=0)
+        right.semilogy(median, color=WAYS[way], linewidth=1, label=way)
+    right.set(xlabel="training step", ylabel="imitation loss, median over networks")
     right.legend(frameon=False)
     _save(figure, path)
 

@@ -80,7 +80,12 @@ class Settings:
                 raise ValueError(
                     f"--{name.replace('_', '-')} must be above 0, got {getattr(self, name)}"
                 )
-        if not self.goals or min(self.goals) <= 0:
+        for name in ("margin", "decay"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"--{name} must be at least 0, got {getattr(self, name)}")
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"--hidden must be numbers of neurons, got {self.hidden}")
+        if not self.goals or not min(self.goals) > 0:
             raise ValueError(f"--goals must be half-widths above 0, got {self.goals}")
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -132,7 +133,7 @@ def test_a_failed_solve_is_skipped_and_counted(case):
     same = lambda a, b: all(map(np.array_equal, jax.tree.leaves(a), jax.tree.leaves(b)))  # noqa: E731
     nets, skipped = trained(failing=(1, 2))
     assert skipped == 2
-    assert [same(a, b) for a, b in zip(nets, nets[1:], strict=False)] == [False, True, True, False]
+    assert [same(a, b) for a, b in pairwise(nets)] == [False, True, True, False]
     whole, none = trained(failing=())
     assert none == 0
     assert same(nets[-1], whole[2])  # also the optimiser's state was left alone

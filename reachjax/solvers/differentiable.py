@@ -42,9 +42,8 @@ def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Arra
     Returns:
         The proved offsets `(f,)`, and what the solver proposed (which has no derivative).
     """
-    offsets, _, solution = _proved_offsets(
-        solver, program.facts.mid, program.objective.mid, program
-    )
+    result: Any = _proved_offsets(solver, program.facts.mid, program.objective.mid, program)
+    offsets, _, solution = result
     return offsets, solution
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ def bounding_box(X: AbstractSet) -> Box:
     """The smallest box around a set; differentiable, also inside `jax.jit`."""
     if not isinstance(X, Polytope):
         return X.bounding_box()
-    ends = _differentiable(_box, 2 * X.dimension, X.A, X.b)
+    ends = _values(_box, 2 * X.dimension, X.A, X.b)
     return Box(-ends[: X.dimension], ends[X.dimension :])
 
 
@@ -36,7 +37,7 @@ def support(X: AbstractSet, directions: Float[Array, "m n"]) -> Float[Array, " m
     """The largest value of each direction on a set, rounded up; differentiable, also in `jit`."""
     if not isinstance(X, Polytope):
         return X.support(directions)
-    return _differentiable(_support, len(directions), X.A, X.b, directions)
+    return _values(_support, len(directions), X.A, X.b, directions)
 
 
 def separation(X: PolyhedralSet, Y: PolyhedralSet) -> Float[Array, ""]:
@@ -44,16 +45,21 @@ def separation(X: PolyhedralSet, Y: PolyhedralSet) -> Float[Array, ""]:
 
     A lower bound, rounding included; differentiable, also inside `jax.jit`. `X` is bounded.
     """
-    return _differentiable(_separation, 1, *X.facets, *Y.facets)[0]
+    return _values(_separation, 1, *X.facets, *Y.facets)[0]
 
 
 def polytope_volume(X: Polytope) -> Float[Array, ""]:
     """The volume; differentiable: moving facet `i` by `db_i` sweeps `area_i db_i / |a_i|`."""
-    return _differentiable(_volume, 1, X.A, X.b)[0]
+    return _values(_volume, 1, X.A, X.b)[0]
+
+
+def _values(compute: Values, count: int, *arrays: Array) -> Array:
+    values: Any = _linearised(compute, count, *arrays)
+    return values
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _differentiable(compute: Values, count: int, *arrays: Array) -> Array:
+def _linearised(compute: Values, count: int, *arrays: Array) -> Array:
     return _forward(compute, count, *arrays)[0]
 
 
@@ -67,7 +73,7 @@ def _backward(compute, count, slopes, cotangent):
     return tuple(jnp.tensordot(cotangent, slope, 1) for slope in slopes)
 
 
-_differentiable.defvjp(_forward, _backward)
+_linearised.defvjp(_forward, _backward)
 
 
 def _box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, Slopes]:

@@ -13,11 +13,19 @@ from reachjax.certificates import Certificate
 from reachjax.reach import ReachTube, reach, reach_step
 from reachjax.relaxation import AbstractRelaxation, LocalBounds, PaperQC
 from reachjax.requirements import shortfall
-from reachjax.sets import AbstractSet, Box, PolyhedralSet, Polytope, Template
+from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet, Polytope, Template
 from reachjax.sizes import log_volume, log_widths, volume
 from reachjax.solvers import SCS, AbstractSolver, Clarabel, CvxpySolver, SolverStatus
 from reachjax.specs import Counterexample, Verdict, VerdictStatus, verify
-from reachjax.systems import MLP, AbstractActivation, AffinePlant, ClosedLoop, ReLU
+from reachjax.systems import (
+    MLP,
+    AbstractActivation,
+    AffinePlant,
+    ClosedLoop,
+    ReLU,
+    runge_kutta,
+    zero_order_hold,
+)
 from reachjax.training import (
     PenaltySchedule,
     failures,
@@ -43,6 +51,7 @@ __all__ = [
     "ClosedLoop",
     "Counterexample",
     "CvxpySolver",
+    "Ellipsoid",
     "LocalBounds",
     "PaperQC",
     "PenaltySchedule",
@@ -60,10 +69,12 @@ __all__ = [
     "log_widths",
     "reach",
     "reach_step",
+    "runge_kutta",
     "shortfall",
     "skip_failures",
     "specification_penalty",
     "verify",
     "volume",
     "volume_penalty",
+    "zero_order_hold",
 ]

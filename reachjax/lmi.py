@@ -38,7 +38,8 @@ class Program(Replaceable):
     """The semidefinite programs of one step: one for each facet, all but the objective shared.
 
     Attributes:
-        facts: `(m, n)` rows over the scaled basis, never negative on the set.
+        facts: `(m, n)` rows over the scaled basis, never negative on the set, and the rows of its
+            cone fact.
         objective: `(f, n)` rows over the scaled basis: `a . x+` for each facet.
         products: which pairs of facts are multiplied.
         shift: `(n,)`, the midpoint of each entry of the basis (zero for the constant).
@@ -89,7 +90,7 @@ def weighted_products(program: Program, multipliers: Float[Array | np.ndarray, "
     Works on JAX arrays and on numpy arrays alike.
     """
     products, facts = program.products, program.facts
-    weights = multipliers[products.multiplier][:, None]
+    weights = (products.sign * multipliers[products.multiplier])[:, None]
     L, dL = facts.mid[products.left], facts.rad[products.left]
     R, dR = facts.mid[products.right], facts.rad[products.right]
     half = (weights * L).T @ R
@@ -120,13 +121,14 @@ def step_program(
         t: the time.
         relaxation: which products of facts are used.
     """
-    return _step_program(loop, X.facts(), box, template.directions, t, relaxation)
+    return _step_program(loop, X.facts(), X.cone_facts(), box, template.directions, t, relaxation)
 
 
 @partial(jax.jit, static_argnames="relaxation")
 def _step_program(
     loop: ClosedLoop,
     set_facts: Float[Array, "m n_x+1"],
+    cone_facts: Float[Array, "r n_x+1"],
     box: Box,
     directions: Float[Array, "f n_x"],
     t: int,
@@ -137,8 +139,10 @@ def _step_program(
     bounds = loop_bounds(loop, box, t)
     rows = loop_rows(loop, columns(0, n, size), n, t, bounds, relaxation.remove_stable)
     one = columns(size - 1, 1, size)
-    of_the_set = set_facts[:, :-1] @ rows.state + set_facts[:, -1]
-    facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts)
+    of_the_set, cone = (
+        given[:, :-1] @ rows.state + given[:, -1] for given in (set_facts, cone_facts)
+    )
+    facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts, cone)
     # the optimal value does not depend on the scaling, so neither does its derivative
     shift, scale = jax.lax.stop_gradient(basis_box(bounds, relaxation.remove_stable))
     # one rounding of the scaling for all rows, whatever the compiler fuses
@@ -147,7 +151,7 @@ def _step_program(
     return Program(
         facts=facts @ T,
         objective=(directions @ rows.successor) @ T,
-        products=relaxation.products(FactLayout(len(set_facts), k)),
+        products=relaxation.products(FactLayout(len(set_facts), k, len(cone_facts))),
         shift=shift,
         scale=scale,
     )
@@ -164,5 +168,6 @@ def lagrangian(
     F, products = program.facts.mid, program.products
     values = F @ moments @ F.T
     pairs = values[:, products.left, products.right]
-    weighted = jnp.sum(multipliers[:, products.multiplier] * pairs, axis=1) / 2
+    weights = products.sign * multipliers[:, products.multiplier]
+    weighted = jnp.sum(weights * pairs, axis=1) / 2
     return weighted + jnp.einsum("fi,fi->f", program.objective.mid, moments[:, :, -1])

@@ -7,16 +7,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reachjax.reach import ReachTube
-from reachjax.sets import PolyhedralSet
+from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SET = {"facecolor": "none", "edgecolor": "tab:red", "linewidth": 1.4}
+OUTLINE = 200
+"""Points of an ellipse's outline."""
+
 SAMPLES = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
 
 
-def plot_set(region: PolyhedralSet, ax: Axes | None = None, **style: Any) -> Axes:
+def plot_set(region: AbstractSet, ax: Axes | None = None, **style: Any) -> Axes:
     """Draw the outline of a bounded set in the plane.
 
     Args:
@@ -32,12 +35,21 @@ def plot_set(region: PolyhedralSet, ax: Axes | None = None, **style: Any) -> Axe
     from matplotlib.patches import Polygon
 
     ax = _axes(ax)
-    corners = np.asarray(region.vertices())
-    around = corners - corners.mean(axis=0)
-    order = np.argsort(np.arctan2(around[:, 1], around[:, 0]))
-    ax.add_patch(Polygon(corners[order], closed=True, **{**SET, **style}))
+    ax.add_patch(Polygon(_outline(region), closed=True, **{**SET, **style}))
     ax.autoscale_view()
     return ax
+
+
+def _outline(region: AbstractSet) -> np.ndarray:
+    """Points around a set of the plane, in order."""
+    if isinstance(region, Ellipsoid):
+        angles = np.linspace(0, 2 * np.pi, OUTLINE, endpoint=False)
+        circle = np.column_stack([np.cos(angles), np.sin(angles)])
+        return np.asarray(region.center) + circle @ np.linalg.cholesky(region.shape).T
+    assert isinstance(region, PolyhedralSet)
+    corners = np.asarray(region.vertices())
+    around = corners - corners.mean(axis=0)
+    return corners[np.argsort(np.arctan2(around[:, 1], around[:, 0]))]
 
 
 def plot_tube(tube: ReachTube, ax: Axes | None = None, samples: int = 2000) -> Axes:
@@ -57,7 +69,6 @@ def plot_tube(tube: ReachTube, ax: Axes | None = None, samples: int = 2000) -> A
     trajectories = np.asarray(tube.simulate(samples))
     for t, region in enumerate(tube.sets):
         ax.scatter(*trajectories[:, t].T, **SAMPLES, label="simulated" if t == 0 else None)
-        assert isinstance(region, PolyhedralSet)
         first = {"edgecolor": "black", "label": "initial set"} if t == 0 else {}
         plot_set(region, ax, **(first or {"label": "certified" if t == 1 else None}))
     ax.set_xlabel("$x_1$")

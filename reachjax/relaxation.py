@@ -4,7 +4,8 @@ Facts are stacked as `[1; facets of the set; z; z - y; caps of z; caps of z - y]
 two of them is never negative on a trajectory, the product `z (z - y)` is zero there. Weighted by
 multipliers they form `F' Gamma F` (propositions 1-2 and lemma 1 of the paper, and what others add
 to them). A diagonal entry of `Gamma` would only add a positive semidefinite term, which never
-helps, so there is none.
+helps, so there is none; but an ellipsoid's rows come squared, `s^2 - |R x|^2 >= 0`, in every
+relaxation (proposition 2).
 """
 
 from __future__ import annotations
@@ -15,17 +16,24 @@ import itertools
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.pytrees import pytree
 
 
 @dataclasses.dataclass(frozen=True)
 class FactLayout:
-    """Where each kind of fact stands among the rows: `facets` of the set, `units` of the loop."""
+    """Where each kind of fact stands among the rows.
+
+    Attributes:
+        facets: of the set of states.
+        units: of the loop.
+        cone: rows of the set's cone fact, the level first; 0 when it has none.
+    """
 
     facets: int
     units: int
+    cone: int = 0
 
     @property
     def set_facets(self) -> range:
@@ -56,6 +64,12 @@ class FactLayout:
         """`max(-l, 0) - (z - y) >= 0`."""
         return self._kind(3)
 
+    @property
+    def cone_rows(self) -> range:
+        """The level `s`, then the rows `R` with `|R x| <= s`."""
+        first = self._kind(4).start
+        return range(first, first + self.cone)
+
 
 @pytree
 class Products:
@@ -64,12 +78,14 @@ class Products:
     Attributes:
         left: `(p,)`, row numbers of facts.
         right: `(p,)`, row numbers of facts.
+        sign: `(p,)`, 1 or -1: with which sign the product enters.
         multiplier: `(p,)`, the multiplier of each pair; several pairs may share one.
         free: `(K,)`, multipliers of either sign (the product is zero); the others are `>= 0`.
     """
 
     left: Int[Array, " p"]
     right: Int[Array, " p"]
+    sign: Float[Array, " p"]
     multiplier: Int[Array, " p"]
     free: Bool[Array, " K"]
 
@@ -90,10 +106,14 @@ class AbstractRelaxation(abc.ABC):
     def products(self, facts: FactLayout) -> Products:
         """The pairs as index arrays."""
         groups, free = self.groups(facts)
+        # s^2 - |R x|^2 >= 0 under one multiplier: the level's square less those of the other rows
+        groups = groups + [[(row, row) for row in facts.cone_rows]] * (facts.cone > 0)
         pairs = np.array(list(itertools.chain.from_iterable(groups)), dtype=int).reshape(-1, 2)
         owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
-        signs = np.arange(len(groups)) < free
-        return Products(*map(jnp.asarray, (pairs[:, 0], pairs[:, 1], owner, signs)))
+        left, right = pairs.T
+        sign = np.where(np.isin(left, facts.cone_rows[1:]), -1.0, 1.0)
+        signed = np.arange(len(groups)) < free
+        return Products(*map(jnp.asarray, (left, right, sign, owner, signed)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -44,7 +44,6 @@ class Requirement:
         if self.inside:
             C, d = self.region.facets
             return (d - support(reached, C)) / jnp.linalg.norm(C, axis=1)
-        assert isinstance(reached, PolyhedralSet)
         return separation(reached, self.region)[None]
 
     def simulated(self, trajectories: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ EXACT_DIMENSIONS = 4
 
 
 def volume(X: AbstractSet) -> Float[Array, ""]:
-    """The `n`-dimensional volume of a set, or of its bounding box beyond four dimensions.
+    """The `n`-dimensional volume; of a polytope beyond four dimensions, that of its bounding box.
 
     Differentiable, also inside `jax.jit`, `jax.vmap` and `jax.lax.scan`.
 
@@ -29,7 +29,9 @@ def volume(X: AbstractSet) -> Float[Array, ""]:
         >>> jax.grad(lambda b: volume(template.polytope(b)))(jnp.array([2.0, 0, 3, 0])).round(9)
         Array([3., 3., 2., 2.], dtype=float64)
     """
-    if isinstance(X, Polytope) and X.dimension <= EXACT_DIMENSIONS:
+    if not isinstance(X, Polytope):
+        return jnp.asarray(X.volume())
+    if X.dimension <= EXACT_DIMENSIONS:
         return polytope_volume(X)
     return jnp.prod(bounding_box(X).widths)
 

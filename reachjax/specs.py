@@ -170,9 +170,7 @@ def verify(
 
 def _surely_broken(tube: ReachTube, item: Requirement, x0: np.ndarray) -> bool:
     """Whether the exact trajectory from `x0` breaks a requirement, rounding accounted for."""
-    X0 = tube.sets[0]
-    assert isinstance(X0, PolyhedralSet)
-    if not X0.surely_contains(x0):
+    if not tube.sets[0].surely_contains(x0):
         return False
     reached = Box(x0, x0)
     for t in range(item.time):

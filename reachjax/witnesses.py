@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.sets import AbstractSet, PolyhedralSet
+from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 from reachjax.systems import ClosedLoop
 
 MOST_DIMENSIONS = 12
@@ -23,10 +23,19 @@ MOST_DIMENSIONS = 12
 PULL = 1 - 1e-12
 """How far a rounded point is brought towards the middle of the set."""
 
+SOLVER_PULL = 1 - 1e-7
+"""The same for a point that a solver proposes."""
+
 
 def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[Array, "c n_x"]:
-    """Corners of a polyhedral set of few dimensions and `count` points drawn from it."""
-    states = X0.sample(jax.random.key(seed), count)
+    """Corners of a polyhedral set of few dimensions, and `count` points drawn from the set.
+
+    Of an ellipsoid, half of the points are on the surface.
+    """
+    key = jax.random.key(seed)
+    states = X0.sample(key, count)
+    if isinstance(X0, Ellipsoid):
+        states = states.at[::2].set(X0.sample_boundary(key, count)[::2])
     if isinstance(X0, PolyhedralSet) and X0.dimension <= MOST_DIMENSIONS:
         with contextlib.suppress(RuntimeError):  # too thin to have corners: do without
             states = jnp.concatenate([X0.vertices(), states])
@@ -39,7 +48,8 @@ def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[Array, "c n_
 
 def proposed_states(X0: AbstractSet, moments: np.ndarray) -> Float[Array, "f n_x"]:
     """The state columns of dual moment matrices, those that lie in the set."""
-    states = jnp.asarray(moments[:, : X0.dimension, -1])
+    center = X0.bounding_box().center
+    states = center + SOLVER_PULL * (jnp.asarray(moments[:, : X0.dimension, -1]) - center)
     return states[np.asarray(X0.contains(states))]
 
 

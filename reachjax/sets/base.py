@@ -2,7 +2,8 @@
 
 A set enters the semidefinite program through its **facts**: rows `r` over `[x, 1]` with
 `r . [x, 1] >= 0` on the set. For a polytope `A x <= b` these are the rows of `[-A, b]`, whose
-pairwise products span the quadratic constraint of the paper's proposition 1.
+pairwise products span the quadratic constraint of the paper's proposition 1. A round set has a
+**cone fact** instead, `|R [x, 1]| <= s [x, 1]`, whose square is that of its proposition 2.
 """
 
 from __future__ import annotations
@@ -32,6 +33,14 @@ class AbstractSet(Replaceable, abc.ABC):
     @abc.abstractmethod
     def facts(self) -> Float[Array, "m n+1"]:
         """Rows `r` with `r . [x, 1] >= 0` for every `x` of the set."""
+
+    def cone_facts(self) -> Float[Array, "r n+1"]:
+        """Rows `[s; R]` with `|R [x, 1]| <= s [x, 1]` for every `x` of the set; none by default."""
+        return jnp.zeros((0, self.dimension + 1))
+
+    @abc.abstractmethod
+    def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
+        """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
 
     @abc.abstractmethod
     def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:

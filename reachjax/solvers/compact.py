@@ -77,13 +77,13 @@ def compact(program: Program) -> CompactProgram:
 def _generators(program: Program, facts: np.ndarray) -> tuple[sp.csc_array, np.ndarray]:
     """The flattened `sum sym(p' q)` of each multiplier's pairs `(n * n, K)`, and their norms."""
     left, right = np.asarray(program.products.left), np.asarray(program.products.right)
-    owner = np.asarray(program.products.multiplier)
+    owner, sign = np.asarray(program.products.multiplier), np.asarray(program.products.sign)
     count, pairs, n = len(program.products.free), len(left), facts.shape[1]
     blocks = []
     for first in range(0, pairs, CHUNK):
         here = slice(first, first + CHUNK)
         outer = facts[left[here], :, None] * facts[right[here], None, :]
-        symmetric = (outer + outer.transpose(0, 2, 1)) / 2
+        symmetric = sign[here, None, None] * (outer + outer.transpose(0, 2, 1)) / 2
         blocks.append(sp.csr_array(symmetric.reshape(-1, n * n)))
     sharing = sp.csr_array((np.ones(pairs), (owner, np.arange(pairs))), shape=(count, pairs))
     generators = sp.csc_array((sharing @ sp.vstack(blocks, format="csr")).T)

@@ -40,11 +40,16 @@ def support(X: AbstractSet, directions: Float[Array, "m n"]) -> Float[Array, " m
     return _values(_support, len(directions), X.A, X.b, directions)
 
 
-def separation(X: PolyhedralSet, Y: PolyhedralSet) -> Float[Array, ""]:
+def separation(X: AbstractSet, Y: PolyhedralSet) -> Float[Array, ""]:
     """How far the facets of `Y` may move outward before it meets `X`; negative if they overlap.
 
-    A lower bound, rounding included; differentiable, also inside `jax.jit`. `X` is bounded.
+    A lower bound, rounding included; differentiable, also inside `jax.jit`. `X` is bounded. If it
+    is round, the bound is the best that one facet of `Y` gives, or the bounding box of `X`.
     """
+    if not isinstance(X, PolyhedralSet):
+        C, d = Y.facets
+        facet = jnp.max((-X.support(-C) - d) / jnp.linalg.norm(C, axis=1))
+        return jnp.maximum(facet, separation(X.bounding_box(), Y))
     return _values(_separation, 1, *X.facets, *Y.facets)[0]
 
 

@@ -1,0 +1,187 @@
+"""Ellipsoids.
+
+With `Q` the shape matrix and `L L' = Q` its Cholesky factor, `(x - q)' Q^-1 (x - q) <= 1` is
+`|A x + b| <= 1` with `A = L^-1` and `b = -A q`, the paper's form (there `A` is symmetric; any
+orthogonal multiple describes the same set).
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
+
+from reachjax.checks import Numbers, is_concrete, same_size
+from reachjax.pytrees import converted, pytree
+from reachjax.rounding import gamma
+from reachjax.sets.base import AbstractSet
+from reachjax.sets.box import Box
+
+SINGULAR = 1e-14
+"""A shape matrix whose smallest eigenvalue is a smaller part of its largest has no inverse."""
+
+
+@pytree
+class Ellipsoid(AbstractSet):
+    """The ellipsoid `(x - center)' shape^-1 (x - center) <= 1` (the paper's proposition 2).
+
+    Args:
+        center: `(n,)`, in the units of the states.
+        shape: `(n, n)`, symmetric and positive definite; the squares of the half-axes are its
+            eigenvalues.
+
+    Raises:
+        ValueError: sizes differ, an entry is not finite, or `shape` is not symmetric or not
+            positive definite (a flat ellipsoid has no facts).
+
+    Example:
+        >>> ellipsoid = Ellipsoid([1.0, 0.0], [[4.0, 0.0], [0.0, 1.0]])
+        >>> ellipsoid.support([[1.0, 0.0], [0.0, 2.0]]).round(9).tolist()
+        [3.0, 2.0]
+        >>> round(float(ellipsoid.volume() / jnp.pi), 9)
+        2.0
+    """
+
+    center: Float[Array, " n"] = converted(converter=Numbers("(n,)"))
+    shape: Float[Array, "n n"] = converted(converter=Numbers("(n, n)"))
+
+    def __post_init__(self):
+        center, shape = self.center, self.shape
+        same_size(
+            "Ellipsoid.center has length",
+            "Ellipsoid.shape has a number of rows of",
+            (len(center), len(shape)),
+        )
+        same_size(
+            "its number of rows is",
+            "Ellipsoid.shape must be square: its number of columns is",
+            shape.shape,
+        )
+        if is_concrete(shape):
+            matrix = np.asarray(shape)
+            if not np.allclose(matrix, matrix.T, rtol=1e-12, atol=1e-12 * abs(matrix).max()):
+                raise ValueError(f"Ellipsoid.shape must be symmetric, but it is\n{matrix}")
+            values = np.linalg.eigvalsh(matrix)
+            if values[0] <= SINGULAR * abs(values).max():
+                raise ValueError(
+                    "Ellipsoid.shape must be positive definite, but its eigenvalues are "
+                    f"{values.tolist()}"
+                )
+
+    @property
+    def dimension(self) -> int:
+        """The number of coordinates."""
+        return self.center.shape[0]
+
+    @property
+    def normal_form(self) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+        """The pair `(A, b)`: the set is `|A x + b| <= 1`, up to rounding."""
+        factor = jnp.linalg.cholesky(self.shape)
+        A = solve_triangular(factor, jnp.eye(self.dimension), lower=True)
+        return A, -A @ self.center
+
+    def _level(self) -> Float[Array, ""]:
+        """A bound `s >= |A x + b|` on the exact set, for `A` and `b` as they are rounded.
+
+        On the set `|A (x - q)|^2` is at most the largest eigenvalue of `A Q A'`, which is at most
+        the largest row sum of its absolute values.
+        """
+        A, _ = self.normal_form
+        n, Q = self.dimension, self.shape
+        rounding = gamma(2 * n) * (abs(A) @ abs(Q) @ abs(A).T)
+        largest = jnp.max(jnp.sum(abs(A @ Q @ A.T) + rounding, axis=1)) * (1 + gamma(n))
+        offset = jnp.linalg.norm(gamma(n) * (abs(A) @ abs(self.center))) * (1 + gamma(n))
+        return jax.lax.stop_gradient((jnp.sqrt(largest) + offset) * (1 + gamma(4)))
+
+    def facts(self) -> Float[Array, "0 n+1"]:
+        """None: an ellipsoid has a cone fact instead."""
+        return jnp.zeros((0, self.dimension + 1))
+
+    def cone_facts(self) -> Float[Array, "n+1 n+1"]:
+        """The rows `[s; A, b]` with `|A x + b| <= s` on the set, `s` being 1 up to rounding."""
+        A, b = self.normal_form
+        level = jnp.zeros(self.dimension + 1).at[-1].set(self._level())
+        return jnp.vstack([level, jnp.hstack([A, b[:, None]])])
+
+    def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
+        """`a . q + sqrt(a' Q a)`, rounded up."""
+        D, n = self._directions(directions), self.dimension
+        Q, q = self.shape, self.center
+        squares = jnp.einsum("mi,ij,mj->m", D, Q, D)
+        sizes = jnp.einsum("mi,ij,mj->m", abs(D), abs(Q), abs(D))
+        reach = jnp.sqrt(squares + gamma(2 * n) * sizes)
+        rounding = gamma(n + 4) * (abs(D) @ abs(q) + reach)
+        return D @ q + reach + rounding
+
+    def contains(
+        self, points: Float[ArrayLike, "*batch n"], tolerance: float = 0.0
+    ) -> Bool[Array, "*batch"]:
+        """Whether `|A x + b| <= 1 + tolerance` for each point."""
+        A, _ = self.normal_form
+        return jnp.linalg.norm((self._points(points) - self.center) @ A.T, axis=-1) <= 1 + tolerance
+
+    def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
+        """Whether a point lies in the set in exact arithmetic; False where rounding may decide.
+
+        As `A Q A'` has no eigenvalue below `1 - e`, with `e` the largest row sum of
+        `|A Q A' - I|`, a point with `|A (x - q)|^2 <= 1 - e` is inside.
+        """
+        A, _ = self.normal_form
+        n, Q, x = self.dimension, self.shape, self._points(point)
+        rounding = gamma(2 * n) * (abs(A) @ abs(Q) @ abs(A).T)
+        off = jnp.max(jnp.sum(abs(A @ Q @ A.T - jnp.eye(n)) + rounding, axis=1))
+        sizes = abs(A) @ (abs(x) + abs(self.center))
+        distance = abs(A @ (x - self.center)) + gamma(n + 2) * sizes
+        return bool(jnp.sum(distance**2) * (1 + gamma(n)) <= 1 - off * (1 + gamma(n)))
+
+    def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
+        """Points drawn uniformly: directions on the sphere, radii `u^(1/n)`."""
+        along, radial = jax.random.split(key)
+        radii = jax.random.uniform(radial, (count, 1), dtype=self.center.dtype)
+        return self._mapped(_directions(along, count, self.center) * radii ** (1 / self.dimension))
+
+    def sample_boundary(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
+        """Points of the surface, up to rounding."""
+        return self._mapped(_directions(key, count, self.center))
+
+    def _mapped(self, points: Float[Array, "count n"]) -> Float[Array, "count n"]:
+        """From the unit ball to the set."""
+        return self.center + points @ jnp.linalg.cholesky(self.shape).T
+
+    def volume(self) -> Float[Array, ""]:
+        """The volume of the unit ball times the product of the half-axes."""
+        n = self.dimension
+        ball = math.pi ** (n / 2) / math.gamma(n / 2 + 1)
+        return ball * jnp.prod(jnp.diag(jnp.linalg.cholesky(self.shape)))
+
+    def bounding_box(self) -> Box:
+        """The smallest box around the set, rounded outwards."""
+        eye = jnp.eye(self.dimension)
+        return Box(-self.support(-eye), self.support(eye))
+
+    def projection(self, *coordinates: int) -> Ellipsoid:
+        """The shadow on some coordinates, an ellipsoid again.
+
+        Raises:
+            ValueError: there is no such coordinate.
+
+        Example:
+            >>> Ellipsoid([1.0, 2.0, 3.0], jnp.eye(3)).projection(2, 0).center.tolist()
+            [3.0, 1.0]
+        """
+        wrong = [i for i in coordinates if not 0 <= i < self.dimension]
+        if wrong or not coordinates:
+            raise ValueError(
+                f"coordinates must be among 0 .. {self.dimension - 1}, but {coordinates} arrived"
+            )
+        index = np.array(coordinates)
+        return Ellipsoid(self.center[index], self.shape[np.ix_(index, index)])
+
+
+def _directions(key: PRNGKeyArray, count: int, like: Array) -> Float[Array, "count n"]:
+    draws = jax.random.normal(key, (count, len(like)), dtype=like.dtype)
+    return draws / jnp.linalg.norm(draws, axis=1, keepdims=True)

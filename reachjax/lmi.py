@@ -10,6 +10,9 @@ over the basis: `F` stacks the facts, `Gamma` weighs their products, `p` is the 
 
 The program is stated in scaled coordinates, `xi = T eta` with `|eta_i| <= 1` on the set, which
 keeps multipliers of order one and bounds `|eta|^2` by the number of entries.
+
+For an ellipsoid `|A x+ + b| <= 1` the last three terms are `V' V - e e'`, `V` being the rows of
+`A x+ + b`. Its Schur complement is affine in `A`, `b` and the multipliers.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from reachjax.bounds import LoopBounds, loop_bounds
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.relaxation import AbstractRelaxation, FactLayout, Products
 from reachjax.rounding import Ball, gamma
-from reachjax.sets import AbstractSet, Box, Template
+from reachjax.sets import AbstractSet, Box, NormalForm, Template
 from reachjax.systems import ClosedLoop
 
 CONSTANT = 1e-9
@@ -101,6 +104,16 @@ def weighted_products(program: Program, multipliers: Float[Array | np.ndarray, "
     return Ball((half + half.T) / 2, (error + error.T) / 2)
 
 
+def form_rows(program: Program, form: NormalForm) -> Ball:
+    """`V = A x+ + b` as rows `(q, n)`, `x+` being the objective rows.
+
+    Works on JAX arrays and on numpy arrays alike.
+    """
+    last = np.arange(program.scale.shape[0]) == program.scale.shape[0] - 1
+    constant = form.b[:, None] * last
+    return form.A @ program.objective + Ball(constant, 0 * constant)
+
+
 def step_program(
     loop: ClosedLoop,
     X: AbstractSet,
@@ -171,3 +184,21 @@ def lagrangian(
     weights = products.sign * multipliers[:, products.multiplier]
     weighted = jnp.sum(weights * pairs, axis=1) / 2
     return weighted + jnp.einsum("fi,fi->f", program.objective.mid, moments[:, :, -1])
+
+
+def schur_lagrangian(
+    program: Program,
+    multipliers: Float[Array, " K"],
+    form: NormalForm,
+    moments: Float[Array, "n+q n+q"],
+) -> Float[Array, ""]:
+    """`<X, [e e' - F' Gamma F, V'; V, I]>` less what does not depend on rows, `V = A x+ + b`.
+
+    That matrix is positive semidefinite where `V' V - e e' + F' Gamma F <= 0`, which is theorem 1
+    for the ellipsoid `|A x + b| <= 1`; it is affine in the multipliers, `A` and `b`.
+    """
+    F, products, n = program.facts.mid, program.products, program.scale.shape[0]
+    pairs = (F @ moments[:n, :n] @ F.T)[products.left, products.right]
+    weights = products.sign * multipliers[products.multiplier]
+    V = form_rows(program, form).mid
+    return 2 * jnp.sum(moments[n:, :n] * V) - jnp.sum(weights * pairs)

@@ -9,7 +9,8 @@ on the set, so the best `eps` gives the smallest offset that these multipliers p
 floating point and then proved: `eps I - M + theta I` is shown to be positive semidefinite by a
 Cholesky factorisation that runs to completion (Rump, Verification of positive definiteness, BIT
 2006), with the rounding errors of `M` itself bounded entry by entry; what is missing costs
-`theta n / 2`. Where the arithmetic overflows, interval arithmetic is the answer.
+`theta n / 2`. Where the arithmetic overflows, interval arithmetic is the answer. For an ellipsoid
+the same steps bound `|A x+ + b|^2`.
 
 Everything here is numpy on the host.
 """
@@ -19,8 +20,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import root_scalar
 
-from reachjax.lmi import Program, weighted_products
+from reachjax.lmi import Program, form_rows, weighted_products
 from reachjax.rounding import UNIT, Ball, gamma
+from reachjax.sets import NormalForm
 
 
 def sound_offsets(program: Program, multipliers: np.ndarray) -> np.ndarray:
@@ -44,11 +46,14 @@ def sound_offsets(program: Program, multipliers: np.ndarray) -> np.ndarray:
             f"multipliers of facet {int(np.argmax(broken))} contain NaN or infinity: "
             "they prove nothing"
         )
-    clipped = np.where(program.products.free, multipliers, np.maximum(multipliers, 0.0))
+    p = program.objective
     with np.errstate(over="ignore", invalid="ignore"):  # overflow ends in the interval bound
         by_intervals = interval_offsets(program)
         return np.array(
-            [_sound_offset(program, i, clipped[i], float(by_intervals[i])) for i in range(facets)]
+            [
+                _proved(program, multipliers[i], _bordered(p.mid[i], p.rad[i]), by_intervals[i])
+                for i in range(facets)
+            ]
         )
 
 
@@ -60,32 +65,56 @@ def interval_offsets(program: Program) -> np.ndarray:
     return p.mid[:, -1] + size + 2 * rounding
 
 
-def _sound_offset(
-    program: Program, facet: int, multipliers: np.ndarray, by_intervals: float
-) -> float:
-    used = program.scale > 0
-    matrix = _facet_matrix(program, facet, multipliers)
-    mid, rad = matrix.mid[np.ix_(used, used)], matrix.rad[np.ix_(used, used)]
+def sound_level(program: Program, multipliers: np.ndarray, form: NormalForm) -> float:
+    """A number that `|A x+ + b|` surely never exceeds, from any multipliers `(K,)`.
+
+    Signed multipliers that are negative are taken as zero. Without good ones it is the root of the
+    sum of the squares of `A x+ + b` by intervals.
+
+    Raises:
+        ValueError: the multipliers have another shape, or contain NaN or infinity.
+    """
+    shape = program.products.free.shape
+    multipliers = np.asarray(multipliers, dtype=float)
+    if multipliers.shape != shape or not np.isfinite(multipliers).all():
+        raise ValueError(
+            f"multipliers must be finite and have shape {shape} (products,), "
+            f"but {multipliers.shape} arrived, {np.isfinite(multipliers).sum()} of them finite"
+        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        V = form_rows(program, form)
+        q, n = V.mid.shape
+        largest = (abs(V.mid).sum(axis=1) + V.rad.sum(axis=1)) * (1 + gamma(n))
+        by_intervals = float(np.sum(largest**2)) * (1 + gamma(q)) / 2
+        # |V|^2 = xi' V' V xi, of which the recheck bounds the half
+        size, squares = abs(V.mid), V.mid.T @ V.mid
+        error = gamma(q + 4) * (size.T @ size) + V.rad.T @ (size + V.rad) + size.T @ V.rad
+        half = _proved(program, multipliers, Ball(squares, error * (1 + gamma(8))), by_intervals)
+    return float(np.sqrt(max(2 * half, 0.0)) * (1 + gamma(4)))
+
+
+def _proved(program: Program, multipliers: np.ndarray, goal: Ball, by_intervals: float) -> float:
+    """The smallest `b` shown for `F' Gamma F + goal - 2 b e e'`, as this module's docstring says."""
+    signed = np.where(program.products.free, multipliers, np.maximum(multipliers, 0.0))
+    used = np.ix_(program.scale > 0, program.scale > 0)
+    products = weighted_products(program, signed)
+    mid = (products.mid + goal.mid)[used]
+    rad = ((products.rad + goal.rad)[used] + gamma(4) * abs(mid)) * (1 + gamma(4))
     if not (np.isfinite(mid).all() and np.isfinite(rad).all()):
-        return by_intervals
+        return float(by_intervals)
     offset, shift = _best_offset(mid)
     error = float(rad.sum(axis=1).max()) * (1 + gamma(len(mid)))  # spectral norm <= row sums
     slack = _proved_slack(mid, offset, shift)
     n = len(mid)
     cost = (shift * (n - 1) + (slack + error) * n) / 2
     proved = offset + cost + gamma(4) * (abs(offset) + cost)
-    return proved if np.isfinite(proved) else by_intervals
+    return proved if np.isfinite(proved) else float(by_intervals)
 
 
-def _facet_matrix(program: Program, facet: int, multipliers: np.ndarray) -> Ball:
-    """`F' Gamma F + p e' + e p'` with a bound of its rounding error."""
-    products = weighted_products(program, multipliers)
-    p = program.objective
-    mid, rad = products.mid.copy(), products.rad.copy()
-    for part, whole in ((p.mid[facet], mid), (p.rad[facet], rad)):
-        whole[-1, :] += part
-        whole[:, -1] += part
-    return Ball(mid, (rad + gamma(4) * abs(mid)) * (1 + gamma(4)))
+def _bordered(mid: np.ndarray, rad: np.ndarray) -> Ball:
+    """`p e' + e p'`."""
+    last = np.eye(len(mid))[-1]
+    return Ball(*(np.outer(part, last) + np.outer(last, part) for part in (mid, rad)))
 
 
 def _best_offset(matrix: np.ndarray) -> tuple[float, float]:

@@ -2,8 +2,8 @@
 
 from reachjax.sets.base import AbstractSet, PolyhedralSet
 from reachjax.sets.box import Box
-from reachjax.sets.ellipsoid import Ellipsoid
+from reachjax.sets.ellipsoid import Ellipsoid, NormalForm
 from reachjax.sets.polytope import Polytope
 from reachjax.sets.template import Template
 
-__all__ = ["AbstractSet", "Box", "Ellipsoid", "PolyhedralSet", "Polytope", "Template"]
+__all__ = ["AbstractSet", "Box", "Ellipsoid", "NormalForm", "PolyhedralSet", "Polytope", "Template"]

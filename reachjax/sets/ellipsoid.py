@@ -8,6 +8,7 @@ orthogonal multiple describes the same set).
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +22,20 @@ from reachjax.rounding import gamma
 from reachjax.sets.base import AbstractSet
 from reachjax.sets.box import Box
 
-SINGULAR = 1e-14
-"""A shape matrix whose smallest eigenvalue is a smaller part of its largest has no inverse."""
+FLAT = 1e-14
+"""A shape matrix counts as singular if scaling its diagonal to 1 leaves no larger eigenvalue."""
+
+
+class NormalForm(NamedTuple):
+    """The ellipsoid `|A x + b| <= 1`, the paper's (there `A` is symmetric).
+
+    Attributes:
+        A: `(n, n)`.
+        b: `(n,)`.
+    """
+
+    A: Float[Array | np.ndarray, "n n"]
+    b: Float[Array | np.ndarray, " n"]
 
 
 @pytree
@@ -65,11 +78,11 @@ class Ellipsoid(AbstractSet):
             matrix = np.asarray(shape)
             if not np.allclose(matrix, matrix.T, rtol=1e-12, atol=1e-12 * abs(matrix).max()):
                 raise ValueError(f"Ellipsoid.shape must be symmetric, but it is\n{matrix}")
-            values = np.linalg.eigvalsh(matrix)
-            if values[0] <= SINGULAR * abs(values).max():
+            widths = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+            if not widths.all() or np.linalg.eigvalsh(matrix / np.outer(widths, widths))[0] <= FLAT:
                 raise ValueError(
                     "Ellipsoid.shape must be positive definite, but its eigenvalues are "
-                    f"{values.tolist()}"
+                    f"{np.linalg.eigvalsh(matrix).tolist()}"
                 )
 
     @property
@@ -78,11 +91,32 @@ class Ellipsoid(AbstractSet):
         return self.center.shape[0]
 
     @property
-    def normal_form(self) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    def normal_form(self) -> NormalForm:
         """The pair `(A, b)`: the set is `|A x + b| <= 1`, up to rounding."""
         factor = jnp.linalg.cholesky(self.shape)
         A = solve_triangular(factor, jnp.eye(self.dimension), lower=True)
-        return A, -A @ self.center
+        return NormalForm(A, -A @ self.center)
+
+    @classmethod
+    def enclosing(cls, form: NormalForm, level: Float[ArrayLike, ""] = 1.0) -> Ellipsoid:
+        """An ellipsoid that surely contains `|A x + b| <= level`, and is no larger but for rounding.
+
+        With `|A q + b| <= e` and `A Q A' >= (level + e)^2 I`, a point with `|A x + b| <= level` has
+        `|A (x - q)| <= level + e`, so `(x - q)' Q^-1 (x - q) <= 1`. The smallest eigenvalue of
+        `A Q A'` is at least its diagonal less the row sums of the rest.
+
+        Example:
+            >>> form = Ellipsoid([1.0, 0.0], [[4.0, 0.0], [0.0, 1.0]]).normal_form
+            >>> Ellipsoid.enclosing(form, 2.0).shape.round(6).tolist()
+            [[16.0, 0.0], [0.0, 4.0]]
+        """
+        A, b = form
+        n = len(b)
+        inverse = jnp.linalg.inv(A)
+        q, Q = -inverse @ b, inverse @ inverse.T
+        Q = (Q + Q.T) / 2
+        held = jax.lax.stop_gradient((A, b, q, Q, jnp.asarray(level)))
+        return cls(q, Q * _inflation(*jax.lax.optimization_barrier(held)))
 
     def _level(self) -> Float[Array, ""]:
         """A bound `s >= |A x + b|` on the exact set, for `A` and `b` as they are rounded.
@@ -180,6 +214,16 @@ class Ellipsoid(AbstractSet):
             )
         index = np.array(coordinates)
         return Ellipsoid(self.center[index], self.shape[np.ix_(index, index)])
+
+
+def _inflation(A: Array, b: Array, q: Array, Q: Array, level: Array) -> Float[Array, ""]:
+    """A factor `f` for which `A (f Q) A' >= (level + |A q + b|)^2 I`, rounding included."""
+    n = len(b)
+    residual = abs(A @ q + b) + gamma(n + 2) * (abs(A) @ abs(q) + abs(b))
+    needed = ((level + jnp.linalg.norm(residual)) * (1 + gamma(n + 8))) ** 2
+    formed = abs(A @ Q @ A.T - jnp.eye(n)) + gamma(2 * n + 4) * (abs(A) @ abs(Q) @ abs(A).T)
+    least = 1 - jnp.max(jnp.sum(formed, axis=1)) * (1 + gamma(n))
+    return needed / least * (1 + gamma(8))
 
 
 def _directions(key: PRNGKeyArray, count: int, like: Array) -> Float[Array, "count n"]:

@@ -1,9 +1,10 @@
 """The seam to semidefinite-programming codes: arrays in, arrays out."""
 
-from reachjax.solvers.accepted import accepted_offsets
-from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
+from reachjax.solvers.accepted import accepted_enclosure, accepted_offsets
+from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, SolverStatus
 from reachjax.solvers.conic import SCS, Clarabel, CvxpySolver
 from reachjax.solvers.differentiable import proved_offsets
+from reachjax.solvers.enclosures import proved_ellipsoid, proved_size
 from reachjax.solvers.geometry import bounding_box, polytope_volume, separation, support
 
 __all__ = [
@@ -11,12 +12,16 @@ __all__ = [
     "AbstractSolver",
     "Clarabel",
     "CvxpySolver",
+    "Enclosure",
     "Solution",
     "SolverStatus",
+    "accepted_enclosure",
     "accepted_offsets",
     "bounding_box",
     "polytope_volume",
+    "proved_ellipsoid",
     "proved_offsets",
+    "proved_size",
     "separation",
     "support",
 ]

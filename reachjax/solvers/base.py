@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.lmi import Program
+from reachjax.sets import NormalForm
 
 
 class SolverStatus(enum.IntEnum):
@@ -84,9 +85,49 @@ class Solution(NamedTuple):
         )
 
 
+class Enclosure(NamedTuple):
+    """What a solver proposes for an ellipsoid around the successors; arrays only.
+
+    Attributes:
+        form: `A (q, q)` and `b (q,)`: it proposes `|A x + b| <= 1`; NaN where it has none.
+        multipliers: `(K,)`, zero where it has none.
+        moments: `(n + q, n + q)`, the dual matrix of the Schur complement over the scaled basis,
+            NaN where it has none.
+        status: a value of `SolverStatus`.
+        seconds: wall time.
+    """
+
+    form: NormalForm
+    multipliers: Float[Array | np.ndarray, " K"]
+    moments: Float[Array | np.ndarray, "n+q n+q"]
+    status: Int[Array | np.ndarray, ""]
+    seconds: Float[Array | np.ndarray, ""]
+
+    @classmethod
+    def blank(cls, program: Program) -> Enclosure:
+        """No proposal yet: zero multipliers, everything else missing."""
+        q, n = program.objective.mid.shape
+        return cls(
+            form=NormalForm(np.full((q, q), np.nan), np.full(q, np.nan)),
+            multipliers=np.zeros(program.products.free.shape[0]),
+            moments=np.full((n + q, n + q), np.nan),
+            status=np.array(int(SolverStatus.FAILED)),
+            seconds=np.array(0.0),
+        )
+
+
 class AbstractSolver(abc.ABC):
     """Solves the programs of one step. Hashable and immutable: its options are its fields."""
 
     @abc.abstractmethod
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet of a program whose leaves are numpy arrays."""
+
+    @abc.abstractmethod
+    def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
+        """Propose the smallest ellipsoid around the successors, and its multipliers.
+
+        Args:
+            program: whose leaves are numpy arrays and whose objective rows are the successor's.
+            form: the ellipsoid up to a factor on `A` and `b`; free if it is None.
+        """

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from reachjax.lmi import Program
+from reachjax.sets import NormalForm
 
 NOISE = 16.0
 """Rows no larger than this many times their own rounding error count as zero."""
@@ -43,6 +44,24 @@ class CompactProgram(NamedTuple):
     columns: np.ndarray
     kept: np.ndarray
     norms: np.ndarray
+
+    def with_objective_times(self, factor: float) -> CompactProgram:
+        """The same program with another unit of the objective."""
+        return self._replace(objective=factor * self.objective, units=self.units / factor)
+
+    def to_unit_box(self, form: NormalForm) -> NormalForm:
+        """`|A x + b| <= 1` over the coordinates in which the objective rows are stated."""
+        return NormalForm(form.A * self.units, form.b + form.A @ self.centers)
+
+    def from_unit_box(self, form: NormalForm) -> NormalForm:
+        """The inverse of `to_unit_box`."""
+        A = form.A / self.units
+        return NormalForm(A, form.b - A @ self.centers)
+
+    def cotangent_to_unit_box(self, cotangent: NormalForm) -> NormalForm:
+        """The transpose of `from_unit_box`."""
+        A = (cotangent.A - np.outer(cotangent.b, self.centers)) / self.units
+        return NormalForm(A, cotangent.b)
 
 
 def compact(program: Program) -> CompactProgram:

@@ -1,8 +1,4 @@
-"""Semidefinite programs by cvxpy: Clarabel by default, any other solver that cvxpy knows alike.
-
-The model is built once for a step. Only a parameter (the objective row) changes from facet to
-facet, so cvxpy's canonicalisation is done once as well (disciplined parametrised programming).
-"""
+"""Semidefinite programs by cvxpy: Clarabel by default, any other solver that cvxpy knows alike."""
 
 from __future__ import annotations
 
@@ -15,14 +11,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from reachjax.lmi import Program
-from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
-from reachjax.solvers.compact import CompactProgram, compact
+from reachjax.sets import NormalForm
+from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, SolverStatus
+from reachjax.solvers.compact import compact
+from reachjax.solvers.models import EllipsoidModel, FacetModel
 
 RESCALINGS = (1.0, 8.0, 0.125, 64.0, 1.0)
 """Factors on the objective, tried in turn while a solver stalls: another scale often helps it."""
+
+STALLED = (SolverStatus.INACCURATE, SolverStatus.FAILED)
 
 STATUSES = {
     "optimal": SolverStatus.SOLVED,
@@ -36,42 +35,6 @@ STATUSES = {
     "solver_error": SolverStatus.FAILED,
 }
 """cvxpy's words for how a solver ended."""
-
-
-class _Model:
-    """The cvxpy problem of one step, with the objective row as its parameter."""
-
-    def __init__(self, program: CompactProgram):
-        import cvxpy as cp
-
-        n = program.objective.shape[1]
-        free, signed = program.generators[:, program.free], program.generators[:, ~program.free]
-        self.free = cp.Variable(free.shape[1]) if free.shape[1] else None
-        self.signed = cp.Variable(signed.shape[1], nonneg=True)
-        self.offset = cp.Variable()
-        self.objective = cp.Parameter(n)
-        corner = np.zeros(n * n)
-        corner[-1] = 2.0
-        matrix = signed @ self.signed + _bordered(n) @ self.objective - corner * self.offset
-        if self.free is not None:
-            matrix = matrix + free @ self.free
-        self.lmi = cp.reshape(matrix, (n, n), order="F") << 0
-        self.problem = cp.Problem(cp.Minimize(self.offset), [self.lmi])
-
-    def multipliers(self, program: CompactProgram) -> np.ndarray:
-        """The values found, in the order of the program's generators."""
-        y = np.zeros(len(program.kept))
-        y[~program.free] = self.signed.value
-        if self.free is not None:
-            y[program.free] = self.free.value
-        return y / program.norms
-
-
-def _bordered(n: int) -> sp.csr_array:
-    """The map from a row `p` to the flattened `p e' + e p'`."""
-    index = np.arange(n)
-    rows = np.r_[index * n + n - 1, (n - 1) * n + index]
-    return sp.csr_array((np.ones(2 * n), (rows, np.r_[index, index])), shape=(n * n, n))
 
 
 class _ConicSolver(AbstractSolver, abc.ABC):
@@ -91,28 +54,62 @@ class _ConicSolver(AbstractSolver, abc.ABC):
         name, options = self.settings()
         _require_installed(name)
         reduced = compact(program)
-        model = _Model(reduced)
+        model = FacetModel(reduced)
         facets, size = program.objective.mid.shape
         solution = Solution.blank(facets, len(program.products.free), size)
         for i, (row, center, unit) in enumerate(
             zip(reduced.objective, reduced.centers, reduced.units, strict=True)
         ):
             began = time.perf_counter()
-            solution.statuses[i], factor = _run_scaled(model, row, name, options)
+            factor = 1.0
+            for factor in RESCALINGS:
+                model.objective.value = factor * row
+                solution.statuses[i] = _run(model.problem, name, options)
+                if solution.statuses[i] not in STALLED:
+                    break
             solution.seconds[i] = time.perf_counter() - began
-            if model.offset.value is None or model.signed.value is None:
-                continue
-            multipliers = unit / factor * model.multipliers(reduced)
-            if not np.isfinite(multipliers).all():
+            multipliers = model.multipliers.value
+            if model.offset.value is None or multipliers is None:
                 continue
             solution.offsets[i] = center + unit / factor * float(model.offset.value)
-            solution.multipliers[i, reduced.kept] = multipliers
+            solution.multipliers[i, reduced.kept] = unit / factor * multipliers / reduced.norms
             moment = np.asarray(model.lmi.dual_value, dtype=float)
             if moment.ndim == 2 and moment[-1, -1] > 0:
                 solution.moments[i] = 0.0
                 used = np.ix_(reduced.columns, reduced.columns)
                 solution.moments[i][used] = moment / moment[-1, -1]
         return solution
+
+    def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
+        """Propose the smallest ellipsoid around the successors, and its multipliers.
+
+        Raises:
+            ValueError: cvxpy does not find the solver, or it takes no such programs.
+            TypeError: the solver does not know one of the options.
+        """
+        name, options = self.settings()
+        _require_installed(name)
+        reduced, proposal = compact(program), Enclosure.blank(program)
+        began = time.perf_counter()
+        for factor in RESCALINGS:
+            scaled = reduced.with_objective_times(factor)
+            model = EllipsoidModel(scaled, None if form is None else scaled.to_unit_box(form))
+            status = _run(model.problem, name, options)
+            if status not in STALLED:
+                break
+        seconds = time.perf_counter() - began
+        found, multipliers = model.form, model.multipliers.value
+        proposal = proposal._replace(status=np.array(int(status)), seconds=np.array(seconds))
+        if found is None or multipliers is None:
+            return proposal
+        proposal.multipliers[reduced.kept] = multipliers / reduced.norms
+        moments = np.asarray(model.lmi.dual_value, dtype=float)
+        if moments.ndim == 2:
+            size, extra = len(program.scale), len(found.b)
+            used = np.r_[reduced.columns, size + np.arange(extra)]
+            proposal.moments[:] = 0.0
+            proposal.moments[np.ix_(used, used)] = moments
+        return proposal._replace(form=scaled.from_unit_box(found))
 
 
 def _require_installed(name: str) -> None:
@@ -125,29 +122,16 @@ def _require_installed(name: str) -> None:
         )
 
 
-def _run_scaled(
-    model: _Model, row: np.ndarray, name: str, options: dict
-) -> tuple[SolverStatus, float]:
-    """Solve for one objective row, at other scales while the solver stalls; the scale used last."""
-    status, factor = SolverStatus.FAILED, 1.0
-    for factor in RESCALINGS:
-        status = _run(model, factor * row, name, options)
-        if status not in (SolverStatus.INACCURATE, SolverStatus.FAILED):
-            break
-    return status, factor
-
-
-def _run(model: _Model, objective: np.ndarray, name: str, options: dict) -> SolverStatus:
-    """Solve for one objective row; values that an earlier facet left behind are cleared first."""
+def _run(problem: Any, name: str, options: dict) -> SolverStatus:
+    """Solve; values that an earlier facet left behind are cleared first."""
     import cvxpy as cp
 
-    for variable in model.problem.variables():
+    for variable in problem.variables():
         variable.value = None
-    model.objective.value = objective
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # cvxpy warns of inaccuracy, which the status says
         try:
-            model.problem.solve(solver=name, **options)
+            problem.solve(solver=name, **options)
         except cp.SolverError as error:
             if "cannot solve" in str(error):  # not "failed": it takes no such cones
                 raise ValueError(
@@ -160,7 +144,7 @@ def _run(model: _Model, objective: np.ndarray, name: str, options: dict) -> Solv
             if isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit):
                 raise
             return SolverStatus.FAILED
-    return STATUSES.get(model.problem.status, SolverStatus.FAILED)
+    return STATUSES.get(problem.status, SolverStatus.FAILED)
 
 
 def _require_positive(solver: Any) -> None:

@@ -1,0 +1,222 @@
+"""How a minimum-volume ellipsoid moves with its program, by way of the central path.
+
+The optimum of a semidefinite program need not be differentiable, and its optimality conditions are
+singular there. The minimiser of
+
+    -log det R - mu log det Z - mu sum_k log y_k,    Z = [e e' - sum_k y_k G_k, V'; V, I],
+
+`V = R W + r e'`, is near it, unique and smooth, and moves as the implicit function theorem says,
+with the Hessian of this function. A few Newton steps lead there from a solution.
+
+One more multiplier `t >= 0`, at a price, weighs `sum_i (1 - eta_i^2)`, so that there always is a
+point inside; the price keeps it at the size of `mu`. Everything here is numpy on the host.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
+
+from reachjax.lmi import Program
+from reachjax.sets import NormalForm
+from reachjax.solvers.compact import CompactProgram, compact
+from reachjax.solvers.models import FLAT
+
+WEIGHT = 1e-7
+"""The barrier weight `mu`, about the relative error that centring leaves in a derivative."""
+
+STEPS = 60
+"""Newton steps after which the centre counts as not found."""
+
+CENTRED = 1e-8
+"""The squared Newton decrement, in units of `mu`, at which it is found."""
+
+
+class Sensitivity(NamedTuple):
+    """A derivative of `A` and `b` as that of two Lagrangians, `lmi.schur_lagrangian`.
+
+    The derivative in the rows of `<cotangent, (A, b)>` is that of the Lagrangian at the first three
+    less that at the last three.
+
+    Attributes:
+        multipliers: `(K,)`, at the centre.
+        form: `A` and `b` at the centre.
+        moments: `(n + q, n + q)`, how the moments at the centre answer the cotangent.
+        multipliers_slope: `(K,)`, how the multipliers answer it.
+        form_slope: how `A` and `b` do.
+        moments_slope: `(n + q, n + q)`, the moments at the centre.
+    """
+
+    multipliers: np.ndarray
+    form: NormalForm
+    moments: np.ndarray
+    multipliers_slope: np.ndarray
+    form_slope: NormalForm
+    moments_slope: np.ndarray
+
+    @classmethod
+    def unknown(cls, program: Program) -> Sensitivity:
+        """NaN throughout, of the right shapes."""
+        q, n = program.objective.mid.shape
+        K = program.products.free.shape[0]
+        half = (
+            np.full(K, np.nan),
+            NormalForm(np.full((q, q), np.nan), np.full(q, np.nan)),
+            np.full((n + q, n + q), np.nan),
+        )
+        return cls(*half, *half)
+
+
+def sensitivity(
+    program: Program, multipliers: np.ndarray, form: NormalForm, cotangent: NormalForm
+) -> Sensitivity:
+    """The derivative of `<cotangent, (A, b)>`, NaN where the centre is not found.
+
+    Args:
+        program: whose objective rows are the successor's.
+        multipliers: `(K,)`, of the solution.
+        form: the solution.
+        cotangent: weights of `A` and `b`.
+    """
+    unknown = Sensitivity.unknown(program)
+    given = (multipliers, *form, *cotangent)
+    if not all(np.isfinite(part).all() for part in given):
+        return unknown
+    reduced = compact(program)
+    barrier = _Barrier(reduced)
+    y = barrier.start(reduced.norms * multipliers[reduced.kept], reduced.to_unit_box(form))
+    if y is None:
+        return unknown
+    found = barrier.centred(y)
+    if found is None:
+        return unknown
+    y, hessian = found
+    w = _solved(hessian, barrier.vector(reduced.cotangent_to_unit_box(cotangent)))
+    inverse = np.linalg.inv(barrier.schur(y))
+    moving = np.tensordot(w, barrier.terms, 1)
+    size, q = len(program.scale), len(form.b)
+    used = np.ix_(*2 * [np.r_[reduced.columns, size + np.arange(q)]])
+    halves = []
+    for vector, moments in ((y, -WEIGHT * inverse @ moving @ inverse), (w, -WEIGHT * inverse)):
+        whole, weights = np.zeros((size + q, size + q)), np.zeros(len(multipliers))
+        whole[used] = moments
+        weights[reduced.kept] = vector[: barrier.count] / reduced.norms
+        halves += [weights, reduced.from_unit_box(barrier.form(vector)), whole]
+    return Sensitivity(*halves)
+
+
+class _Barrier:
+    """The function of this module's docstring, of `[multipliers, t, R, r]` in one vector."""
+
+    def __init__(self, program: CompactProgram):
+        W = program.objective
+        self.q, self.n = q, n = W.shape
+        self.count = len(program.kept)
+        self.pairs = np.triu_indices(q)
+        N, sides = n + q, len(self.pairs[0])
+        size = self.count + 1 + sides + q
+        self.R = slice(self.count + 1, self.count + 1 + sides)
+        self.signed = np.r_[np.flatnonzero(~program.free), self.count]
+        terms = np.zeros((size, N, N))
+        terms[: self.count, :n, :n] = -program.generators.T.toarray().reshape(-1, n, n)
+        terms[self.count, :n, :n] = np.diag(np.r_[np.ones(n - 1), 1.0 - n])
+        self.symmetric = np.zeros((sides, q, q))
+        for k, (i, j) in enumerate(zip(*self.pairs, strict=True)):
+            self.symmetric[k, i, j] = self.symmetric[k, j, i] = 1.0
+        rows = np.zeros((sides + q, q, n))
+        rows[:sides] = self.symmetric @ W
+        rows[sides + np.arange(q), np.arange(q), -1] = 1.0
+        terms[self.count + 1 :, n:, :n] = rows
+        terms[self.count + 1 :, :n, n:] = rows.transpose(0, 2, 1)
+        self.terms = terms
+        self.constant = np.diag(np.r_[np.zeros(n - 1), 1.0, np.ones(q)])
+        self.price = float(n * q)
+
+    def schur(self, y: np.ndarray) -> np.ndarray:
+        return self.constant + np.tensordot(y, self.terms, 1)
+
+    def form(self, y: np.ndarray) -> NormalForm:
+        return NormalForm(np.tensordot(y[self.R], self.symmetric, 1), y[-self.q :])
+
+    def vector(self, cotangent: NormalForm) -> np.ndarray:
+        """The gradient of `<cotangent, (R, r)>` in the variables."""
+        zero = np.zeros(self.count + 1)
+        return np.r_[zero, np.tensordot(self.symmetric, cotangent.A, 2), cotangent.b]
+
+    def start(self, multipliers: np.ndarray, form: NormalForm) -> np.ndarray | None:
+        """A point inside near a solution: a smaller `V`, and a little of `t`."""
+        for t in 10 * WEIGHT * 4.0 ** np.arange(8):
+            shrink = 1 - self.n * t
+            if shrink <= 0.5:
+                break
+            R = np.sqrt(shrink) * (form.A + form.A.T) / 2
+            y = np.r_[shrink * multipliers, t, R[self.pairs], np.sqrt(shrink) * form.b]
+            least = t / (4 * (1 + np.sqrt(self.count)))
+            y[self.signed] = np.maximum(y[self.signed], least)
+            if np.isfinite(self.value(y)):
+                return y
+        return None
+
+    def value(self, y: np.ndarray) -> float:
+        """Infinite outside."""
+        if np.any(y[self.signed] <= 0):
+            return np.inf
+        value = self.price * y[self.count] - WEIGHT * np.sum(np.log(y[self.signed]))
+        for weight, block, _ in self._blocks(y):
+            try:
+                factor = np.linalg.cholesky(block)
+            except LinAlgError:
+                return np.inf
+            value -= 2 * weight * np.sum(np.log(np.diag(factor)))
+        return float(value)
+
+    def _blocks(self, y: np.ndarray):
+        """Each matrix under a logarithm of a determinant: its weight, itself, its variables."""
+        R = self.form(y).A
+        yield 1.0, R, (self.R, self.symmetric)
+        yield WEIGHT, np.eye(self.q) / FLAT - R, (self.R, -self.symmetric)
+        yield WEIGHT, self.schur(y), (slice(None), self.terms)
+
+    def derivatives(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient and Hessian."""
+        gradient, hessian = np.zeros(len(y)), np.zeros((len(y), len(y)))
+        gradient[self.count] = self.price
+        gradient[self.signed] -= WEIGHT / y[self.signed]
+        hessian[self.signed, self.signed] += WEIGHT / y[self.signed] ** 2
+        for weight, block, (where, terms) in self._blocks(y):
+            inverse = solve_triangular(np.linalg.cholesky(block), np.eye(len(block)), lower=True)
+            scaled = inverse @ terms @ inverse.T
+            flat = scaled.reshape(len(terms), -1)
+            gradient[where] -= weight * np.trace(scaled, axis1=1, axis2=2)
+            hessian[where, where] += weight * flat @ flat.T
+        return gradient, hessian
+
+    def centred(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Newton's method from a point inside: the minimiser and the Hessian there."""
+        value = self.value(y)
+        for _ in range(STEPS):
+            gradient, hessian = self.derivatives(y)
+            step = -_solved(hessian, gradient)
+            decrement = -float(gradient @ step)
+            if decrement <= CENTRED * WEIGHT:
+                return y, hessian
+            length = 1.0
+            while not (after := self.value(y + length * step)) <= value - decrement * length / 4:
+                length /= 2
+                if length < 1e-10:
+                    return None
+            y, value = y + length * step, after
+        return None
+
+
+def _solved(hessian: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """`hessian^-1 vector`, scaled to a unit diagonal and regularised at rounding level."""
+    scale = 1 / np.sqrt(np.diag(hessian))
+    matrix = hessian * np.outer(scale, scale)
+    matrix[np.diag_indices_from(matrix)] += 1e-14
+    factor = cho_factor(matrix)
+    solution = cho_solve(factor, scale * vector)
+    residual = scale * vector - matrix @ solution  # one step of refinement
+    return scale * (solution + cho_solve(factor, residual))

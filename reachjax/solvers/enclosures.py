@@ -1,0 +1,151 @@
+"""Ellipsoids around the successors, proved, and their derivative.
+
+**A given shape.** Only its size is sought. Its factor is an optimal value, so the envelope theorem
+gives the derivative exactly, as for offsets.
+
+**Any shape.** The ellipsoid is an optimal *point*: its derivative is that of the point on the
+central path at a small barrier weight (see `centring`), and is about as accurate as that weight.
+
+In both cases the derivative is NaN where the solver has no optimum that its multipliers bear out,
+and what the recheck adds to an ellipsoid is not differentiated.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from reachjax.lmi import Program, form_rows, schur_lagrangian
+from reachjax.sets import Ellipsoid, NormalForm
+from reachjax.solvers.accepted import accepted_enclosure
+from reachjax.solvers.base import AbstractSolver, Enclosure
+from reachjax.solvers.centring import Sensitivity, sensitivity
+from reachjax.solvers.host import on_host
+
+
+def proved_ellipsoid(program: Program, solver: AbstractSolver) -> tuple[Ellipsoid, Enclosure]:
+    """The minimum-volume ellipsoid of a program, differentiable in the program's rows.
+
+    Args:
+        program: whose objective rows are the successor's.
+        solver: what solves it.
+
+    Returns:
+        The ellipsoid, and what the solver proposed (which has no derivative).
+    """
+    result: Any = _ellipsoid(solver, program.facts.mid, program.objective.mid, program)
+    form, level, _, enclosure = result
+    return Ellipsoid.enclosing(form, jax.lax.stop_gradient(level)), enclosure
+
+
+def _solve(
+    solver: AbstractSolver, argument: tuple[Program, NormalForm | None]
+) -> tuple[NormalForm, np.ndarray, np.ndarray, Enclosure]:
+    program, given = argument
+    enclosure = solver.enclose(program, given)
+    return *accepted_enclosure(program, enclosure, given), enclosure
+
+
+def _shapes(program: Program) -> tuple[NormalForm, Any, Any, Enclosure]:
+    blank = jax.tree.map(
+        lambda field: jax.ShapeDtypeStruct(field.shape, field.dtype), Enclosure.blank(program)
+    )
+    number, truth = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), bool)
+    return blank.form, number, truth, blank
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _ellipsoid(solver, facts, objective, program):
+    return on_host(partial(_solve, solver), _shapes(program), (program, None))
+
+
+def _ellipsoid_forward(solver, facts, objective, program):
+    result: Any = _ellipsoid(solver, facts, objective, program)
+    form, _, optimal, enclosure = result
+    return result, (program, form, optimal, enclosure.multipliers)
+
+
+def _ellipsoid_backward(solver, residual, cotangents):
+    program, form, optimal, multipliers = residual
+    shapes = jax.tree.map(
+        lambda field: jax.ShapeDtypeStruct(field.shape, float), Sensitivity.unknown(program)
+    )
+    arguments = (program, multipliers, form, cotangents[0])
+    held: Any = on_host(lambda given: sensitivity(*given), shapes, arguments)
+
+    def value(facts, objective):
+        rows = _with_rows(program, facts, objective)
+        at_centre = schur_lagrangian(rows, held.multipliers, held.form, held.moments)
+        return at_centre - schur_lagrangian(
+            rows, held.multipliers_slope, held.form_slope, held.moments_slope
+        )
+
+    slopes = jax.grad(value, (0, 1))(program.facts.mid, program.objective.mid)
+    return *(jnp.where(optimal, slope, jnp.nan) for slope in slopes), None
+
+
+_ellipsoid.defvjp(_ellipsoid_forward, _ellipsoid_backward)
+
+
+def _with_rows(program: Program, facts: Array, objective: Array) -> Program:
+    return program.replace(
+        facts=type(program.facts)(facts, program.facts.rad),
+        objective=type(program.objective)(objective, program.objective.rad),
+    )
+
+
+def proved_size(
+    program: Program, given: NormalForm, solver: AbstractSolver
+) -> tuple[Ellipsoid, Enclosure]:
+    """The smallest ellipsoid of a given centre and shape, differentiable in rows and shape.
+
+    Args:
+        program: whose objective rows are the successor's.
+        given: the ellipsoid up to a factor on `A` and `b`.
+        solver: what solves it.
+
+    Returns:
+        The ellipsoid, and what the solver proposed (which has no derivative).
+    """
+    result: Any = _size(solver, program.facts.mid, program.objective.mid, given, program)
+    factor, level, _, enclosure = result
+    scaled = NormalForm(factor * given.A, factor * given.b)
+    return Ellipsoid.enclosing(scaled, jax.lax.stop_gradient(level)), enclosure
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _size(solver, facts, objective, given, program):
+    found: Any = on_host(partial(_solve, solver), _shapes(program), (program, given))
+    form, *rest = found
+    return jnp.sum(form.A * given.A) / jnp.sum(given.A**2), *rest
+
+
+def _size_forward(solver, facts, objective, given, program):
+    result: Any = _size(solver, facts, objective, given, program)
+    factor, _, optimal, enclosure = result
+    return result, (program, given, factor, optimal, enclosure)
+
+
+def _size_backward(solver, residual, cotangents):
+    program, given, factor, optimal, enclosure = residual
+    n = program.scale.shape[0]
+    moments = enclosure.moments
+    # stationarity in the factor gives the dual its scale, whatever the solver's objective was
+    unit = -2 * jnp.sum(moments[n:, :n] * form_rows(program, given).mid)
+
+    def value(facts, objective, given):
+        scaled = NormalForm(factor * given.A, factor * given.b)
+        rows = _with_rows(program, facts, objective)
+        return schur_lagrangian(rows, enclosure.multipliers, scaled, moments) / unit
+
+    slopes = jax.grad(value, (0, 1, 2))(program.facts.mid, program.objective.mid, given)
+    weight = jnp.where(optimal, cotangents[0], jnp.nan)
+    return *jax.tree.map(lambda slope: weight * slope, slopes), None
+
+
+_size.defvjp(_size_forward, _size_backward)

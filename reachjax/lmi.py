@@ -139,10 +139,11 @@ def _step_program(
     one = columns(size - 1, 1, size)
     of_the_set = set_facts[:, :-1] @ rows.state + set_facts[:, -1]
     facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts)
-    # the optimal value does not depend on the scaling, so neither does its derivative
-    shift, scale = jax.lax.stop_gradient(basis_box(bounds, relaxation.remove_stable))
+    # The optimal value does not depend on the scaling, but its derivative at inexact multipliers
+    # does: with the scaling's share, facts of thin sets keep their size and errors cancel.
+    scaling_of_basis = basis_box(bounds, relaxation.remove_stable)
     # one rounding of the scaling for all rows, whatever the compiler fuses
-    shift, scale = jax.lax.optimization_barrier((shift, scale))
+    shift, scale = jax.lax.optimization_barrier(scaling_of_basis)
     T = scaling(shift, scale)
     return Program(
         facts=facts @ T,

@@ -8,9 +8,14 @@ from jaxtyping import Bool, Float
 from reachjax.lmi import Program
 from reachjax.recheck import interval_offsets, sound_offsets
 from reachjax.solvers.base import Solution, SolverStatus
+from reachjax.solvers.compact import compact
 
 SHORTFALL = 1e-3
-"""A claim that its multipliers miss by more than this part of the interval's radius is none."""
+"""A claim counts as the optimum if multipliers and moments bear it out to this part of what is
+compared: the interval's radius for values, generators of unit norm for signs."""
+
+ROUNDING = 1e-12
+"""What rounding may add to a claim, as a part of its size."""
 
 
 def accepted_offsets(
@@ -20,8 +25,9 @@ def accepted_offsets(
 
     The recheck knows that the basis is bounded, so it may prove less than the program's optimal
     value. Where the solver has that value, the offset stays there: it means what the relaxation's
-    name says, and its derivative is the program's. Elsewhere, or where the multipliers fall short
-    of the claim, it is what is proved, by multipliers or by intervals.
+    name says, and its derivative is the program's. A claim is that value if the multipliers prove
+    it and the moments attain it. Elsewhere the offset is what is proved, by multipliers or by
+    intervals.
 
     Returns:
         The offsets, and for each whether it is the relaxation's optimal value.
@@ -32,6 +38,25 @@ def accepted_offsets(
     answers = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
     answered = np.isin(solution.statuses, answers) & np.isfinite(claims)
     size = by_intervals - np.asarray(program.objective.mid)[:, -1]
-    borne_out = offsets <= claims + SHORTFALL * size  # False where the claim is NaN
-    optimal = answered & borne_out
+    slack = SHORTFALL * size + ROUNDING * (abs(by_intervals) + size)
+    proved = offsets <= claims + slack  # False where the claim is NaN
+    optimal = answered & proved & (_attained(program, solution) >= claims - slack)
     return np.where(optimal, np.fmax(offsets, claims), offsets), optimal
+
+
+def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
+    """The values of the moment matrices, `-inf` for those that the program does not allow.
+
+    The optimal value is no smaller (weak duality), but for what they miss their constraints by.
+    """
+    reduced = compact(program)
+    values = np.full(len(reduced.centers), -np.inf)
+    for i, whole in enumerate(np.asarray(solution.moments)):
+        X = whole[np.ix_(reduced.columns, reduced.columns)]
+        if not np.isfinite(X).all() or abs(X[-1, -1] - 1) > SHORTFALL:
+            continue
+        products = reduced.generators.T @ X.ravel()
+        missed = np.where(reduced.free, abs(products), -products)
+        if missed.max(initial=0.0) <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL:
+            values[i] = reduced.centers[i] + reduced.units[i] * (reduced.objective[i] @ X[:, -1])
+    return values

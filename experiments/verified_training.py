@@ -77,7 +77,9 @@ class Settings:
             at_least_one(**{f"--{name.replace('_', '-')}": getattr(self, name)})
         at_least_one(**{"--workers": self.workers})
         if self.samples < 10:
-            raise ValueError(f"--samples must be at least 10, a tenth to validate, got {self.samples}")
+            raise ValueError(
+                f"--samples must be at least 10, a tenth to validate, got {self.samples}"
+            )
         for name in ("learning_rate", "specification", "volume"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(

@@ -140,7 +140,8 @@ def _change_of_basis(loop: ClosedLoop, t: int) -> ChangeOfBasis:
     n, k = loop.states, loop.units
     size = n + k + 1
     anything = Ball(jnp.zeros(k), jnp.zeros(k))
-    bounds = LoopBounds(anything, anything, anything, *[jnp.zeros(k)] * 3, anything)
+    none = jnp.zeros(k)
+    bounds = LoopBounds(anything, anything, anything, none, none, none, anything)
     rows = loop_rows(loop, columns(0, n, size), n, t, bounds, prune=False)
     one = columns(size - 1, 1, size).mid
     # the paper keeps x^{l+1} = z + u_low and x^{l+2} = u_high - z in place of the last outputs

@@ -17,7 +17,6 @@ from reachjax.rounding import Ball, gamma
 from reachjax.sets import Box
 from reachjax.systems import AbstractActivation, ClosedLoop
 
-
 MARGINAL = 1e-9
 """Inputs that cross zero by no more than this part of their size leave a unit affine."""
 
@@ -47,7 +46,7 @@ class LoopBounds:
 
 def loop_bounds(loop: ClosedLoop, box: Box, t: int | jax.Array) -> LoopBounds:
     """Propagate a box of states through one step by interval arithmetic."""
-    units: list[tuple[Ball, Ball, Array, Array]] = []
+    units: list[tuple[Ball, Ball, Array, Array, Array]] = []
 
     def unit(activation: AbstractActivation, y: Ball) -> Ball:
         z = Ball.between(*activation.interval(y.lower, y.upper))

@@ -90,9 +90,8 @@ def requirements(
         ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
     """
     everywhere = range(horizon + 1)
+    avoid = {} if avoid is None else avoid
     timed = avoid if isinstance(avoid, Mapping) else dict.fromkeys(everywhere, avoid)
-    if avoid is None:
-        timed = {}
     for regions in timed.values():
         if not isinstance(regions, Sequence):
             raise TypeError(

@@ -78,4 +78,6 @@ def log_volume(X: AbstractSet | ReachTube) -> Float[Array, ""]:
 def _require_set(X: Any) -> None:
     if not isinstance(X, AbstractSet):
         hint = ": of a tube, measure tube.sets[t]" if isinstance(X, ReachTube) else ""
-        raise TypeError(f"X must be a set such as Box(lower, upper), but {described(X)} arrived{hint}")
+        raise TypeError(
+            f"X must be a set such as Box(lower, upper), but {described(X)} arrived{hint}"
+        )

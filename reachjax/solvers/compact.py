@@ -50,8 +50,8 @@ class CompactProgram(NamedTuple):
 def compact(program: Program) -> CompactProgram:
     """Drop what is empty or noise, and bring the generators to unit norm."""
     facts, solid = np.asarray(program.facts.mid), _solid(program.facts)
-    columns = np.flatnonzero((solid.any(axis=0) | _solid(program.objective).any(axis=0)))
-    facts = np.where(solid.any(axis=1)[:, None], facts, 0.0)[:, columns]
+    columns = np.flatnonzero(solid.any(axis=0) | _solid(program.objective).any(axis=0))
+    facts = np.where(solid.any(axis=1, keepdims=True), facts, 0.0)[:, columns]
     generators, norms = _generators(program, facts)
     kept = np.flatnonzero(norms > 0)
     unit_size = sp.diags_array(1 / norms[kept])

@@ -19,6 +19,7 @@ from reachjax.sets import AbstractSet, PolyhedralSet, Template
 from reachjax.sizes import log_volume
 from reachjax.systems import ClosedLoop
 
+
 def volume_penalty(
     loop: ClosedLoop,
     X0: AbstractSet,

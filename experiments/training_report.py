@@ -31,12 +31,12 @@ def tables(outcomes: Outcomes, goals: tuple[float, ...], cost: StepCost) -> list
 
 def verdict_table(outcomes: Outcomes) -> Table:
     """How many controllers are proved, and at what imitation error."""
-    table = _table("verdicts, and root mean square imitation errors on samples not trained on")
+    table = _table("verdicts, and root mean square errors on samples not trained on")
     table.add_column("trained", no_wrap=True)
     for status in COLOURS:
-        table.add_column(status.lower(), justify="right")
-    for heading in ("error: least", "median", "largest", "over plain", "skipped"):
-        table.add_column(heading, justify="right")
+        table.add_column(status.lower(), justify="right", no_wrap=True)
+    for heading in ("least", "median", "largest", "/ plain", "skipped"):
+        table.add_column(heading, justify="right", no_wrap=True)
     plain = [outcome.validation_error for outcome in next(iter(outcomes.values()))]
     for way, group in outcomes.items():
         errors = [outcome.validation_error for outcome in group]
@@ -44,7 +44,7 @@ def verdict_table(outcomes: Outcomes) -> Table:
         spread = [f"{value:.4f}" for value in (min(errors), np.median(errors), max(errors))]
         ratios = np.array(errors) / plain
         skipped = sum(outcome.skipped for outcome in group)
-        times = f"{ratios.min():.2f} .. {ratios.max():.2f}"
+        times = f"{ratios.min():.2f}-{ratios.max():.2f}"
         table.add_row(way, *map(str, counts), *spread, times, str(skipped))
     return table
 

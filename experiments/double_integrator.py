@@ -172,7 +172,7 @@ def main(settings: Settings) -> None:
     """Train, certify, print, and write the figure and the results."""
     settings.output.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", str(settings.output.parent / "jax_cache"))
+    jax.config.update("jax_compilation_cache_dir", str(settings.output / "jax_cache"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     margins = {"as printed": 0.0, "with margin": settings.margin}
     fits = {name: controller(name, margin, settings) for name, margin in margins.items()}

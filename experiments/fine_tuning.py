@@ -31,6 +31,7 @@ from experiments.sampling import Samples
 
 HORIZON = 6
 TEMPLATE = rj.Template.octagonal
+PROBLEM = (A, B, INPUT_BOX, INITIAL_BOX, STATE_BOX, GOAL_BOX)
 
 
 @dataclass(frozen=True)
@@ -116,10 +117,12 @@ def certified_tube(net: rj.MLP, horizon: int = HORIZON, **options) -> rj.ReachTu
 
 def run(layers, samples: Samples, tuning: Tuning, path: Path) -> Outcome:
     """Train, certify and keep the outcome at `path`, or take it from there."""
-    start = b"".join(np.ascontiguousarray(part).tobytes() for layer in layers for part in layer)
+    parts = [part for layer in layers for part in layer] + [samples.states, samples.inputs]
+    start = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
     settings = asdict(tuning) | {
         "goals": list(tuning.goals),
-        "start": hashlib.sha256(start + samples.inputs.tobytes()).hexdigest(),
+        "start": hashlib.sha256(start).hexdigest(),
+        "problem": [HORIZON, *(part.tolist() for part in PROBLEM), len(TEMPLATE(2))],
     }
     kept = stored.load(path, settings)
     if kept is None:
@@ -177,8 +180,9 @@ def _trained(layers, samples: Samples, tuning: Tuning) -> tuple[list, dict]:
         "imitation": parts[:, 0],
         "penalty": parts[computed, 1],
         "skipped": np.array(rj.failures(state)),
+        # the first one compiles
         "step_seconds": np.median(np.array(seconds)[computed][1:])
-        if tuning.penalised
+        if tuning.penalised and computed.sum() > 1
         else np.array(np.nan),
     }
     return [(np.asarray(W), np.asarray(b)) for W, b in net.layers], record

@@ -31,18 +31,21 @@ def tables(outcomes: Outcomes, goals: tuple[float, ...], cost: StepCost) -> list
 
 def verdict_table(outcomes: Outcomes) -> Table:
     """How many controllers are proved, and at what imitation error."""
-    table = _table("verdicts, and root mean square imitation errors on samples not trained on")
+    table = _table("verdicts, and root mean square errors on samples not trained on")
     table.add_column("trained", no_wrap=True)
     for status in COLOURS:
-        table.add_column(status.lower(), justify="right")
-    for heading in ("error: least", "median", "largest", "skipped"):
-        table.add_column(heading, justify="right")
+        table.add_column(status.lower(), justify="right", no_wrap=True)
+    for heading in ("least", "median", "largest", "/ plain", "skipped"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    plain = [outcome.validation_error for outcome in next(iter(outcomes.values()))]
     for way, group in outcomes.items():
         errors = [outcome.validation_error for outcome in group]
         counts = [sum(outcome.verdict == status for outcome in group) for status in COLOURS]
         spread = [f"{value:.4f}" for value in (min(errors), np.median(errors), max(errors))]
+        ratios = np.array(errors) / plain
         skipped = sum(outcome.skipped for outcome in group)
-        table.add_row(way, *map(str, counts), *spread, str(skipped))
+        times = f"{ratios.min():.2f}-{ratios.max():.2f}"
+        table.add_row(way, *map(str, counts), *spread, times, str(skipped))
     return table
 
 
@@ -102,7 +105,7 @@ def cost_table(outcomes: Outcomes, cost: StepCost) -> Table:
     for way, group in outcomes.items():
         if way != "plain":
             median = np.median([outcome.step_seconds for outcome in group])
-            table.add_row(f"{way} penalty, {HORIZON} steps, here", f"{median:.3f}")
+            table.add_row(f"{way} penalty, {HORIZON} steps, side by side", f"{median:.3f}")
     table.add_row("log-volume of 5 steps, forward", f"{cost.forward:.3f}")
     table.add_row("  of it in cvxpy and the solver", f"{cost.solver:.3f}")
     table.add_row("forward and backward", f"{cost.both:.3f}")

@@ -9,6 +9,7 @@ and of simulated hulls: the latter tell whether the loop improved, or only the r
     python -m experiments.verified_training --help
 """
 
+import math
 import multiprocessing
 import os
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -75,14 +76,21 @@ class Settings:
         for name in ("seeds", "samples", "pretraining_steps", "steps", "every", "simulations"):
             at_least_one(**{f"--{name.replace('_', '-')}": getattr(self, name)})
         at_least_one(**{"--workers": self.workers})
+        if self.samples < 10:
+            raise ValueError(
+                f"--samples must be at least 10, a tenth to validate, got {self.samples}"
+            )
         for name in ("learning_rate", "specification", "volume"):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(
-                    f"--{name.replace('_', '-')} must be above 0, got {getattr(self, name)}"
+                    f"--{name.replace('_', '-')} must be finite and above 0, "
+                    f"got {getattr(self, name)}"
                 )
-        for name in ("margin", "decay"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"--{name} must be at least 0, got {getattr(self, name)}")
+        for name in ("margin", "decay", "seed"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"--{name} must be finite and at least 0, got {getattr(self, name)}"
+                )
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"--hidden must be numbers of neurons, got {self.hidden}")
         if not self.goals or not min(self.goals) > 0:
@@ -123,7 +131,7 @@ def train_on(networks, samples: Samples, settings: Settings) -> dict[str, list[O
         settings.workers,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=configure,
-        initargs=(settings.output.parent / "jax_cache",),
+        initargs=(settings.output / "jax_cache",),
     )
     with bar() as shown, pool:
         jobs = {
@@ -146,7 +154,7 @@ def train_on(networks, samples: Samples, settings: Settings) -> dict[str, list[O
 def main(settings: Settings) -> None:
     """Sample, train, certify, print, and write figures and results."""
     settings.output.mkdir(parents=True, exist_ok=True)
-    configure(settings.output.parent / "jax_cache")
+    configure(settings.output / "jax_cache")
     mpc = linear_mpc(margin=0.0)
     lower, upper = mpc.state_lower, mpc.state_upper
     path = settings.output / "samples.npz"
@@ -163,9 +171,11 @@ def main(settings: Settings) -> None:
         path=settings.output / "networks.npz",
     )
     outcomes = train_on([fit.layers for fit in fits], samples, settings)
+    rich.print("timing training steps, about a minute ...")
     cost = step_cost(fits[0].layers)
     for table in training_report.tables(outcomes, settings.goals, cost):
         rich.print(table)
+    rich.print("drawing ...")
     training_report.draw_tubes(outcomes, settings.output / "tubes.png")
     training_report.draw_seeds(outcomes, settings.output / "seeds.png")
     training_report.write(settings, outcomes, cost, settings.output / "results.json")

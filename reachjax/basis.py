@@ -35,6 +35,10 @@ class Rows(Ball):
         last = jnp.zeros((other.shape[0], self.mid.shape[1])).at[:, -1].set(other)
         return Rows.exact(last)
 
+    def widened(self, by: Array) -> Rows:
+        """Rows whose values may be off by so much."""
+        return Rows(self.mid, self.rad.at[:, -1].add(by))
+
     def where(self, mask: Array) -> Rows:
         """Keep the rows in which the mask is true; the others are zero."""
         keep = jnp.asarray(mask, self.mid.dtype)[:, None]
@@ -81,7 +85,7 @@ def loop_rows(
         z = columns(first + done, y.mid.shape[0], size)
         if prune:
             passing, blocking = bounds.passing[here], bounds.blocking[here]
-            z = z.where(~passing & ~blocking) + y.where(passing)
+            z = (z.where(~passing & ~blocking) + y.where(passing)).widened(bounds.excess[here])
         interval = bounds.preactivation[here]
         units.append((y, z, activation.facts(y, z, interval.lower, interval.upper)))
         return z
@@ -136,7 +140,8 @@ def _change_of_basis(loop: ClosedLoop, t: int) -> ChangeOfBasis:
     n, k = loop.states, loop.units
     size = n + k + 1
     anything = Ball(jnp.zeros(k), jnp.zeros(k))
-    bounds = LoopBounds(anything, anything, anything, jnp.zeros(k), jnp.zeros(k), anything)
+    none = jnp.zeros(k)
+    bounds = LoopBounds(anything, anything, anything, none, none, none, anything)
     rows = loop_rows(loop, columns(0, n, size), n, t, bounds, prune=False)
     one = columns(size - 1, 1, size).mid
     # the paper keeps x^{l+1} = z + u_low and x^{l+2} = u_high - z in place of the last outputs

@@ -17,6 +17,9 @@ from reachjax.rounding import Ball, gamma
 from reachjax.sets import Box
 from reachjax.systems import AbstractActivation, ClosedLoop
 
+MARGINAL = 1e-9
+"""Inputs that cross zero by no more than this part of their size leave a unit affine."""
+
 
 @pytree
 class LoopBounds:
@@ -26,8 +29,9 @@ class LoopBounds:
         state: `(n_x,)`, the box of states it started from.
         preactivation: `(k,)`, inputs `y` of the units.
         output: `(k,)`, outputs `z` of the units.
-        passing: `(k,)`, units that are surely the identity.
-        blocking: `(k,)`, units that are surely zero.
+        passing: `(k,)`, units that are the identity, up to `excess`.
+        blocking: `(k,)`, units that are zero, up to `excess`.
+        excess: `(k,)`, by how much at most; zero where `y` surely does not change its sign.
         successor: `(n_x,)`, states one step later.
     """
 
@@ -36,26 +40,44 @@ class LoopBounds:
     output: Ball
     passing: Array
     blocking: Array
+    excess: Array
     successor: Ball
 
 
 def loop_bounds(loop: ClosedLoop, box: Box, t: int | jax.Array) -> LoopBounds:
     """Propagate a box of states through one step by interval arithmetic."""
-    units: list[tuple[Ball, Ball, Array, Array]] = []
+    units: list[tuple[Ball, Ball, Array, Array, Array]] = []
 
     def unit(activation: AbstractActivation, y: Ball) -> Ball:
         z = Ball.between(*activation.interval(y.lower, y.upper))
         # the ends of `y` may be rounded differently where the midpoint and the radius are formed
-        z = Ball(z.mid, z.rad + gamma(8) * (abs(y.mid) + y.rad))
-        units.append((y, z, *activation.phases(y.lower, y.upper)))
+        rounding = gamma(8) * (abs(y.mid) + y.rad)
+        zero = activation.phases(y.lower, y.upper)[1]
+        z = Ball(jnp.where(zero, 0.0, z.mid), jnp.where(zero, 0.0, z.rad + rounding))
+        units.append((y, z, *_phases(activation, y)))
         return z
 
     state = Ball.between(box.lower, box.upper)
     successor = loop.step(state, t, unit)
     empty = jnp.zeros(0)
-    units.insert(0, (Ball.exact(empty), Ball.exact(empty), empty > 0, empty > 0))
-    y, z, passing, blocking = jax.tree.map(_concatenate, *units)
-    return LoopBounds(state, y, z, passing, blocking, successor)
+    units.insert(0, (Ball.exact(empty), Ball.exact(empty), empty > 0, empty > 0, empty))
+    y, z, passing, blocking, excess = jax.tree.map(_concatenate, *units)
+    return LoopBounds(state, y, z, passing, blocking, excess, successor)
+
+
+def _phases(activation: AbstractActivation, y: Ball) -> tuple[Array, Array, Array]:
+    """Units that are affine but for inputs that change their sign by next to nothing.
+
+    Kept, such a unit would need multipliers of the size of `1 / MARGINAL`, and derivatives lose as
+    many digits. An activation is nonexpansive, so its output is off by twice the distance of an
+    input from where it is the identity.
+    """
+    spare = MARGINAL * (abs(y.mid) + y.rad)
+    surely = activation.phases(y.lower, y.upper)
+    passing = activation.phases(y.lower + spare, jnp.maximum(y.upper, y.lower + spare))[0]
+    blocking = activation.phases(jnp.minimum(y.lower, y.upper - spare), y.upper - spare)[1]
+    excess = jnp.where(surely[0] | surely[1] | ~(passing | blocking), 0.0, 2 * spare)
+    return passing, blocking & ~passing, excess
 
 
 @jax.jit

@@ -67,6 +67,21 @@ def whole_number(name: str, value: Any, least: int) -> int:
     return number
 
 
+def real_number(name: str, value: Any, least: float) -> float:
+    """`value` as a finite `float` of at least `least`.
+
+    Raises:
+        TypeError: it is no number.
+        ValueError: it is smaller, NaN or infinite.
+    """
+    array = np.asarray(value) if is_concrete(value) else None
+    if array is None or array.shape != () or array.dtype.kind not in "iuf":
+        raise TypeError(f"{name} must be a number, but {described(value)} arrived")
+    if not (np.isfinite(array) and array >= least):
+        raise ValueError(f"{name} must be finite and at least {least:g}, but {array} arrived")
+    return float(array)
+
+
 def described(value: Any) -> str:
     """A short word for what arrived: classes and plain values as they are, objects by kind."""
     if isinstance(value, type | str | int | float | list | None):

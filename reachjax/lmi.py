@@ -156,10 +156,11 @@ def _step_program(
         given[:, :-1] @ rows.state + given[:, -1] for given in (set_facts, cone_facts)
     )
     facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts, cone)
-    # the optimal value does not depend on the scaling, so neither does its derivative
-    shift, scale = jax.lax.stop_gradient(basis_box(bounds, relaxation.remove_stable))
+    # The optimal value does not depend on the scaling, but its derivative at inexact multipliers
+    # does: with the scaling's share, facts of thin sets keep their size and errors cancel.
+    scaling_of_basis = basis_box(bounds, relaxation.remove_stable)
     # one rounding of the scaling for all rows, whatever the compiler fuses
-    shift, scale = jax.lax.optimization_barrier((shift, scale))
+    shift, scale = jax.lax.optimization_barrier(scaling_of_basis)
     T = scaling(shift, scale)
     return Program(
         facts=facts @ T,

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.certificates import Certificate
@@ -22,7 +23,7 @@ from reachjax.checks import (
 from reachjax.lmi import step_program
 from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, LocalBounds
-from reachjax.sets import AbstractSet, Polytope, Template
+from reachjax.sets import AbstractSet, Box, Polytope, Template
 from reachjax.solvers import AbstractSolver, Clarabel, bounding_box, proved_offsets
 from reachjax.systems import ClosedLoop
 from reachjax.witnesses import initial_states, proposed_states, witnesses
@@ -156,13 +157,20 @@ def reach(
         start: the time of `X0`, for time-varying loops.
         samples: how many trajectories are simulated for witnesses, besides those from corners.
         seed: of the samples.
-        progress: wraps the iteration over steps to show a progress bar, such as `tqdm.tqdm`.
+        progress: wraps the iteration over steps to show a progress bar, such as `tqdm.tqdm`; inside
+            `jax.jit` it sees them once, while the loop is traced.
 
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind.
         ValueError: dimensions disagree, `X0` is empty or unbounded, the window is not supported,
-            or a time-varying loop ends before the horizon.
+            a time-varying loop ends before the horizon, or states overflow. What depends on traced
+            values is NaN instead, inside `jax.jit`.
+
+    The offsets of the sets have first derivatives in everything but facet normals (reverse mode):
+    in the loop's weights, plant and input box, and in a box's ends or a polytope's offsets. In the
+    normals of `X0` and of the template the derivative is NaN where a bound of a coordinate is
+    attained on a whole face.
 
     Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 
@@ -181,14 +189,31 @@ def reach(
     certificates: list[Certificate] = []
     steps = range(horizon)
     for k in steps if progress is None else progress(steps):
-        X = sets[-1]
-        program = step_program(loop, X, bounding_box(X), template, start + k, relaxation)
+        box = _bounded(sets[-1], "X0" if k == 0 else f"the certified set at t = {start + k}")
+        program = step_program(loop, sets[-1], box, template, start + k, relaxation)
         bounds, solution = proved_offsets(program, solver)
+        if is_concrete(bounds) and not np.isfinite(bounds).all():
+            raise ValueError(
+                f"the loop's states at t = {start + k + 1} overflow or are not numbers: check the "
+                "weights of loop.controller and the entries of loop.plant"
+            )
         certificates.append(Certificate.from_solution(program, bounds, solution))
         sets.append(template.polytope(bounds))
-    if is_concrete(loop, X0):
+    if is_concrete(loop, X0, certificates):
         certificates = _with_witnesses(certificates, loop, X0, template, start, samples, seed)
     return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
+
+
+def _bounded(X: AbstractSet, name: str) -> Box:
+    """The box around a set.
+
+    Raises:
+        ValueError: the set is empty or unbounded, or seems so because its numbers are so large.
+    """
+    try:
+        return bounding_box(X)
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} cannot be used: {error}") from None
 
 
 def _with_witnesses(certificates, loop, X0, template, start, samples, seed) -> list[Certificate]:
@@ -230,9 +255,5 @@ def _check(
         )
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
-    try:
-        bounding_box(X0)
-    except ValueError as error:
-        raise ValueError(f"X0 cannot start a tube: {error}") from None
     if whole_number("window", window, 1) != 1:
         raise ValueError(f"window must be 1 (one step at a time), but {window!r} arrived")

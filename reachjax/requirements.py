@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.checks import described
+from reachjax.checks import described, is_concrete, real_number
 from reachjax.reach import ReachTube
 from reachjax.sets import Box, PolyhedralSet
 from reachjax.solvers import separation, support
@@ -58,8 +59,28 @@ class Requirement:
         return margin >= 0 if self.inside else margin > 0
 
 
-def requirements(
+def of_tube(
     tube: ReachTube, goal: PolyhedralSet | None, avoid: AvoidSets | None, safe: PolyhedralSet | None
+) -> list[Requirement]:
+    """A specification's requirements for a tube, one for each set and time.
+
+    Raises:
+        TypeError: there is no tube, or a set is of a kind without facets.
+        ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
+    """
+    if not isinstance(tube, ReachTube):
+        raise TypeError(
+            f"tube must be a ReachTube, as reach(...) returns it, but {described(tube)} arrived"
+        )
+    return requirements(tube.loop.states, tube.horizon, goal, avoid, safe)
+
+
+def requirements(
+    states: int,
+    horizon: int,
+    goal: PolyhedralSet | None,
+    avoid: AvoidSets | None,
+    safe: PolyhedralSet | None,
 ) -> list[Requirement]:
     """A specification's requirements, one for each set and time.
 
@@ -67,36 +88,34 @@ def requirements(
         TypeError: a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
     """
-    if not isinstance(tube, ReachTube):
-        raise TypeError(
-            f"tube must be a ReachTube, as reach(...) returns it, but {described(tube)} arrived"
-        )
-    everywhere = range(tube.horizon + 1)
-    timed = avoid if isinstance(avoid, Mapping) else dict.fromkeys(everywhere, avoid or ())
+    everywhere = range(horizon + 1)
+    avoid = {} if avoid is None else avoid
+    timed = avoid if isinstance(avoid, Mapping) else dict.fromkeys(everywhere, avoid)
     for regions in timed.values():
         if not isinstance(regions, Sequence):
             raise TypeError(
                 "avoid must be a sequence of sets, avoid=[A, ...], or a mapping from a time to "
-                f"one, avoid={{t: [A, ...]}}, but a {type(regions).__name__} arrived"
+                f"one, avoid={{t: [A, ...]}}, but {described(regions)} arrived"
             )
-    found = [Requirement("goal", tube.horizon, goal, True)] if goal is not None else []
+    found = [Requirement("goal", horizon, goal, True)] if goal is not None else []
     found += [Requirement("safe", t, safe, True) for t in everywhere if safe is not None]
     for t, regions in timed.items():
-        if t not in everywhere:
-            raise ValueError(f"avoid names time {t!r}, but the tube is for t = 0 .. {tube.horizon}")
+        if isinstance(t, bool) or t not in everywhere:
+            raise ValueError(f"avoid names time {t!r}, but the tube is for t = 0 .. {horizon}")
         found += [Requirement(f"avoid[{i}]", t, A, False) for i, A in enumerate(regions)]
     if not found:
         raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")
     for item in found:
         if not isinstance(item.region, PolyhedralSet):
-            kind = type(item.region).__name__
-            raise TypeError(f"{item.name} must be a Box or a Polytope, but a {kind} arrived")
+            raise TypeError(
+                f"{item.name} must be a Box or a Polytope, but {described(item.region)} arrived"
+            )
         if isinstance(item.region, Box) and item.region.steps is not None:
             raise ValueError(f"{item.name} must be one box, but a time-varying one arrived")
-        if item.region.dimension != tube.loop.states:
+        if item.region.dimension != states:
             raise ValueError(
                 f"{item.name} has dimension {item.region.dimension}, "
-                f"but the loop has {tube.loop.states} states"
+                f"but the loop has {states} states"
             )
     return found
 
@@ -124,8 +143,9 @@ def shortfall(
         margin: how far the sets should be from breaking a requirement, in the units of the state.
 
     Raises:
-        TypeError: a set is of a kind without facets.
-        ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
+        TypeError: a set is of a kind without facets, or the margin is no number.
+        ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or the
+            margin is negative.
 
     Example:
         >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach
@@ -134,7 +154,14 @@ def shortfall(
         >>> round(float(shortfall(tube, goal=Box([0.0], [0.9]))), 6)
         0.1
     """
+    check_margin(margin)
     missing = jnp.zeros(())
-    for item in requirements(tube, goal, avoid, safe):
+    for item in of_tube(tube, goal, avoid, safe):
         missing += jnp.sum(jnp.maximum(0.0, margin - item.margins(tube)))
     return missing
+
+
+def check_margin(margin: Any) -> None:
+    """A margin is a number of at least 0, as far as one can see inside `jax.jit`."""
+    if is_concrete(margin) or jnp.shape(margin) != ():
+        real_number("margin", margin, 0.0)

@@ -7,9 +7,12 @@ a polytope is that of its bounding box.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from reachjax.checks import described
 from reachjax.reach import ReachTube
 from reachjax.sets import AbstractSet, Polytope
 from reachjax.solvers import bounding_box, polytope_volume
@@ -22,6 +25,11 @@ def volume(X: AbstractSet) -> Float[Array, ""]:
 
     Differentiable, also inside `jax.jit`, `jax.vmap` and `jax.lax.scan`.
 
+    Raises:
+        TypeError: `X` is no set.
+        ValueError: a polytope is empty or unbounded (NaN inside `jax.jit`).
+        RuntimeError: it is too thin for its corners to be found (NaN inside `jax.jit`).
+
     Example:
         >>> import jax
         >>> from reachjax import Template
@@ -29,6 +37,7 @@ def volume(X: AbstractSet) -> Float[Array, ""]:
         >>> jax.grad(lambda b: volume(template.polytope(b)))(jnp.array([2.0, 0, 3, 0])).round(9)
         Array([3., 3., 2., 2.], dtype=float64)
     """
+    _require_set(X)
     if not isinstance(X, Polytope):
         return jnp.asarray(X.volume())
     if X.dimension <= EXACT_DIMENSIONS:
@@ -37,12 +46,26 @@ def volume(X: AbstractSet) -> Float[Array, ""]:
 
 
 def log_widths(X: AbstractSet) -> Float[Array, " n"]:
-    """Logarithms of the widths of a set along each coordinate."""
+    """Logarithms of the widths of a set along each coordinate; differentiable as `volume` is.
+
+    Raises:
+        TypeError: `X` is no set.
+        ValueError: a polytope is empty or unbounded (NaN inside `jax.jit`).
+
+    Example:
+        >>> from reachjax import Box
+        >>> log_widths(Box([0.0, 0.0], [1.0, 2.0])).round(6).tolist()
+        [0.0, 0.693147]
+    """
+    _require_set(X)
     return jnp.log(bounding_box(X).widths)
 
 
 def log_volume(X: AbstractSet | ReachTube) -> Float[Array, ""]:
     """The logarithm of a set's volume; of a tube, the sum over `t = 1 .. horizon`.
+
+    Raises:
+        TypeError: `X` is neither a set nor a tube.
 
     Example:
         >>> from reachjax import Box
@@ -52,3 +75,11 @@ def log_volume(X: AbstractSet | ReachTube) -> Float[Array, ""]:
     if isinstance(X, ReachTube):
         return sum((log_volume(region) for region in X.sets[1:]), start=jnp.zeros(()))
     return jnp.log(volume(X))
+
+
+def _require_set(X: Any) -> None:
+    if not isinstance(X, AbstractSet):
+        hint = ": of a tube, measure tube.sets[t]" if isinstance(X, ReachTube) else ""
+        raise TypeError(
+            f"X must be a set such as Box(lower, upper), but {described(X)} arrived{hint}"
+        )

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from reachjax.bounds import successor_box
 from reachjax.checks import whole_number
 from reachjax.reach import ReachTube
-from reachjax.requirements import AvoidSets, Requirement, requirements
+from reachjax.requirements import AvoidSets, Requirement, of_tube
 from reachjax.rounding import gamma
 from reachjax.sets import Box, PolyhedralSet
 from reachjax.solvers import SolverStatus
@@ -139,7 +139,7 @@ def verify(
         >>> verify(tube, goal=Box([0.0], [0.4])).counterexample.states.ravel().round(3).tolist()
         [2.0, 1.2, 0.72, 0.432]
     """
-    required = requirements(tube, goal, avoid, safe)
+    required = of_tube(tube, goal, avoid, safe)
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     proofs = [tube.proof(t) for t in range(1, tube.horizon + 1)]

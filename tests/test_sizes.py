@@ -59,3 +59,41 @@ def test_the_log_volume_of_a_tube_sums_its_steps():
     tube = rj.reach(loop, rj.Box([0.0, 0.0], [1.0, 1.0]), 2, rj.Template.box(2))
     assert float(rj.log_volume(tube)) == pytest.approx(-6 * np.log(2), abs=1e-6)
     np.testing.assert_allclose(rj.log_widths(tube.sets[1]), -np.log(2), atol=1e-6)
+
+
+@pytest.mark.parametrize("beyond", [2.0, 5.0])
+def test_of_parallel_facets_the_inner_one_bounds_the_volume(beyond):
+    A = jnp.array([[1.0, 0.0], [2.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+    def area(b):
+        return rj.volume(rj.Polytope(A, b))
+
+    slopes = jax.grad(area)(jnp.array([beyond, 2.0, 0.0, 3.0, 0.0]))  # x <= beyond, 2 x <= 2
+    np.testing.assert_allclose(slopes, [0.0, 1.5, 3.0, 1.0, 1.0], atol=1e-9)
+
+
+def test_what_is_no_set_is_named():
+    net = rj.MLP.from_layers([(np.zeros((1, 1)), [0.0])])
+    tube = rj.reach(
+        rj.ClosedLoop(rj.AffinePlant([[0.5]], [[1.0]]), net),
+        rj.Box([0.0], [1.0]),
+        1,
+        rj.Template.box(1),
+    )
+    with pytest.raises(
+        TypeError, match=r"X must be a set .* but a ReachTube arrived: .*tube\.sets"
+    ):
+        rj.volume(tube)
+    with pytest.raises(TypeError, match=r"X must be a set .* but None arrived"):
+        rj.log_volume(None)
+
+
+def test_inside_jit_an_empty_or_unbounded_set_is_nan_and_outside_an_error():
+    A = jnp.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    area = lambda b: rj.volume(rj.Polytope(A, b))  # noqa: E731
+    empty = jnp.array([1.0, -2.0, 1.0, 0.0])
+    value, slopes = jax.jit(jax.value_and_grad(area))(empty)
+    assert np.isnan(value)
+    assert np.isnan(slopes).all()
+    with pytest.raises(ValueError, match="empty"):
+        area(empty)

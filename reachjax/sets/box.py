@@ -45,7 +45,10 @@ class Box(PolyhedralSet):
                 f"Box.lower and Box.upper must have one shape, "
                 f"but {lower.shape} and {upper.shape} arrived"
             )
-        if is_concrete(lower, upper) and bool(jnp.any(lower > upper)):
+        if not is_concrete(lower, upper):
+            # an empty box inside jax.jit: what is computed from it is NaN
+            self._set(upper=jnp.where(lower <= upper, upper, jnp.nan))
+        elif bool(jnp.any(lower > upper)):
             where = tuple(int(i) for i in np.argwhere(np.asarray(lower > upper))[0])
             raise ValueError(
                 f"Box.lower must not exceed Box.upper, but at {where} "

@@ -11,6 +11,9 @@ from reachjax.sets.polyhedra import balanced, bounding_box, chebyshev, maximiser
 
 TOO_THIN = "the polytope is too thin for its corners to be told apart"
 
+PARALLEL = 1e-9
+"""Unit normals that differ by no more are parallel."""
+
 FLAT = 1e-9
 """Scaled to a unit box, a polytope whose largest inscribed ball is smaller than this is flat."""
 
@@ -72,17 +75,27 @@ def _affine_hull(A: np.ndarray, b: np.ndarray, point: np.ndarray, tolerance: flo
 
 
 def volume(A: np.ndarray, b: np.ndarray) -> float:
-    """The volume of a bounded polytope, zero for a flat one."""
+    """The volume of a bounded polytope, zero for a flat one.
+
+    Raises:
+        ValueError: the polytope is empty or unbounded.
+        RuntimeError: it is too thin for its corners to be found.
+    """
     corners = vertices(A, b)
-    n = A.shape[1]
-    if n == 1:
+    if A.shape[1] == 1:
         return float(np.ptp(corners))
-    if len(corners) <= n:
-        return 0.0
+    hull = _hull(corners)
+    return 0.0 if hull is None else float(hull.volume)
+
+
+def _hull(corners: np.ndarray) -> ConvexHull | None:
+    """The convex hull, None where the corners span fewer than all dimensions."""
+    if len(corners) <= corners.shape[1]:
+        return None
     try:
-        return float(ConvexHull(corners).volume)
-    except QhullError:  # the corners span fewer than n dimensions
-        return 0.0
+        return ConvexHull(corners)
+    except QhullError:
+        return None
 
 
 def facet_areas(A: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -90,23 +103,26 @@ def facet_areas(A: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.nda
 
     Moving facet `i` outwards by `db_i` sweeps the volume `area_i db_i / |a_i|`. A facet that does
     not bound the polytope has area zero.
+
+    Raises:
+        ValueError: the polytope is empty or unbounded.
+        RuntimeError: it is too thin for its corners to be found.
     """
     n, norms = A.shape[1], np.linalg.norm(A, axis=1)
-    corners = vertices(A, b)
+    corners, reach = vertices(A, b), b / norms
     areas, centroids = np.zeros(len(b)), np.zeros((len(b), n))
     if n == 1:
         for side in (A[:, 0] < 0, A[:, 0] > 0):
-            facet = np.flatnonzero(side)[np.argmin((b / abs(A[:, 0]))[side])]
+            facet = np.flatnonzero(side)[np.argmin(reach[side])]
             areas[facet], centroids[facet] = 1.0, b[facet] / A[facet, 0]
         return float(np.ptp(corners)), areas, centroids
-    if len(corners) <= n:
-        return 0.0, areas, centroids
-    try:
-        hull = ConvexHull(corners)
-    except QhullError:  # the corners span fewer than n dimensions
+    hull = _hull(corners)
+    if hull is None:
         return 0.0, areas, centroids
     for simplex, equation in zip(corners[hull.simplices], hull.equations, strict=True):
-        facet = int(np.argmin(np.linalg.norm(A / norms[:, None] - equation[:-1], axis=1)))
+        off = np.linalg.norm(A / norms[:, None] - equation[:-1], axis=1)
+        parallel = off <= off.min() + PARALLEL
+        facet = int(np.argmin(np.where(parallel, reach, np.inf)))  # the others bound nothing
         edges = simplex[1:] - simplex[0]
         area = np.sqrt(max(np.linalg.det(edges @ edges.T), 0.0)) / math.factorial(n - 1)
         areas[facet] += area

@@ -110,21 +110,20 @@ def support_and_multipliers(
     return np.ldexp(values, exponents), multipliers, np.stack(points)
 
 
-def separation(A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray) -> float:
-    """How far the facets of `C x <= d` may move outward before it meets the bounded `A x <= b`.
-
-    A lower bound whatever the linear program's accuracy; positive means disjoint.
-    """
-    return separation_and_multipliers(A, b, C, d)[0]
-
-
 def separation_and_multipliers(
     A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """The separation, the multipliers of `A x <= b` and `C x <= d`, and the nearest point.
+    """How far the facets of `C x <= d` may move outward before it meets the bounded `A x <= b`.
 
-    Minimises `s` over `A x <= b`, `C x - s |c_i| <= d`. The value returned is the dual one,
-    `-(y'b + w'd)` with `y, w >= 0` and `w . |c_i| = 1`, less what its residual can cost.
+    A lower bound whatever the linear program's accuracy; positive means disjoint. Minimises `s`
+    over `A x <= b`, `C x - s |c_i| <= d`. The value returned is the dual one, `-(y'b + w'd)` with
+    `y, w >= 0` and `w . |c_i| = 1`, less what its residual can cost.
+
+    Returns:
+        The separation, the multipliers of both sets and the nearest point.
+
+    Raises:
+        RuntimeError: the linear program was not solved.
     """
     lengths = [np.frexp(np.linalg.norm(rows, axis=1))[1] for rows in (A, C)]
     (A, b), (C, d) = balanced(A, b), balanced(C, d)

@@ -10,11 +10,16 @@ from reachjax.recheck import interval_offsets, sound_level, sound_offsets
 from reachjax.rounding import gamma
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import Enclosure, Solution, SolverStatus
+from reachjax.solvers.compact import compact
 
 ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
 
 SHORTFALL = 1e-3
-"""A claim that its multipliers miss by more than this part of the interval's radius is none."""
+"""A claim counts as the optimum if multipliers and moments bear it out to this part of what is
+compared: the interval's radius for values, generators of unit norm for signs."""
+
+ROUNDING = 1e-12
+"""What rounding may add to a claim, as a part of its size."""
 
 
 def accepted_offsets(
@@ -24,8 +29,9 @@ def accepted_offsets(
 
     The recheck knows that the basis is bounded, so it may prove less than the program's optimal
     value. Where the solver has that value, the offset stays there: it means what the relaxation's
-    name says, and its derivative is the program's. Elsewhere, or where the multipliers fall short
-    of the claim, it is what is proved, by multipliers or by intervals.
+    name says, and its derivative is the program's. A claim is that value if the multipliers prove
+    it and the moments attain it. Elsewhere the offset is what is proved, by multipliers or by
+    intervals.
 
     Returns:
         The offsets, and for each whether it is the relaxation's optimal value.
@@ -35,9 +41,28 @@ def accepted_offsets(
     claims = np.asarray(solution.offsets)
     answered = np.isin(solution.statuses, ANSWERS) & np.isfinite(claims)
     size = by_intervals - np.asarray(program.objective.mid)[:, -1]
-    borne_out = offsets <= claims + SHORTFALL * size  # False where the claim is NaN
-    optimal = answered & borne_out
+    slack = SHORTFALL * size + ROUNDING * (abs(by_intervals) + size)
+    proved = offsets <= claims + slack  # False where the claim is NaN
+    optimal = answered & proved & (_attained(program, solution) >= claims - slack)
     return np.where(optimal, np.fmax(offsets, claims), offsets), optimal
+
+
+def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
+    """The values of the moment matrices, `-inf` for those that the program does not allow.
+
+    The optimal value is no smaller (weak duality), but for what they miss their constraints by.
+    """
+    reduced = compact(program)
+    values = np.full(len(reduced.centers), -np.inf)
+    for i, whole in enumerate(np.asarray(solution.moments)):
+        X = whole[np.ix_(reduced.columns, reduced.columns)]
+        if not np.isfinite(X).all() or abs(X[-1, -1] - 1) > SHORTFALL:
+            continue
+        products = reduced.generators.T @ X.ravel()
+        missed = np.where(reduced.free, abs(products), -products)
+        if missed.max(initial=0.0) <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL:
+            values[i] = reduced.centers[i] + reduced.units[i] * (reduced.objective[i] @ X[:, -1])
+    return values
 
 
 def accepted_enclosure(
@@ -69,11 +94,9 @@ def _log_volume(form: NormalForm, level: float) -> float:
 
 def _interval_form(program: Program) -> NormalForm:
     """The ellipsoid around the interval bounds of the successor, never quite flat."""
-    p = program.objective
-    center, radius = p.mid[:, -1], abs(p.mid[:, :-1]).sum(axis=1)
-    least = np.maximum(1e-9 * (abs(center) + radius.max()), 1e-300)
-    A = np.diag(1 / (np.sqrt(len(p.mid)) * np.maximum(radius, least)))
-    return NormalForm(A, -A @ center)
+    reduced = compact(program)
+    A = np.diag(1 / (np.sqrt(len(reduced.widths)) * reduced.widths))
+    return NormalForm(A, -A @ reduced.centers)
 
 
 def _invertible(form: NormalForm) -> bool:

@@ -85,6 +85,7 @@ def sensitivity(
     if not all(np.isfinite(part).all() for part in given):
         return unknown
     reduced = compact(program)
+    reduced = reduced.with_units(reduced.widths)
     barrier = _Barrier(reduced)
     y = barrier.start(reduced.norms * multipliers[reduced.kept], reduced.to_unit_box(form))
     if y is None:

@@ -1,8 +1,8 @@
 """The program as a solver should see it: nothing empty, nothing at rounding level, unit sizes.
 
-Columns that no row uses are dropped, so are rows whose coefficients are rounding noise (one of size
-1e-16 scaled up to 1 made a solver report "solved" for an offset below the true support). The
-generators that remain are scaled to unit norm.
+Rows whose coefficients are rounding noise are dropped (one of size 1e-16 scaled up to 1 made a
+solver report "solved" for an offset below the true support), so are columns that the others use at
+that level or not at all. The generators that remain are scaled to unit norm.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ import numpy as np
 import scipy.sparse as sp
 
 from reachjax.lmi import Program
+from reachjax.rounding import Ball
 from reachjax.sets import NormalForm
 
 NOISE = 16.0
-"""Rows no larger than this many times their own rounding error count as zero."""
+"""Coefficients no larger than this many times the rounding error of their row count as zero."""
 
 CHUNK = 256
 """Pairs whose dense outer products are held in memory at once."""
@@ -29,7 +30,8 @@ class CompactProgram(NamedTuple):
         generators: sparse `(n * n, K')`, the flattened `G_k`.
         objective: `(f, n)`, of unit 1-norm and without a constant.
         centers: `(f,)`, the constants; a facet's offset is `centers + units b`.
-        units: `(f,)`; the program's multipliers are those of the scaled objective times this.
+        units: `(f,)`; the program's multipliers are those of the scaled objective times this. Zero
+            where the objective has one value.
         free: `(K',)`, multipliers of either sign.
         columns: `(n,)`, numbers of the columns kept.
         kept: `(K',)`, numbers of the multipliers kept.
@@ -45,9 +47,14 @@ class CompactProgram(NamedTuple):
     kept: np.ndarray
     norms: np.ndarray
 
-    def with_objective_times(self, factor: float) -> CompactProgram:
-        """The same program with another unit of the objective."""
-        return self._replace(objective=factor * self.objective, units=self.units / factor)
+    @property
+    def widths(self) -> np.ndarray:
+        """The units, none of them at rounding level."""
+        return np.maximum(self.units, 1e-9 * (abs(self.centers) + self.units.max()) + 1e-300)
+
+    def with_units(self, units: np.ndarray) -> CompactProgram:
+        """The same program with other units of the objective."""
+        return self._replace(objective=self.objective * (self.units / units)[:, None], units=units)
 
     def to_unit_box(self, form: NormalForm) -> NormalForm:
         """`|A x + b| <= 1` over the coordinates in which the objective rows are stated."""
@@ -66,12 +73,9 @@ class CompactProgram(NamedTuple):
 
 def compact(program: Program) -> CompactProgram:
     """Drop what is empty or noise, and bring the generators to unit norm."""
-    columns = np.flatnonzero(program.scale > 0)
-    facts = np.asarray(program.facts.mid)[:, columns]
-    noise = np.asarray(program.facts.rad)[:, columns]
-    size = np.linalg.norm(facts, axis=1)
-    solid = size > NOISE * np.linalg.norm(noise, axis=1)
-    facts = np.where(solid[:, None], facts, 0.0)
+    facts, solid = np.asarray(program.facts.mid), _solid(program.facts)
+    columns = np.flatnonzero(solid.any(axis=0) | _solid(program.objective).any(axis=0))
+    facts = np.where(solid.any(axis=1, keepdims=True), facts, 0.0)[:, columns]
     generators, norms = _generators(program, facts)
     kept = np.flatnonzero(norms > 0)
     unit_size = sp.diags_array(1 / norms[kept])
@@ -79,11 +83,10 @@ def compact(program: Program) -> CompactProgram:
     objective = np.asarray(program.objective.mid)[:, columns].copy()
     centers = objective[:, -1].copy()
     objective[:, -1] = 0.0
-    sizes = abs(objective).sum(axis=1)
-    units = np.where(sizes > 0, sizes, 1.0)
+    units = abs(objective).sum(axis=1)
     return CompactProgram(
         generators=sp.csc_array(generators[:, kept] @ unit_size),
-        objective=objective / units[:, None],
+        objective=objective / np.where(units > 0, units, 1.0)[:, None],
         centers=centers,
         units=units,
         free=np.asarray(program.products.free)[kept],
@@ -91,6 +94,12 @@ def compact(program: Program) -> CompactProgram:
         kept=kept,
         norms=norms[kept],
     )
+
+
+def _solid(rows: Ball) -> np.ndarray:
+    """Which coefficients stand out from the rounding errors of their row."""
+    noise = np.linalg.norm(np.asarray(rows.rad), axis=1)
+    return abs(np.asarray(rows.mid)) > NOISE * noise[:, None]
 
 
 def _generators(program: Program, facts: np.ndarray) -> tuple[sp.csc_array, np.ndarray]:

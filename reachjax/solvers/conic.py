@@ -92,7 +92,7 @@ class _ConicSolver(AbstractSolver, abc.ABC):
         reduced, proposal = compact(program), Enclosure.blank(program)
         began = time.perf_counter()
         for factor in RESCALINGS:
-            scaled = reduced.with_objective_times(factor)
+            scaled = reduced.with_units(reduced.widths / factor)
             model = EllipsoidModel(scaled, None if form is None else scaled.to_unit_box(form))
             status = _run(model.problem, name, options)
             if status not in STALLED:

@@ -6,14 +6,15 @@ moments fixed and differentiate the Lagrangian,
     d b = <X / 2, d(F' Gamma F + p e' + e p')>,
 
 with `X` the dual moment matrix; ordinary automatic differentiation carries it on through rows,
-bounds and earlier steps. What the recheck adds to an offset is not differentiated. Where the solver
-gave no optimal value that its multipliers bear out, the derivative is NaN, so that no number of a
-failed solve reaches an optimiser.
+bounds and earlier steps. What the recheck adds to an offset is not differentiated. The derivative
+is NaN unless the solver reports `SOLVED` with an optimal value that its multipliers prove and its
+moments attain, so that no number of a failed solve reaches an optimiser. What a solver proposes
+(multipliers, moments, its own offsets) has no derivative: asking for one gives NaN.
 
-**Accuracy.** The derivative is as good as the solver. Where facets are `SOLVED` at tolerance 1e-9
-it differs from fourth-order differences by 2e-5 in the median and 6e-4 at most, over one step and
-over five; at 1e-6 it is off by 2e-4 to 3e-3, at 1e-4 by 5e-3 to 7e-2 (of its norm). Facets left
-`INACCURATE` were seen to be wrong by up to 1e-1.
+**Accuracy.** The derivative is as good as the solver: at its default tolerance of 1e-9 the tests
+hold it to 1e-3 of fourth-order differences, over one step and over five. At 1e-6 it was off by up
+to 3e-3, at 1e-4 by up to 7e-2 (of its norm). Flat sets and points keep these digits; of sets, and
+input ranges, of a width below some 1e-8 of their size the derivative in the width loses them.
 
 **Kinks.** Where a facet only touches, a neuron becomes stable, or an optimal point is not unique,
 an offset has a kink: the derivative is then one of its generalised gradients, and central
@@ -32,7 +33,7 @@ from jaxtyping import Array, Float
 
 from reachjax.lmi import Program, lagrangian
 from reachjax.solvers.accepted import accepted_offsets
-from reachjax.solvers.base import AbstractSolver, Solution
+from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
 from reachjax.solvers.host import on_host
 
 
@@ -59,7 +60,8 @@ def _proved_offsets(solver, facts, objective, program) -> tuple[Array, Array, So
 def _forward(solver, facts, objective, program):
     result: Any = _proved_offsets(solver, facts, objective, program)
     _, optimal, solution = result
-    moments = jnp.where(optimal[:, None, None], solution.moments, jnp.nan)
+    trusted = optimal & (solution.statuses == SolverStatus.SOLVED)
+    moments = jnp.where(trusted[:, None, None], solution.moments, jnp.nan)
     return result, (program, solution.multipliers, moments)
 
 
@@ -74,12 +76,18 @@ def _backward(solver, residual, cotangents):
         return lagrangian(held, multipliers, moments)
 
     pull: Any = jax.vjp(value, program.facts.mid, program.objective.mid)[1]
-    return *pull(cotangents[0]), None
+    offsets, _, proposal = cotangents
+    asked = [jnp.any(part != 0) for part in proposal if part.dtype == offsets.dtype]
+    return *pull(jnp.where(jnp.array(asked).any(), jnp.nan, offsets)), None
 
 
 _proved_offsets.defvjp(_forward, _backward)
 
 
 def _solve(solver: AbstractSolver, program: Program) -> tuple[np.ndarray, np.ndarray, Solution]:
+    facets, size = program.objective.mid.shape
+    if not all(np.isfinite(part).all() for part in jax.tree.leaves(program)):
+        blank = Solution.blank(facets, len(program.products.free), size)
+        return np.full(facets, np.nan), np.zeros(facets, dtype=bool), blank
     solution = solver.solve(program)
     return *accepted_offsets(program, solution), solution

@@ -18,12 +18,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from reachjax.lmi import Program, form_rows, schur_lagrangian
 from reachjax.sets import Ellipsoid, NormalForm
 from reachjax.solvers.accepted import accepted_enclosure
-from reachjax.solvers.base import AbstractSolver, Enclosure
+from reachjax.solvers.base import AbstractSolver, Enclosure, SolverStatus
 from reachjax.solvers.centring import Sensitivity, sensitivity
 from reachjax.solvers.host import on_host
 
@@ -47,6 +47,9 @@ def _solve(
     solver: AbstractSolver, argument: tuple[Program, NormalForm | None]
 ) -> tuple[NormalForm, np.ndarray, np.ndarray, Enclosure]:
     program, given = argument
+    if not all(np.isfinite(part).all() for part in jax.tree.leaves(argument)):
+        blank = Enclosure.blank(program)
+        return blank.form, np.array(np.nan), np.array(False), blank
     enclosure = solver.enclose(program, given)
     return *accepted_enclosure(program, enclosure, given), enclosure
 
@@ -59,6 +62,10 @@ def _shapes(program: Program) -> tuple[NormalForm, Any, Any, Enclosure]:
     return blank.form, number, truth, blank
 
 
+def _trusted(optimal: Array, enclosure: Enclosure) -> Bool[Array, ""]:
+    return optimal & (enclosure.status == SolverStatus.SOLVED)
+
+
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _ellipsoid(solver, facts, objective, program):
     return on_host(partial(_solve, solver), _shapes(program), (program, None))
@@ -67,7 +74,7 @@ def _ellipsoid(solver, facts, objective, program):
 def _ellipsoid_forward(solver, facts, objective, program):
     result: Any = _ellipsoid(solver, facts, objective, program)
     form, _, optimal, enclosure = result
-    return result, (program, form, optimal, enclosure.multipliers)
+    return result, (program, form, _trusted(optimal, enclosure), enclosure.multipliers)
 
 
 def _ellipsoid_backward(solver, residual, cotangents):
@@ -128,7 +135,7 @@ def _size(solver, facts, objective, given, program):
 def _size_forward(solver, facts, objective, given, program):
     result: Any = _size(solver, facts, objective, given, program)
     factor, _, optimal, enclosure = result
-    return result, (program, given, factor, optimal, enclosure)
+    return result, (program, given, factor, _trusted(optimal, enclosure), enclosure)
 
 
 def _size_backward(solver, residual, cotangents):

@@ -3,7 +3,12 @@
 All are optimal values of linear programs, or volumes, found in numpy on the host together with
 their slopes: hold the multipliers `y` and the optimal point `x` fixed and differentiate the
 Lagrangian (the envelope theorem). Where a maximum is attained at more than one point, the slope is
-one of several generalised gradients.
+one of several generalised gradients; only the bounding box says NaN to the derivative in a facet's
+normal there, because it is one of many ingredients of a step, and generalised gradients of
+ingredients do not add up to one of the whole.
+
+A set that is empty, unbounded or too thin raises an error on plain arrays. Inside `jax.jit`, where
+it may come from weights that went astray in training, its values and slopes are NaN.
 """
 
 from __future__ import annotations
@@ -17,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from reachjax.checks import is_concrete, require_double_precision
 from reachjax.sets import AbstractSet, Box, PolyhedralSet, Polytope, hulls, polyhedra
 from reachjax.solvers.host import on_host
 
@@ -69,9 +75,21 @@ def _linearised(compute: Values, count: int, *arrays: Array) -> Array:
 
 
 def _forward(compute, count, *arrays):
+    require_double_precision(argument=arrays)
     values = jax.ShapeDtypeStruct((count,), float)
     slopes = tuple(jax.ShapeDtypeStruct((count, *array.shape), float) for array in arrays)
-    return on_host(lambda arguments: compute(*arguments), (values, slopes), arrays)
+    shapes, traced = (values, slopes), not is_concrete(arrays)
+
+    def computed(arguments):
+        try:
+            if all(np.isfinite(array).all() for array in arguments):
+                return compute(*arguments)
+        except (ValueError, RuntimeError):
+            if not traced:
+                raise
+        return jax.tree.map(lambda part: np.full(part.shape, np.nan), shapes)
+
+    return on_host(computed, shapes, arrays)
 
 
 def _backward(compute, count, slopes, cotangent):
@@ -83,7 +101,9 @@ _linearised.defvjp(_forward, _backward)
 
 def _box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, Slopes]:
     lower, upper, Y, points = polyhedra.bounding_box_and_multipliers(A, b)
-    return np.concatenate([-lower, upper]), (-Y[:, :, None] * points[:, None, :], Y)
+    a_vertex = (Y > 0).sum(axis=1, keepdims=True) >= A.shape[1]  # else a whole face attains the end
+    weights = np.where(a_vertex | (Y == 0), Y, np.nan)
+    return np.concatenate([-lower, upper]), (-weights[:, :, None] * points[:, None, :], Y)
 
 
 def _support(A: np.ndarray, b: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, Slopes]:

@@ -39,7 +39,7 @@ def test_the_penalty_turns_a_refuted_controller_into_a_proved_one(as_printed, tm
     assert penalised.simulated_safe_margin >= penalised.safe_margin
     assert penalised.skipped == 0
     assert np.all(penalised.hulls <= penalised.areas)
-    assert penalised.validation_error < plain.validation_error + 0.02
+    assert penalised.validation_error < 1.5 * plain.validation_error
     assert len(penalised.penalty) == 8
     assert np.all(np.diff(np.array(plain.goals, int)) <= 0)
 
@@ -82,6 +82,7 @@ def test_the_command_prints_tables_and_writes_figures_and_results(tmp_path, caps
     assert list(results["outcomes"]) == ["plain", "specification", "volume"]
     assert len(results["outcomes"]["volume"][0]["areas"]) == 6
     assert 0 < results["cost"]["solver"] < results["cost"]["forward"]
+    assert results["cost"]["both"] < 1.3 * results["cost"]["forward"]  # backward in 0.3 of forward
     assert {path.name for path in settings.output.glob("*.png")} == {"tubes.png", "seeds.png"}
 
 
@@ -91,12 +92,15 @@ def test_the_command_prints_tables_and_writes_figures_and_results(tmp_path, caps
         ({"seeds": 0}, "--seeds must be at least 1, got 0"),
         ({"workers": 0}, "--workers must be at least 1, got 0"),
         ({"every": 0}, "--every must be at least 1, got 0"),
-        ({"volume": -1.0}, r"--volume must be above 0, got -1\.0"),
-        ({"learning_rate": float("nan")}, "--learning-rate must be above 0, got nan"),
+        ({"volume": -1.0}, r"--volume must be finite and above 0, got -1\.0"),
+        ({"learning_rate": float("nan")}, "--learning-rate must be finite and above 0, got nan"),
+        ({"specification": float("inf")}, "--specification must be finite and above 0, got inf"),
+        ({"seed": -1}, "--seed must be finite and at least 0, got -1"),
+        ({"samples": 5}, "--samples must be at least 10"),
         ({"goals": ()}, "--goals must be half-widths above 0"),
         ({"goals": (0.1, 0.0)}, "--goals must be half-widths above 0"),
         ({"hidden": (10, 0)}, r"--hidden must be numbers of neurons"),
-        ({"margin": -0.1}, "--margin must be at least 0"),
+        ({"margin": -0.1}, "--margin must be finite and at least 0"),
     ],
 )
 def test_bad_settings_are_named(options, message):

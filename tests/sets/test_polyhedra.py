@@ -81,16 +81,16 @@ def test_the_largest_ball_of_an_unbounded_or_empty_polytope_is_refused():
 def test_the_margin_of_two_boxes_is_the_gap_between_their_facets(n, gap):
     A, b = cube([-1.0] * n, [1.0] * n)
     C, d = cube([1.0 + gap, *[-3.0] * (n - 1)], [5.0 + gap, *[3.0] * (n - 1)])
-    margin = polyhedra.separation(A, b, C, d)
+    margin = polyhedra.separation_and_multipliers(A, b, C, d)[0]
     assert Fraction(margin) <= Fraction(gap)
     assert margin == pytest.approx(gap, abs=1e-12)
 
 
 def test_the_margin_is_a_distance_along_normals_not_between_corners():
-    margin = polyhedra.separation(*cube([0, 0], [1, 1]), *cube([2, 2], [3, 3]))
+    margin = polyhedra.separation_and_multipliers(*cube([0, 0], [1, 1]), *cube([2, 2], [3, 3]))[0]
     assert margin == pytest.approx(1.0, abs=1e-12)
     diagonal, offset = np.array([[-1.0, -1.0]]), np.array([-4.0])  # x + y >= 4
-    margin = polyhedra.separation(*cube([0, 0], [1, 1]), diagonal, offset)
+    margin = polyhedra.separation_and_multipliers(*cube([0, 0], [1, 1]), diagonal, offset)[0]
     assert margin == pytest.approx(np.sqrt(2), abs=1e-12)
 
 
@@ -112,5 +112,6 @@ def test_the_margin_is_that_of_a_convex_program(n, seed, distance):
     x = cp.Variable(n)
     excess = cp.max(cp.multiply(1 / np.linalg.norm(C, axis=1), C @ x - d))
     expected = cp.Problem(cp.Minimize(excess), [first.A @ x <= first.b]).solve(solver="CLARABEL")
-    assert polyhedra.separation(first.A, first.b, C, d) == pytest.approx(expected, abs=1e-6)
+    margin = polyhedra.separation_and_multipliers(first.A, first.b, C, d)[0]
+    assert margin == pytest.approx(expected, abs=1e-6)
     assert distance not in (0.0, 4.0) or (expected > 0) == (distance == 4.0)

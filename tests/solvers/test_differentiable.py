@@ -218,34 +218,143 @@ def test_forward_mode_and_second_derivatives_raise():
         jax.hessian(of)(loop.plant.c)
 
 
-@pytest.mark.parametrize("status", [s for s in rj.SolverStatus if s > rj.SolverStatus.INACCURATE])
-def test_a_status_without_an_optimal_value_has_no_number_for_a_gradient(status):
+@pytest.mark.parametrize("n", [1, 3])
+def test_the_gradient_is_the_central_difference_in_other_dimensions(n):
+    region = box_region(n, seed=n)
+    X0 = rj.Box(region.corners.min(axis=0), region.corners.max(axis=0))
+    args = (closed_loop(random_loop(n, hidden=(4, 3), seed=n)), X0)
+    template = rj.Template.box(n)
+
+    def f(loop, X0):
+        return jnp.linspace(0.5, 2.0, 2 * n) @ rj.reach(loop, X0, 2, template).sets[2].b
+
+    gradient = jax.jit(jax.grad(f, argnums=(0, 1)))(*args)
+    for part in PARTS:
+        error = relative_error(jax.jit(f), args, gradient, along(part, *args, 0), STEP)
+        assert error <= PROMISED, part
+
+
+FORKED = rj.MLP.from_layers(
+    [([[1.0, 0.5], [-1.0, 0.3], [0.4, -1.0]], [0.1, 0.2, -0.7]), ([[-0.3, 0.3, 0.5]], [0.0])]
+)
+INTEGRATOR = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
+
+
+@pytest.mark.parametrize("widths", [(1e-3, 0.5), (1e-6, 0.5), (0.0, 0.5), (0.0, 0.0)])
+def test_flat_and_thin_sets_and_points_have_gradients(widths):
+    """Of where they are, and of the loop: not of the width, which has a kink at zero."""
+
+    def f(loop, position):
+        X0 = rj.Box(position, position + jnp.array(widths))
+        return rj.reach(loop, X0, 2, rj.Template.box(2)).sets[2].b @ jnp.array([1.0, 2.0, 3.0, 4.0])
+
+    args = (rj.ClosedLoop(INTEGRATOR, FORKED), jnp.array([2.0, -0.25]))
+    gradient, rng = jax.grad(f, argnums=(0, 1))(*args), np.random.default_rng(0)
+    for _ in range(3):
+        direction = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), args)
+        assert relative_error(f, args, gradient, direction, STEP) <= PROMISED
+
+
+def test_a_coordinate_that_becomes_constant_has_a_gradient():
+    plant = rj.AffinePlant([[1.0, 1.0], [0.0, 0.0]], [[0.5], [0.0]], [0.0, 0.3])
+
+    def f(c):
+        loop = rj.ClosedLoop(plant.replace(c=c), FORKED)
+        return rj.reach(loop, rj.Box([2.0, -0.25], [2.5, 0.25]), 3, rj.Template.box(2)).sets[3].b
+
+    slopes, h = jax.jacrev(f)(plant.c), 1e-4
+    for k in range(2):
+        move = jnp.zeros(2).at[k].set(h)
+        np.testing.assert_allclose(
+            slopes[:, k], (f(plant.c + move) - f(plant.c - move)) / (2 * h), atol=1e-5
+        )
+
+
+def test_an_input_range_of_zero_width_has_a_one_sided_gradient():
+    def f(lower, upper):
+        loop = rj.ClosedLoop(INTEGRATOR, FORKED, input_box=rj.Box(lower, upper))
+        return rj.reach(loop, rj.Box([2.5, -0.25], [3.0, 0.25]), 2, rj.Template.box(2)).sets[2].b[0]
+
+    zero, h = jnp.zeros(1), 1e-6
+    gradient = jax.grad(f, argnums=(0, 1))(zero, zero)
+    np.testing.assert_allclose(gradient[0], (f(zero, zero) - f(zero - h, zero)) / h, atol=1e-4)
+    np.testing.assert_allclose(gradient[1], (f(zero, zero + h) - f(zero, zero)) / h, atol=1e-4)
+
+
+def test_normals_have_a_derivative_where_bounds_are_attained_at_corners():
+    loop, X0 = planar(1, polytope=True)
+
+    def f(A):
+        return WEIGHTS @ rj.reach(loop, rj.Polytope(A, X0.b), 1, TEMPLATE).sets[1].b
+
+    gradient, direction = (
+        jax.grad(f)(X0.A),
+        jnp.asarray(np.random.default_rng(0).normal(size=X0.A.shape)),
+    )
+    assert relative_error(f, (X0.A,), (gradient,), (direction,), STEP) <= PROMISED
+    square = rj.Polytope(*rj.Box([0.0, 0.0], [1.0, 1.0]).facets)
+    sides = jax.grad(lambda A: rj.reach(loop, rj.Polytope(A, square.b), 1, TEMPLATE).sets[1].b[0])
+    assert np.isnan(sides(square.A)).all()  # each bound is attained on a whole side
+
+
+UNTRUSTED = [status for status in rj.SolverStatus if status is not rj.SolverStatus.SOLVED]
+
+
+@pytest.mark.parametrize("status", UNTRUSTED)
+def test_a_status_other_than_solved_has_no_number_for_a_gradient(status):
     loop, X0 = planar(0)
     bound, gradient = jax.value_and_grad(value)(loop, X0, solver=Ending(status))
     assert np.isfinite(bound)
     assert not any(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient.controller))
 
 
-def test_multipliers_that_do_not_bear_the_claim_out_have_no_number_for_a_gradient():
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"multipliers": 0.5},
+        {"moments": -3.0},
+        {"moments": 0.99},
+        {"moments": np.nan},
+        {"offsets": 1.1},
+        {"offsets": 0.9},
+    ],
+    ids=str,
+)
+def test_a_claim_that_is_not_borne_out_has_no_number_for_a_gradient(changes):
     loop, X0 = planar(0)
-    solver = Ending(rj.SolverStatus.SOLVED, times=0.5)
+    solver = Ending(rj.SolverStatus.SOLVED, **changes)
     bound, gradient = jax.value_and_grad(value)(loop, X0, solver=solver)
-    assert bound > value(loop, X0)
+    assert bound >= value(loop, X0) - 1e-6
     assert not any(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient.controller))
+    if "multipliers" not in changes:  # what they prove is reported, not the claim
+        assert bound == pytest.approx(float(value(loop, X0)), abs=1e-5)
+
+
+def test_what_a_solver_proposes_has_no_derivative():
+    loop, X0 = planar(0)
+
+    def claimed(loop):
+        return rj.reach(loop, X0, 1, TEMPLATE).proof(1).solver_offsets.sum()
+
+    assert all(np.isnan(leaf).any() for leaf in jax.tree.leaves(jax.grad(claimed)(loop).controller))
 
 
 @dataclasses.dataclass(frozen=True)
 class Ending(rj.AbstractSolver):
-    """Clarabel, reporting another status, its multipliers off by a factor."""
+    """Clarabel, reporting another status, and what it found times a factor."""
 
     status: rj.SolverStatus
-    times: float = 1.0
+    multipliers: float = 1.0
+    moments: float = 1.0
+    offsets: float = 1.0
 
     def solve(self, program):
         solution = rj.Clarabel().solve(program)
         return solution._replace(
             statuses=np.full_like(solution.statuses, self.status),
-            multipliers=self.times * solution.multipliers,
+            multipliers=self.multipliers * solution.multipliers,
+            moments=self.moments * solution.moments,
+            offsets=solution.offsets + (self.offsets - 1) * abs(solution.offsets).max(),
         )
 
 

@@ -1,0 +1,107 @@
+"""When a training loop computes a penalty, and what it weighs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.checks import described, is_concrete, real_number, whole_number
+from reachjax.pytrees import Replaceable
+
+
+@dataclasses.dataclass(frozen=True)
+class PenaltySchedule(Replaceable):
+    """At which training steps a penalty is computed, and what it weighs there.
+
+    Semidefinite programs cost much more than a pass over a batch, so a penalty may be computed
+    every few steps only; the weight is that of the steps at which it is.
+
+    Args:
+        weight: once the ramp is over.
+        every: the penalty is computed at one step in so many.
+        warmup: steps before the first penalty, to train without.
+        ramp: steps after the warm-up over which the weight grows linearly.
+
+    Raises:
+        TypeError, ValueError: a number is of another kind, or too small.
+
+    Example:
+        >>> schedule = PenaltySchedule(weight=2.0, every=5, warmup=10, ramp=20)
+        >>> [float(schedule(step)) for step in (0, 10, 11, 15, 30)]
+        [0.0, 0.1, 0.0, 0.6, 2.0]
+    """
+
+    weight: float
+    every: int = 1
+    warmup: int = 0
+    ramp: int = 0
+
+    def __post_init__(self):
+        self._set(
+            weight=real_number("PenaltySchedule.weight", self.weight, least=0.0),
+            every=whole_number("PenaltySchedule.every", self.every, 1),
+            warmup=whole_number("PenaltySchedule.warmup", self.warmup, 0),
+            ramp=whole_number("PenaltySchedule.ramp", self.ramp, 0),
+        )
+
+    def __call__(self, step: int | Array) -> Float[Array, ""]:
+        """The weight at a training step, counted from 0; zero where nothing is computed.
+
+        Raises:
+            TypeError: the step is no whole number.
+            ValueError: it is negative.
+        """
+        if is_concrete(step) and np.ndim(step) == 0:
+            whole_number("step", step, 0)
+        since = jnp.asarray(step) - self.warmup
+        computed = (since >= 0) & (since % self.every == 0)
+        grown = jnp.minimum(1.0, (since + 1) / max(self.ramp, 1))
+        return jnp.where(computed, self.weight * grown, 0.0)
+
+    def apply(
+        self, step: int | Array, penalty: Callable[..., Float[Array, ""]], *arguments: Any
+    ) -> Float[Array, ""]:
+        """`weight * penalty(*arguments)` at the steps that have a weight, zero at the others.
+
+        At the others nothing is solved, also inside `jax.jit`, where the step may be traced.
+
+        Args:
+            step: the training step, counted from 0.
+            penalty: a function that gives one number.
+            arguments: what it is called with.
+
+        Raises:
+            TypeError: the step is no whole number, or the penalty is no function.
+            ValueError: the step is no single number, or the penalty gives none.
+
+        Example:
+            >>> schedule = PenaltySchedule(weight=2.0, every=5)
+            >>> [float(schedule.apply(step, lambda x: x**2, 3.0)) for step in (0, 1, 5)]
+            [18.0, 0.0, 18.0]
+        """
+        if not callable(penalty):
+            raise TypeError(f"penalty must be a function, but {described(penalty)} arrived")
+        weight = self(step)
+        if weight.shape != ():
+            raise ValueError(f"step must be one number, but one of shape {weight.shape} arrived")
+
+        def weighed(*arguments):
+            value = jnp.asarray(penalty(*arguments))
+            if value.shape != ():
+                raise ValueError(
+                    f"penalty must give one number, but an array of shape {value.shape} arrived"
+                )
+            return (weight * value).astype(weight.dtype)
+
+        def nothing(*_):
+            return jnp.zeros_like(weight)
+
+        if is_concrete(weight):
+            return (weighed if weight > 0 else nothing)(*arguments)
+        return jax.lax.cond(weight > 0, weighed, nothing, *arguments)

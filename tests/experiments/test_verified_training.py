@@ -39,7 +39,7 @@ def test_the_penalty_turns_a_refuted_controller_into_a_proved_one(as_printed, tm
     assert penalised.simulated_safe_margin >= penalised.safe_margin
     assert penalised.skipped == 0
     assert np.all(penalised.hulls <= penalised.areas)
-    assert penalised.validation_error < 1.5 * plain.validation_error
+    assert penalised.validation_error < 0.02  # of inputs in [-1, 1], after 24 steps only
     assert len(penalised.penalty) == 8
     assert np.all(np.diff(np.array(plain.goals, int)) <= 0)
 

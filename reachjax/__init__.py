@@ -9,11 +9,20 @@ Turn on 64-bit floats before building networks and sets::
 """
 
 from reachjax.basis import ChangeOfBasis, change_of_basis
-from reachjax.certificates import Certificate
+from reachjax.certificates import AbstractCertificate, Certificate, EllipsoidCertificate
 from reachjax.reach import ReachTube, reach, reach_step
 from reachjax.relaxation import AbstractRelaxation, LocalBounds, PaperQC
 from reachjax.requirements import shortfall
-from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet, Polytope, Template
+from reachjax.sets import (
+    AbstractSet,
+    AbstractTemplate,
+    Box,
+    Ellipsoid,
+    EllipsoidTemplate,
+    PolyhedralSet,
+    Polytope,
+    Template,
+)
 from reachjax.sizes import log_volume, log_widths, volume
 from reachjax.solvers import SCS, AbstractSolver, Clarabel, CvxpySolver, SolverStatus
 from reachjax.specs import Counterexample, Verdict, VerdictStatus, verify
@@ -40,9 +49,11 @@ __all__ = [
     "MLP",
     "SCS",
     "AbstractActivation",
+    "AbstractCertificate",
     "AbstractRelaxation",
     "AbstractSet",
     "AbstractSolver",
+    "AbstractTemplate",
     "AffinePlant",
     "Box",
     "Certificate",
@@ -52,6 +63,8 @@ __all__ = [
     "Counterexample",
     "CvxpySolver",
     "Ellipsoid",
+    "EllipsoidCertificate",
+    "EllipsoidTemplate",
     "LocalBounds",
     "PaperQC",
     "PenaltySchedule",

@@ -7,17 +7,48 @@ trajectories; the true support of the reachable set lies between witness and bou
 
 from __future__ import annotations
 
+import abc
+
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.lmi import Program, scaling
 from reachjax.pytrees import Replaceable, pytree
-from reachjax.solvers import Solution, SolverStatus, accepted_offsets
+from reachjax.recheck import sound_level
+from reachjax.sets import Ellipsoid, NormalForm
+from reachjax.solvers import Enclosure, Solution, SolverStatus, accepted_offsets
+
+
+class AbstractCertificate(Replaceable, abc.ABC):
+    """What the proof of one step's set has, whatever the set: see its two kinds."""
+
+    program: Program
+    multipliers: Float[Array | np.ndarray, "f K"]
+    moments: Float[Array | np.ndarray, "f n n"]
+    codes: Int[Array | np.ndarray, " f"]
+    bounds: Float[Array | np.ndarray, " f"]
+    witnesses: Float[Array | np.ndarray, " f"]
+    witness_states: Float[Array | np.ndarray, "f n_x"]
+    seconds: Float[Array | np.ndarray, " f"]
+
+    @property
+    def statuses(self) -> tuple[SolverStatus, ...]:
+        """How the solver ended on each program; each has a sentence of `advice`."""
+        return tuple(SolverStatus(int(code)) for code in self.codes)
+
+    @property
+    def gaps(self) -> Float[Array | np.ndarray, " f"]:
+        """`bounds - witnesses`: how much tightness may be left; negative by rounding at most."""
+        return self.bounds - self.witnesses
+
+    @abc.abstractmethod
+    def recheck(self, multipliers: Float[np.ndarray, "f K"] | None = None) -> np.ndarray:
+        """Prove the bounds anew, from the program and these or other multipliers."""
 
 
 @pytree
-class Certificate(Replaceable):
+class Certificate(AbstractCertificate):
     """Proof of the offsets of one step, `directions x[t] <= bounds`.
 
     Attributes:
@@ -65,16 +96,6 @@ class Certificate(Replaceable):
     def __repr__(self) -> str:
         return f"Certificate(facets={len(self.bounds)}, products={self.multipliers.shape[-1]})"
 
-    @property
-    def statuses(self) -> tuple[SolverStatus, ...]:
-        """How the solver ended on each facet; each has a sentence of `advice`."""
-        return tuple(SolverStatus(int(code)) for code in self.codes)
-
-    @property
-    def gaps(self) -> Float[Array | np.ndarray, " f"]:
-        """`bounds - witnesses`: how much tightness may be left; negative by rounding at most."""
-        return self.bounds - self.witnesses
-
     def recheck(
         self, multipliers: Float[np.ndarray, "f K"] | None = None
     ) -> Float[np.ndarray, " f"]:
@@ -99,3 +120,80 @@ class Certificate(Replaceable):
         proposed = self.multipliers if multipliers is None else multipliers
         solution = Solution(self.solver_offsets, proposed, self.moments, self.codes, self.seconds)
         return accepted_offsets(jax.device_get(self.program), solution)[0]
+
+
+@pytree
+class EllipsoidCertificate(AbstractCertificate):
+    """Proof of the ellipsoid of one step, `|A x[t] + b| <= 1`: one program, so `f = 1`.
+
+    Attributes:
+        program: facts, products and the rows of the successor over the scaled basis.
+        form: `A` and `b` of the set.
+        multipliers: `(1, K)`.
+        moments: `(1, n, n)`, the dual matrix over the unscaled basis with corner 1; NaN where the
+            solver gave none.
+        codes: `(1,)`, how the solver ended, as a value of `SolverStatus`.
+        bounds: `(1,)`, what `|A x + b|` surely does not exceed: 1.
+        witnesses: `(1,)`, its largest simulated value.
+        witness_states: `(1, n_x)`, the initial state that attains it.
+        seconds: `(1,)`, solver time.
+    """
+
+    program: Program
+    form: NormalForm
+    multipliers: Float[Array | np.ndarray, "1 K"]
+    moments: Float[Array | np.ndarray, "1 n n"]
+    codes: Int[Array | np.ndarray, " 1"]
+    bounds: Float[Array | np.ndarray, " 1"]
+    witnesses: Float[Array | np.ndarray, " 1"]
+    witness_states: Float[Array | np.ndarray, "1 n_x"]
+    seconds: Float[Array | np.ndarray, " 1"]
+
+    @classmethod
+    def from_enclosure(
+        cls, program: Program, region: Ellipsoid, enclosure: Enclosure
+    ) -> EllipsoidCertificate:
+        """What was proved with what a solver proposed; witnesses are not known yet (NaN)."""
+        T, n = scaling(program.shift, program.scale), program.scale.shape[0]
+        moments = enclosure.moments[:n, :n] / enclosure.moments[n - 1, n - 1]
+        return cls(
+            program=program,
+            form=region.normal_form,
+            multipliers=enclosure.multipliers[None],
+            moments=(T @ moments @ T.T)[None],
+            codes=enclosure.status[None],
+            bounds=np.ones(1),
+            witnesses=np.full(1, np.nan),
+            witness_states=np.full((1, 0), np.nan),
+            seconds=enclosure.seconds[None],
+        )
+
+    def __repr__(self) -> str:
+        return f"EllipsoidCertificate(products={self.multipliers.shape[-1]})"
+
+    def recheck(
+        self, multipliers: Float[np.ndarray, "1 K"] | None = None
+    ) -> Float[np.ndarray, " 1"]:
+        """What `|A x + b|` surely does not exceed, by these or other multipliers.
+
+        Sound for any multipliers; for the certificate's own it is 1 at most, but for rounding.
+
+        Raises:
+            ValueError: the multipliers contain NaN or infinity, or have another shape.
+
+        Example:
+            >>> from reachjax import AffinePlant, ClosedLoop, EllipsoidTemplate, MLP, reach_step
+            >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+            >>> X0 = Ellipsoid([1.0], [[1.0]])
+            >>> following, certificate = reach_step(loop, X0, EllipsoidTemplate())
+            >>> following.shape.round(6).tolist(), certificate.recheck().round(6).tolist()
+            ([[0.25]], [1.0])
+        """
+        proposed = np.asarray(self.multipliers if multipliers is None else multipliers)
+        if proposed.shape != self.multipliers.shape:
+            raise ValueError(
+                f"multipliers must have shape {self.multipliers.shape} (1, products), "
+                f"but {proposed.shape} arrived"
+            )
+        form = jax.device_get(self.form)
+        return np.array([sound_level(jax.device_get(self.program), proposed[0], form)])

@@ -29,7 +29,7 @@ from reachjax.bounds import LoopBounds, loop_bounds
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.relaxation import AbstractRelaxation, FactLayout, Products
 from reachjax.rounding import Ball, gamma
-from reachjax.sets import AbstractSet, Box, NormalForm, Template
+from reachjax.sets import AbstractSet, Box, NormalForm
 from reachjax.systems import ClosedLoop
 
 CONSTANT = 1e-9
@@ -118,23 +118,24 @@ def step_program(
     loop: ClosedLoop,
     X: AbstractSet,
     box: Box,
-    template: Template,
+    directions: Float[Array, "f n_x"],
     t: int,
     relaxation: AbstractRelaxation,
 ) -> Program:
     """Theorem 1 for every facet of the successors of `X` at time `t`, over the scaled basis.
 
-    Compiled once for a loop's shape, a number of facets and a relaxation.
+    Compiled once for a loop's shape, a number of facets and a relaxation. With the identity for
+    directions, the objective rows are the successor: the program of an ellipsoid.
 
     Args:
         loop: the closed loop.
         X: the set of states at time `t`.
         box: a box around it.
-        template: the facet directions.
+        directions: one row for each facet.
         t: the time.
         relaxation: which products of facts are used.
     """
-    return _step_program(loop, X.facts(), X.cone_facts(), box, template.directions, t, relaxation)
+    return _step_program(loop, X.facts(), X.cone_facts(), box, directions, t, relaxation)
 
 
 @partial(jax.jit, static_argnames="relaxation")

@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.certificates import Certificate
+from reachjax.certificates import AbstractCertificate
 from reachjax.checks import (
     described,
     is_concrete,
@@ -20,11 +19,11 @@ from reachjax.checks import (
     same_size,
     whole_number,
 )
-from reachjax.lmi import step_program
 from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, LocalBounds
-from reachjax.sets import AbstractSet, Box, Polytope, Template
-from reachjax.solvers import AbstractSolver, Clarabel, bounding_box, proved_offsets
+from reachjax.sets import AbstractSet, AbstractTemplate, Template
+from reachjax.solvers import AbstractSolver, Clarabel
+from reachjax.successors import Step
 from reachjax.systems import ClosedLoop
 from reachjax.witnesses import initial_states, proposed_states, witnesses
 
@@ -36,7 +35,7 @@ SAMPLES = 1000
 EXAMPLES = {
     ClosedLoop: "a ClosedLoop",
     AbstractSet: "a set such as Box(lower, upper) or Polytope(A, b)",
-    Template: "a Template, such as Template.box(n)",
+    AbstractTemplate: "a template, such as Template.box(n) or EllipsoidTemplate()",
     AbstractRelaxation: "a relaxation object, such as LocalBounds()",
     AbstractSolver: "a solver object, such as Clarabel()",
 }
@@ -48,28 +47,30 @@ class ReachTube(Replaceable):
 
     Attributes:
         loop: the loop they were computed for.
-        template: the facet directions.
+        template: what the sets look like: facet directions, or ellipsoids.
         sets: `sets[t]` for `t = 0 .. horizon`; `sets[0]` is the initial set.
         certificates: `certificates[t]` for `t = 1 .. horizon`; the first entry is `None`.
         start: the time of the initial set, for time-varying loops.
     """
 
     loop: ClosedLoop
-    template: Template
+    template: AbstractTemplate
     sets: tuple[AbstractSet, ...]
-    certificates: tuple[Certificate | None, ...]
+    certificates: tuple[AbstractCertificate | None, ...]
     start: int = static(default=0)
 
     def __repr__(self) -> str:
-        size = f"horizon={self.horizon}, facets={len(self.template)}, states={self.loop.states}"
-        return f"ReachTube({size})"
+        sort = (
+            f"facets={len(self.template)}" if isinstance(self.template, Template) else "ellipsoids"
+        )
+        return f"ReachTube(horizon={self.horizon}, {sort}, states={self.loop.states})"
 
     @property
     def horizon(self) -> int:
         """The number of steps."""
         return len(self.sets) - 1
 
-    def proof(self, t: int) -> Certificate:
+    def proof(self, t: int) -> AbstractCertificate:
         """The certificate of `sets[t]`.
 
         Raises:
@@ -89,20 +90,20 @@ class ReachTube(Replaceable):
 def reach_step(
     loop: ClosedLoop,
     X: AbstractSet,
-    template: Template,
+    template: AbstractTemplate,
     *,
     t: int = 0,
     relaxation: AbstractRelaxation = LocalBounds(),  # noqa: B008  (immutable)
     solver: AbstractSolver = Clarabel(),  # noqa: B008
     samples: int = SAMPLES,
     seed: int = 0,
-) -> tuple[Polytope, Certificate]:
-    """The polytope that contains every successor of a set, and its certificate.
+) -> tuple[AbstractSet, AbstractCertificate]:
+    """A set that surely contains every successor of a set, and its certificate.
 
     Args:
         loop: the closed loop.
         X: the set of states at time `t`.
-        template: the facet directions.
+        template: what the sets look like: facet directions, or ellipsoids.
         t: the time, for time-varying loops.
         relaxation: which products of facts are used.
         solver: what solves the semidefinite programs.
@@ -114,7 +115,7 @@ def reach_step(
         TypeError: an argument is of another kind.
         ValueError: dimensions disagree, the set is empty or unbounded, or `t` is beyond the loop.
 
-    Source: theorem 1 and problem (sdp::poly) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
+    Source: theorem 1 and problems (sdp::poly) and (sdp::ellips) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 
     Example:
         >>> from reachjax import MLP, AffinePlant, Box
@@ -125,16 +126,14 @@ def reach_step(
         [1.2, -0.6]
     """
     tube = reach(loop, X, 1, template, relaxation, 1, solver, start=t, samples=samples, seed=seed)
-    following = tube.sets[1]
-    assert isinstance(following, Polytope)
-    return following, tube.proof(1)
+    return tube.sets[1], tube.proof(1)
 
 
 def reach(
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
-    template: Template,
+    template: AbstractTemplate,
     relaxation: AbstractRelaxation = LocalBounds(),  # noqa: B008  (immutable)
     window: int = 1,
     solver: AbstractSolver = Clarabel(),  # noqa: B008
@@ -150,7 +149,7 @@ def reach(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number `N` of steps.
-        template: the facet directions of every set.
+        template: what every set looks like: facet directions, or ellipsoids.
         relaxation: which products of facts are used.
         window: over how many steps each program reaches back; 1 is the paper's recursion.
         solver: what solves the semidefinite programs.
@@ -186,44 +185,29 @@ def reach(
     """
     _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
     sets: list[AbstractSet] = [X0]
-    certificates: list[Certificate] = []
+    certificates: list[AbstractCertificate] = []
     steps = range(horizon)
     for k in steps if progress is None else progress(steps):
-        box = _bounded(sets[-1], "X0" if k == 0 else f"the certified set at t = {start + k}")
-        program = step_program(loop, sets[-1], box, template, start + k, relaxation)
-        bounds, solution = proved_offsets(program, solver)
-        if is_concrete(bounds) and not np.isfinite(bounds).all():
-            raise ValueError(
-                f"the loop's states at t = {start + k + 1} overflow or are not numbers: check the "
-                "weights of loop.controller and the entries of loop.plant"
-            )
-        certificates.append(Certificate.from_solution(program, bounds, solution))
-        sets.append(template.polytope(bounds))
+        name = "X0" if k == 0 else f"the certified set at t = {start + k}"
+        step = Step(loop, sets[-1], start + k, relaxation, solver, name)
+        following, certificate = step.successors(template)
+        sets.append(following)
+        certificates.append(certificate)
     if is_concrete(loop, X0, certificates):
-        certificates = _with_witnesses(certificates, loop, X0, template, start, samples, seed)
+        certificates = _with_witnesses(certificates, sets, loop, start, samples, seed)
     return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
 
 
-def _bounded(X: AbstractSet, name: str) -> Box:
-    """The box around a set.
-
-    Raises:
-        ValueError: the set is empty or unbounded, or seems so because its numbers are so large.
-    """
-    try:
-        return bounding_box(X)
-    except (ValueError, RuntimeError) as error:
-        raise ValueError(f"{name} cannot be used: {error}") from None
-
-
-def _with_witnesses(certificates, loop, X0, template, start, samples, seed) -> list[Certificate]:
+def _with_witnesses(
+    certificates: list[AbstractCertificate], sets: list[AbstractSet], loop, start, samples, seed
+) -> list[AbstractCertificate]:
     """Simulate what the certificates bound, from the initial set."""
-    states = initial_states(X0, samples, seed)
-    states = jnp.concatenate([states, proposed_states(X0, certificates[0].moments)])
-    values, origins = witnesses(loop, states, template.directions, len(certificates), start)
+    states = initial_states(sets[0], samples, seed)
+    states = jnp.concatenate([states, proposed_states(sets[0], certificates[0].moments)])
+    found = witnesses(loop, states, sets[1:], start)
     return [
-        certificate.replace(witnesses=values[k], witness_states=origins[k])
-        for k, certificate in enumerate(certificates)
+        certificate.replace(witnesses=values, witness_states=origins)
+        for certificate, (values, origins) in zip(certificates, found, strict=True)
     ]
 
 
@@ -233,7 +217,7 @@ def _check(
     for name, value, kind in (
         ("loop", loop, ClosedLoop),
         ("X0", X0, AbstractSet),
-        ("template", template, Template),
+        ("template", template, AbstractTemplate),
         ("relaxation", relaxation, AbstractRelaxation),
         ("solver", solver, AbstractSolver),
     ):
@@ -246,7 +230,7 @@ def _check(
     same_size(
         "the loop's number of states is",
         "the dimension of template is",
-        (loop.states, template.dimension),
+        (loop.states, template.dimension or loop.states),
     )
     loop.check_horizon(horizon, start)
     if progress is not None and not callable(progress):

@@ -8,6 +8,7 @@ the dual of a semidefinite program proposes.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -56,15 +57,17 @@ def proposed_states(X0: AbstractSet, moments: np.ndarray) -> Float[Array, "f n_x
 def witnesses(
     loop: ClosedLoop,
     states: Float[Array, "c n_x"],
-    directions: Float[Array, "f n_x"],
-    horizon: int,
+    sets: Sequence[AbstractSet],
     start: int = 0,
-) -> tuple[Float[np.ndarray, "h f"], Float[np.ndarray, "h f n_x"]]:
-    """The largest value of each direction at times `1 .. horizon`, and the initial states.
+) -> list[tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n_x"]]]:
+    """The largest value of everything that sets bound at times `1, 2, ...`.
 
     Returns:
-        Values `(horizon, f)` and initial states `(horizon, f, n_x)`.
+        For each set the values `(m,)` and the initial states `(m, n_x)` that attain them.
     """
-    trajectories = loop.simulate(states, horizon, start)[:, 1:]
-    values = np.asarray(trajectories @ directions.T)
-    return values.max(axis=0), np.asarray(states)[values.argmax(axis=0)]
+    trajectories = loop.simulate(states, len(sets), start)
+    found = []
+    for t, region in enumerate(sets, start=1):
+        values = np.asarray(region.bounded_values(trajectories[:, t]))
+        found.append((values.max(axis=0), np.asarray(states)[values.argmax(axis=0)]))
+    return found

@@ -24,7 +24,7 @@ STATES = [1, 2, 3, 6]
 def program_of(data, X, relaxation, t=0):
     template = rj.Template(directions(X.dimension, extra=2))
     return jax.device_get(
-        step_program(closed_loop(data), X, X.bounding_box(), template, t, relaxation)
+        step_program(closed_loop(data), X, X.bounding_box(), template.directions, t, relaxation)
     )
 
 
@@ -180,8 +180,8 @@ def test_a_program_compiles_once_for_new_weights_sets_and_times():
     data = random_loop(2, hidden=(4,), steps=3)
     template, relaxation = rj.Template.octagonal(2), rj.LocalBounds()
     loop = closed_loop(data)
-    step_program(loop, X := rj.Box([0, 0], [1, 1]), X, template, 0, relaxation)
+    step_program(loop, X := rj.Box([0, 0], [1, 1]), X, template.directions, 0, relaxation)
     before = _step_program._cache_size()
     other = loop.replace(controller=jax.tree.map(lambda w: 2 * w, loop.controller))
-    step_program(other, X := rj.Box([0, 0], [1e-3, 1e-3]), X, template, 1, relaxation)
+    step_program(other, X := rj.Box([0, 0], [1e-3, 1e-3]), X, template.directions, 1, relaxation)
     assert _step_program._cache_size() == before

@@ -22,7 +22,12 @@ def case(request):
     X, template = rj.Polytope(region.A, region.b), rj.Template(directions(n_x, extra=1))
     program = jax.device_get(
         step_program(
-            closed_loop(data), X, X.bounding_box(), template, 0, rj.LocalBounds(remove_stable=False)
+            closed_loop(data),
+            X,
+            X.bounding_box(),
+            template.directions,
+            0,
+            rj.LocalBounds(remove_stable=False),
         )
     )
     states = np.vstack([region.corners, region.sample(20_000, seed=0)])
@@ -96,7 +101,9 @@ def test_the_recheck_of_a_solved_program_costs_next_to_nothing(n_x):
     region = box_region(n_x, seed=n_x)
     X, template = rj.Polytope(region.A, region.b), rj.Template(directions(n_x, extra=1))
     loop = closed_loop(random_loop(n_x, seed=n_x))
-    program = jax.device_get(step_program(loop, X, X.bounding_box(), template, 0, rj.LocalBounds()))
+    program = jax.device_get(
+        step_program(loop, X, X.bounding_box(), template.directions, 0, rj.LocalBounds())
+    )
     solution = rj.Clarabel(tolerance=1e-9).solve(program)
     solved = solution.statuses == rj.SolverStatus.SOLVED
     excess = sound_offsets(program, solution.multipliers) - solution.offsets

@@ -4,6 +4,16 @@ from reachjax.sets.base import AbstractSet, PolyhedralSet
 from reachjax.sets.box import Box
 from reachjax.sets.ellipsoid import Ellipsoid, NormalForm
 from reachjax.sets.polytope import Polytope
-from reachjax.sets.template import Template
+from reachjax.sets.template import AbstractTemplate, EllipsoidTemplate, Template
 
-__all__ = ["AbstractSet", "Box", "Ellipsoid", "NormalForm", "PolyhedralSet", "Polytope", "Template"]
+__all__ = [
+    "AbstractSet",
+    "AbstractTemplate",
+    "Box",
+    "Ellipsoid",
+    "EllipsoidTemplate",
+    "NormalForm",
+    "PolyhedralSet",
+    "Polytope",
+    "Template",
+]

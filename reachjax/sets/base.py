@@ -39,6 +39,10 @@ class AbstractSet(Replaceable, abc.ABC):
         return jnp.zeros((0, self.dimension + 1))
 
     @abc.abstractmethod
+    def bounded_values(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch m"]:
+        """What the set bounds, at each point: `A x` (by `b`), or `|A x + b|` (by 1)."""
+
+    @abc.abstractmethod
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
 
@@ -97,6 +101,10 @@ class PolyhedralSet(AbstractSet):
         A, b = self.facets
         x = self._points(point)
         return bool(jnp.all(A @ x + gamma(self.dimension) * (abs(A) @ abs(x)) <= b))
+
+    def bounded_values(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch m"]:
+        """`A x` of each facet."""
+        return self._points(points) @ self.facets[0].T
 
     def facts(self) -> Float[Array, "m n+1"]:
         """The rows `[-a, b]`: a facet's slack `b - a . x` is never negative."""

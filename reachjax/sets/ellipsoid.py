@@ -151,12 +151,16 @@ class Ellipsoid(AbstractSet):
         rounding = gamma(n + 4) * (abs(D) @ abs(q) + reach)
         return D @ q + reach + rounding
 
+    def bounded_values(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch 1"]:
+        """`|A x + b|`, at most 1 on the set."""
+        A, _ = self.normal_form
+        return jnp.linalg.norm((self._points(points) - self.center) @ A.T, axis=-1, keepdims=True)
+
     def contains(
         self, points: Float[ArrayLike, "*batch n"], tolerance: float = 0.0
     ) -> Bool[Array, "*batch"]:
         """Whether `|A x + b| <= 1 + tolerance` for each point."""
-        A, _ = self.normal_form
-        return jnp.linalg.norm((self._points(points) - self.center) @ A.T, axis=-1) <= 1 + tolerance
+        return self.bounded_values(points)[..., 0] <= 1 + tolerance
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the set in exact arithmetic; False where rounding may decide.

@@ -1,7 +1,8 @@
-"""Templates: the facet normals of the polytopes that reachability computes."""
+"""Templates: what the sets that reachability computes look like, polytopes or ellipsoids."""
 
 from __future__ import annotations
 
+import abc
 import itertools
 
 import jax.numpy as jnp
@@ -10,11 +11,21 @@ from jaxtyping import Array, Float
 
 from reachjax.checks import Numbers, is_concrete, whole_number
 from reachjax.pytrees import Replaceable, converted, pytree
+from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polytope import Polytope
 
 
+class AbstractTemplate(Replaceable, abc.ABC):
+    """A family of sets, of which reachability finds the smallest that surely hold the states."""
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int | None:
+        """The number of coordinates; None if it is that of the loop."""
+
+
 @pytree
-class Template(Replaceable):
+class Template(AbstractTemplate):
     """Facet directions: the matrix `A` of the paper's problem (sdp::poly), whose `b` is sought.
 
     Args:
@@ -78,6 +89,40 @@ class Template(Replaceable):
         whole_number("facets", facets, 3)
         angles = 2 * np.pi * np.arange(facets) / facets
         return cls(np.stack([np.cos(angles), np.sin(angles)], axis=1))
+
+
+@pytree
+class EllipsoidTemplate(AbstractTemplate):
+    """Ellipsoids: of minimum volume, the paper's problem (sdp::ellips), or of a given shape.
+
+    Args:
+        shape: `(n, n)`, symmetric and positive definite, up to a factor. Only the size is then
+            sought, around the successor of the centre; the sets are larger, and their derivatives
+            exact. None for the ellipsoid of minimum volume, whose derivative is that of a point
+            close to it (see `reachjax.solvers.enclosures`).
+
+    Raises:
+        ValueError: `shape` is not square, symmetric and positive definite.
+
+    Example:
+        >>> EllipsoidTemplate(shape=[[4.0, 0.0], [0.0, 1.0]]).dimension
+        2
+    """
+
+    shape: Float[Array, "n n"] | None = converted(converter=Numbers("(n, n)"), default=None)
+
+    def __post_init__(self):
+        if self.shape is not None and is_concrete(self.shape):
+            try:
+                Ellipsoid(jnp.zeros(len(self.shape)), self.shape)
+            except ValueError as error:
+                message = str(error).replace("Ellipsoid.", "EllipsoidTemplate.")
+                raise ValueError(message) from None
+
+    @property
+    def dimension(self) -> int | None:
+        """The number of coordinates; None if any shape will do."""
+        return None if self.shape is None else len(self.shape)
 
 
 def _signed(rows: np.ndarray) -> np.ndarray:

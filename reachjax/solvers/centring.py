@@ -24,14 +24,18 @@ from reachjax.sets import NormalForm
 from reachjax.solvers.compact import CompactProgram, compact
 from reachjax.solvers.models import FLAT
 
-WEIGHT = 1e-7
-"""The barrier weight `mu`, about the relative error that centring leaves in a derivative."""
+WEIGHTS = (1e-7, 1e-8, 1e-9)
+"""Barrier weights `mu`, followed downwards as long as arithmetic allows: the derivative of the
+ellipsoid is off by about the square root of the last one."""
 
 STEPS = 60
 """Newton steps after which the centre counts as not found."""
 
 CENTRED = 1e-8
 """The squared Newton decrement, in units of `mu`, at which it is found."""
+
+QUADRATIC = 0.05
+"""The squared decrement, in units of `mu`, below which full Newton steps surely converge."""
 
 
 class Sensitivity(NamedTuple):
@@ -87,20 +91,17 @@ def sensitivity(
     reduced = compact(program)
     reduced = reduced.with_units(reduced.widths)
     barrier = _Barrier(reduced)
-    y = barrier.start(reduced.norms * multipliers[reduced.kept], reduced.to_unit_box(form))
-    if y is None:
-        return unknown
-    found = barrier.centred(y)
+    found = barrier.followed(reduced.norms * multipliers[reduced.kept], reduced.to_unit_box(form))
     if found is None:
         return unknown
-    y, hessian = found
+    y, weight, hessian = found
     w = _solved(hessian, barrier.vector(reduced.cotangent_to_unit_box(cotangent)))
     inverse = np.linalg.inv(barrier.schur(y))
     moving = np.tensordot(w, barrier.terms, 1)
     size, q = len(program.scale), len(form.b)
     used = np.ix_(*2 * [np.r_[reduced.columns, size + np.arange(q)]])
     halves = []
-    for vector, moments in ((y, -WEIGHT * inverse @ moving @ inverse), (w, -WEIGHT * inverse)):
+    for vector, moments in ((y, -weight * inverse @ moving @ inverse), (w, -weight * inverse)):
         whole, weights = np.zeros((size + q, size + q)), np.zeros(len(multipliers))
         whole[used] = moments
         weights[reduced.kept] = vector[: barrier.count] / reduced.norms
@@ -134,6 +135,7 @@ class _Barrier:
         self.terms = terms
         self.constant = np.diag(np.r_[np.zeros(n - 1), 1.0, np.ones(q)])
         self.price = float(n * q)
+        self.spread = 1 + np.linalg.norm(terms[self.signed].sum(axis=0), 2)
 
     def schur(self, y: np.ndarray) -> np.ndarray:
         return self.constant + np.tensordot(y, self.terms, 1)
@@ -146,65 +148,79 @@ class _Barrier:
         zero = np.zeros(self.count + 1)
         return np.r_[zero, np.tensordot(self.symmetric, cotangent.A, 2), cotangent.b]
 
-    def start(self, multipliers: np.ndarray, form: NormalForm) -> np.ndarray | None:
+    def followed(
+        self, multipliers: np.ndarray, form: NormalForm
+    ) -> tuple[np.ndarray, float, np.ndarray] | None:
+        """The centre at the smallest weight that can be reached, the weight, the Hessian there."""
+        found, y = None, self._start(multipliers, form, WEIGHTS[0])
+        for weight in WEIGHTS:
+            centre = None if y is None else self._centred(y, weight)
+            if centre is None:
+                break
+            y, hessian = centre
+            found = y, weight, hessian
+        return found
+
+    def _start(self, multipliers: np.ndarray, form: NormalForm, weight: float) -> np.ndarray | None:
         """A point inside near a solution: a smaller `V`, and a little of `t`."""
-        for t in 10 * WEIGHT * 4.0 ** np.arange(8):
+        for t in 10 * weight * 4.0 ** np.arange(8):
             shrink = 1 - self.n * t
             if shrink <= 0.5:
                 break
             R = np.sqrt(shrink) * (form.A + form.A.T) / 2
             y = np.r_[shrink * multipliers, t, R[self.pairs], np.sqrt(shrink) * form.b]
-            least = t / (4 * (1 + np.sqrt(self.count)))
-            y[self.signed] = np.maximum(y[self.signed], least)
-            if np.isfinite(self.value(y)):
+            y[self.signed] = np.maximum(y[self.signed], t / (4 * self.spread))
+            if np.isfinite(self.value(y, weight)):
                 return y
         return None
 
-    def value(self, y: np.ndarray) -> float:
+    def _blocks(self, y: np.ndarray, weight: float):
+        """Each matrix under a logarithm of a determinant: its weight, itself, its variables."""
+        R = self.form(y).A
+        yield 1.0, R, (self.R, self.symmetric)
+        yield weight, np.eye(self.q) / FLAT - R, (self.R, -self.symmetric)
+        yield weight, self.schur(y), (slice(None), self.terms)
+
+    def value(self, y: np.ndarray, weight: float) -> float:
         """Infinite outside."""
         if np.any(y[self.signed] <= 0):
             return np.inf
-        value = self.price * y[self.count] - WEIGHT * np.sum(np.log(y[self.signed]))
-        for weight, block, _ in self._blocks(y):
+        value = self.price * y[self.count] - weight * np.sum(np.log(y[self.signed]))
+        for each, block, _ in self._blocks(y, weight):
             try:
                 factor = np.linalg.cholesky(block)
             except LinAlgError:
                 return np.inf
-            value -= 2 * weight * np.sum(np.log(np.diag(factor)))
+            value -= 2 * each * np.sum(np.log(np.diag(factor)))
         return float(value)
 
-    def _blocks(self, y: np.ndarray):
-        """Each matrix under a logarithm of a determinant: its weight, itself, its variables."""
-        R = self.form(y).A
-        yield 1.0, R, (self.R, self.symmetric)
-        yield WEIGHT, np.eye(self.q) / FLAT - R, (self.R, -self.symmetric)
-        yield WEIGHT, self.schur(y), (slice(None), self.terms)
-
-    def derivatives(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def derivatives(self, y: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and Hessian."""
         gradient, hessian = np.zeros(len(y)), np.zeros((len(y), len(y)))
         gradient[self.count] = self.price
-        gradient[self.signed] -= WEIGHT / y[self.signed]
-        hessian[self.signed, self.signed] += WEIGHT / y[self.signed] ** 2
-        for weight, block, (where, terms) in self._blocks(y):
+        gradient[self.signed] -= weight / y[self.signed]
+        hessian[self.signed, self.signed] += weight / y[self.signed] ** 2
+        for each, block, (where, terms) in self._blocks(y, weight):
             inverse = solve_triangular(np.linalg.cholesky(block), np.eye(len(block)), lower=True)
             scaled = inverse @ terms @ inverse.T
             flat = scaled.reshape(len(terms), -1)
-            gradient[where] -= weight * np.trace(scaled, axis1=1, axis2=2)
-            hessian[where, where] += weight * flat @ flat.T
+            gradient[where] -= each * np.trace(scaled, axis1=1, axis2=2)
+            hessian[where, where] += each * flat @ flat.T
         return gradient, hessian
 
-    def centred(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def _centred(self, y: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Newton's method from a point inside: the minimiser and the Hessian there."""
-        value = self.value(y)
+        value = self.value(y, weight)
         for _ in range(STEPS):
-            gradient, hessian = self.derivatives(y)
+            gradient, hessian = self.derivatives(y, weight)
             step = -_solved(hessian, gradient)
             decrement = -float(gradient @ step)
-            if decrement <= CENTRED * WEIGHT:
+            if decrement <= CENTRED * weight:
                 return y, hessian
-            length = 1.0
-            while not (after := self.value(y + length * step)) <= value - decrement * length / 4:
+            length, wanted = 1.0, decrement / 4
+            if decrement <= QUADRATIC * weight:
+                wanted = -np.inf  # too close for differences of values to be seen
+            while not (after := self.value(y + length * step, weight)) <= value - length * wanted:
                 length /= 2
                 if length < 1e-10:
                     return None

@@ -26,7 +26,9 @@ def setting():
     """(loop arrays, set, program) of a loop with three states."""
     data, region = random_loop(3, seed=5), box_region(3, seed=5)
     X, template = rj.Polytope(region.A, region.b), rj.Template(directions(3, extra=1))
-    program = step_program(closed_loop(data), X, X.bounding_box(), template, 0, rj.LocalBounds())
+    program = step_program(
+        closed_loop(data), X, X.bounding_box(), template.directions, 0, rj.LocalBounds()
+    )
     return data, region, jax.device_get(program)
 
 

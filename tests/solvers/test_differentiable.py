@@ -142,7 +142,7 @@ def test_the_gradient_is_as_accurate_as_the_solver():
 
 def test_the_lagrangian_at_the_solution_is_the_offset():
     loop, X = planar(0)
-    program = step_program(loop, X, bounding_box(X), TEMPLATE, 0, rj.LocalBounds())
+    program = step_program(loop, X, bounding_box(X), TEMPLATE.directions, 0, rj.LocalBounds())
     offsets, solution = proved_offsets(program, rj.Clarabel())
     values = lagrangian(program, solution.multipliers, solution.moments)
     np.testing.assert_allclose(values, offsets, atol=1e-6)
@@ -203,7 +203,9 @@ def test_a_training_loop_compiles_once_while_neurons_become_stable():
         moved = ((layers[0][0], layers[0][1] + shift), *layers[1:])
         net = loop.controller.replace(layers=moved)
         assert np.isfinite(gradient(net)[0])
-        program = step_program(loop.replace(controller=net), X0, X0, TEMPLATE, 0, rj.LocalBounds())
+        program = step_program(
+            loop.replace(controller=net), X0, X0, TEMPLATE.directions, 0, rj.LocalBounds()
+        )
         stable.add(tuple((np.asarray(program.scale) == 0).tolist()))
     assert len(stable) > 1
     assert len(compiled) == 1

@@ -1,0 +1,100 @@
+"""One step: the smallest set of a template that surely holds the successors, and its proof."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from reachjax.certificates import AbstractCertificate, Certificate, EllipsoidCertificate
+from reachjax.checks import is_concrete
+from reachjax.lmi import step_program
+from reachjax.relaxation import AbstractRelaxation
+from reachjax.sets import (
+    AbstractSet,
+    AbstractTemplate,
+    Box,
+    Ellipsoid,
+    EllipsoidTemplate,
+    Polytope,
+    Template,
+)
+from reachjax.solvers import (
+    AbstractSolver,
+    bounding_box,
+    proved_ellipsoid,
+    proved_offsets,
+    proved_size,
+)
+from reachjax.systems import ClosedLoop
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One step of the loop, and how it is relaxed and solved.
+
+    Attributes:
+        loop: the closed loop.
+        X: the set of states.
+        t: the time.
+        relaxation: which products of facts are used.
+        solver: what solves the semidefinite programs.
+        name: what errors call the set.
+    """
+
+    loop: ClosedLoop
+    X: AbstractSet
+    t: int
+    relaxation: AbstractRelaxation
+    solver: AbstractSolver
+    name: str
+
+    def successors(self, template: AbstractTemplate) -> tuple[AbstractSet, AbstractCertificate]:
+        """The smallest set of a template that surely holds the successors, and its proof.
+
+        Raises:
+            TypeError: the template is of an unknown kind.
+            ValueError: the set of states is empty or unbounded, or states overflow.
+        """
+        if isinstance(template, Template):
+            return self._polytope(template)
+        if isinstance(template, EllipsoidTemplate):
+            return self._ellipsoid(template)
+        raise TypeError(f"there is no step for templates of kind {type(template).__name__}")
+
+    def _box(self) -> Box:
+        """A box around the states; what is too large for numbers may seem empty or unbounded."""
+        try:
+            return bounding_box(self.X)
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"{self.name} cannot be used: {error}") from None
+
+    def _require_finite(self, numbers) -> None:
+        if is_concrete(numbers) and not np.isfinite(numbers).all():
+            raise ValueError(
+                f"the loop's states at t = {self.t + 1} overflow or are not numbers: check the "
+                "weights of loop.controller and the entries of loop.plant"
+            )
+
+    def _polytope(self, template: Template) -> tuple[Polytope, Certificate]:
+        """Problem (sdp::poly): the smallest offset for each facet."""
+        directions = template.directions
+        program = step_program(self.loop, self.X, self._box(), directions, self.t, self.relaxation)
+        offsets, solution = proved_offsets(program, self.solver)
+        self._require_finite(offsets)
+        certificate = Certificate.from_solution(program, offsets, solution)
+        return template.polytope(offsets), certificate
+
+    def _ellipsoid(self, template: EllipsoidTemplate) -> tuple[Ellipsoid, EllipsoidCertificate]:
+        """Problem (sdp::ellips): the minimum volume, or the smallest size of a given shape."""
+        box, rows = self._box(), jnp.eye(self.loop.states)
+        program = step_program(self.loop, self.X, box, rows, self.t, self.relaxation)
+        if template.shape is None:
+            region, enclosure = proved_ellipsoid(program, self.solver)
+        else:
+            middle = self.X.center if isinstance(self.X, Ellipsoid) else box.center
+            given = Ellipsoid(self.loop.step(middle, self.t), template.shape).normal_form
+            region, enclosure = proved_size(program, given, self.solver)
+        self._require_finite(region.shape)
+        return region, EllipsoidCertificate.from_enclosure(program, region, enclosure)

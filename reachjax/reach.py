@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.certificates import AbstractCertificate
@@ -60,10 +61,9 @@ class ReachTube(Replaceable):
     start: int = static(default=0)
 
     def __repr__(self) -> str:
-        sort = (
-            f"facets={len(self.template)}" if isinstance(self.template, Template) else "ellipsoids"
-        )
-        return f"ReachTube(horizon={self.horizon}, {sort}, states={self.loop.states})"
+        facets = isinstance(self.template, Template)
+        sets = f"facets={len(self.template)}" if facets else "ellipsoids"
+        return f"ReachTube(horizon={self.horizon}, {sets}, states={self.loop.states})"
 
     @property
     def horizon(self) -> int:
@@ -115,7 +115,8 @@ def reach_step(
         TypeError: an argument is of another kind.
         ValueError: dimensions disagree, the set is empty or unbounded, or `t` is beyond the loop.
 
-    Source: theorem 1 and problems (sdp::poly) and (sdp::ellips) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
+    Source: theorem 1 and problems (sdp::poly), (sdp::ellips) of Hu, Fazlyab, Morari, Pappas
+    (CDC 2020).
 
     Example:
         >>> from reachjax import MLP, AffinePlant, Box
@@ -203,7 +204,9 @@ def _with_witnesses(
 ) -> list[AbstractCertificate]:
     """Simulate what the certificates bound, from the initial set."""
     states = initial_states(sets[0], samples, seed)
-    states = jnp.concatenate([states, proposed_states(sets[0], certificates[0].moments)])
+    states = jnp.concatenate(
+        [states, proposed_states(sets[0], np.asarray(certificates[0].moments))]
+    )
     found = witnesses(loop, states, sets[1:], start)
     return [
         certificate.replace(witnesses=values, witness_states=origins)

@@ -72,7 +72,7 @@ class Ellipsoid(AbstractSet):
         same_size(
             "its number of rows is",
             "Ellipsoid.shape must be square: its number of columns is",
-            shape.shape,
+            (shape.shape[0], shape.shape[1]),
         )
         if is_concrete(shape):
             matrix = np.asarray(shape)
@@ -99,7 +99,7 @@ class Ellipsoid(AbstractSet):
 
     @classmethod
     def enclosing(cls, form: NormalForm, level: Float[ArrayLike, ""] = 1.0) -> Ellipsoid:
-        """An ellipsoid that surely contains `|A x + b| <= level`, and is no larger but for rounding.
+        """An ellipsoid that surely contains `|A x + b| <= level`; larger by rounding only.
 
         With `|A q + b| <= e` and `A Q A' >= (level + e)^2 I`, a point with `|A x + b| <= level` has
         `|A (x - q)| <= level + e`, so `(x - q)' Q^-1 (x - q) <= 1`. The smallest eigenvalue of
@@ -111,7 +111,6 @@ class Ellipsoid(AbstractSet):
             [[16.0, 0.0], [0.0, 4.0]]
         """
         A, b = form
-        n = len(b)
         inverse = jnp.linalg.inv(A)
         q, Q = -inverse @ b, inverse @ inverse.T
         Q = (Q + Q.T) / 2

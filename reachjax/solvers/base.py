@@ -123,11 +123,14 @@ class AbstractSolver(abc.ABC):
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet of a program whose leaves are numpy arrays."""
 
-    @abc.abstractmethod
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
         """Propose the smallest ellipsoid around the successors, and its multipliers.
 
         Args:
             program: whose leaves are numpy arrays and whose objective rows are the successor's.
             form: the ellipsoid up to a factor on `A` and `b`; free if it is None.
+
+        Raises:
+            NotImplementedError: this solver does not know ellipsoids.
         """
+        raise NotImplementedError(f"{type(self).__name__} solves for facets, not for ellipsoids")

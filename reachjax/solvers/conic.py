@@ -90,7 +90,8 @@ class _ConicSolver(AbstractSolver, abc.ABC):
         name, options = self.settings()
         _require_installed(name)
         reduced, proposal = compact(program), Enclosure.blank(program)
-        began = time.perf_counter()
+        began, status = time.perf_counter(), SolverStatus.FAILED
+        scaled = model = None
         for factor in RESCALINGS:
             scaled = reduced.with_units(reduced.widths / factor)
             model = EllipsoidModel(scaled, None if form is None else scaled.to_unit_box(form))
@@ -98,6 +99,7 @@ class _ConicSolver(AbstractSolver, abc.ABC):
             if status not in STALLED:
                 break
         seconds = time.perf_counter() - began
+        assert model is not None and scaled is not None
         found, multipliers = model.form, model.multipliers.value
         proposal = proposal._replace(status=np.array(int(status)), seconds=np.array(seconds))
         if found is None or multipliers is None:

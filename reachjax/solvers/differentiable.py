@@ -29,7 +29,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from reachjax.lmi import Program, lagrangian
 from reachjax.solvers.accepted import accepted_offsets
@@ -77,8 +77,13 @@ def _backward(solver, residual, cotangents):
 
     pull: Any = jax.vjp(value, program.facts.mid, program.objective.mid)[1]
     offsets, _, proposal = cotangents
-    asked = [jnp.any(part != 0) for part in proposal if part.dtype == offsets.dtype]
-    return *pull(jnp.where(jnp.array(asked).any(), jnp.nan, offsets)), None
+    return *pull(jnp.where(asked_for(proposal), jnp.nan, offsets)), None
+
+
+def asked_for(proposal: Any) -> Bool[Array, ""]:
+    """Whether a derivative of what a solver proposes is asked for; there is none."""
+    parts = [part for part in jax.tree.leaves(proposal) if part.dtype == float]
+    return jnp.array([jnp.any(part != 0) for part in parts]).any()
 
 
 _proved_offsets.defvjp(_forward, _backward)

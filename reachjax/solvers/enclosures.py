@@ -25,6 +25,7 @@ from reachjax.sets import Ellipsoid, NormalForm
 from reachjax.solvers.accepted import accepted_enclosure
 from reachjax.solvers.base import AbstractSolver, Enclosure, SolverStatus
 from reachjax.solvers.centring import Sensitivity, sensitivity
+from reachjax.solvers.differentiable import asked_for
 from reachjax.solvers.host import on_host
 
 
@@ -40,7 +41,14 @@ def proved_ellipsoid(program: Program, solver: AbstractSolver) -> tuple[Ellipsoi
     """
     result: Any = _ellipsoid(solver, program.facts.mid, program.objective.mid, program)
     form, level, _, enclosure = result
-    return Ellipsoid.enclosing(form, jax.lax.stop_gradient(level)), enclosure
+    return _reported(form, level, enclosure)
+
+
+def _reported(form: NormalForm, level: Array, enclosure: Enclosure) -> tuple[Ellipsoid, Enclosure]:
+    """The ellipsoid that was proved, and multipliers that prove it (the proof is homogeneous)."""
+    level = jax.lax.stop_gradient(level)
+    proof = enclosure._replace(multipliers=enclosure.multipliers / level**2)
+    return Ellipsoid.enclosing(form, level), proof
 
 
 def _solve(
@@ -78,7 +86,8 @@ def _ellipsoid_forward(solver, facts, objective, program):
 
 
 def _ellipsoid_backward(solver, residual, cotangents):
-    program, form, optimal, multipliers = residual
+    program, form, trusted, multipliers = residual
+    trusted = trusted & ~asked_for(cotangents[3])
     shapes = jax.tree.map(
         lambda field: jax.ShapeDtypeStruct(field.shape, float), Sensitivity.unknown(program)
     )
@@ -93,7 +102,7 @@ def _ellipsoid_backward(solver, residual, cotangents):
         )
 
     slopes = jax.grad(value, (0, 1))(program.facts.mid, program.objective.mid)
-    return *(jnp.where(optimal, slope, jnp.nan) for slope in slopes), None
+    return *(jnp.where(trusted, slope, jnp.nan) for slope in slopes), None
 
 
 _ellipsoid.defvjp(_ellipsoid_forward, _ellipsoid_backward)
@@ -122,7 +131,7 @@ def proved_size(
     result: Any = _size(solver, program.facts.mid, program.objective.mid, given, program)
     factor, level, _, enclosure = result
     scaled = NormalForm(factor * given.A, factor * given.b)
-    return Ellipsoid.enclosing(scaled, jax.lax.stop_gradient(level)), enclosure
+    return _reported(scaled, level, enclosure)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -139,7 +148,8 @@ def _size_forward(solver, facts, objective, given, program):
 
 
 def _size_backward(solver, residual, cotangents):
-    program, given, factor, optimal, enclosure = residual
+    program, given, factor, trusted, enclosure = residual
+    trusted = trusted & ~asked_for(cotangents[3])
     n = program.scale.shape[0]
     moments = enclosure.moments
     # stationarity in the factor gives the dual its scale, whatever the solver's objective was
@@ -151,7 +161,7 @@ def _size_backward(solver, residual, cotangents):
         return schur_lagrangian(rows, enclosure.multipliers, scaled, moments) / unit
 
     slopes = jax.grad(value, (0, 1, 2))(program.facts.mid, program.objective.mid, given)
-    weight = jnp.where(optimal, cotangents[0], jnp.nan)
+    weight = jnp.where(trusted, cotangents[0], jnp.nan)
     return *jax.tree.map(lambda slope: weight * slope, slopes), None
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from reachjax.checks import described, whole_number
 from reachjax.reach import reach
 from reachjax.requirements import AvoidSets, check_margin, requirements, shortfall
-from reachjax.sets import AbstractSet, PolyhedralSet, Template
+from reachjax.sets import AbstractSet, AbstractTemplate, PolyhedralSet
 from reachjax.sizes import log_volume
 from reachjax.systems import ClosedLoop
 
@@ -24,7 +24,7 @@ def volume_penalty(
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
-    template: Template,
+    template: AbstractTemplate,
     *,
     measure: Callable[[AbstractSet], Float[Array, ""]] = log_volume,
     **options: Any,
@@ -37,7 +37,7 @@ def volume_penalty(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number of steps.
-        template: the facet directions of every set.
+        template: what every set looks like: facet directions, or ellipsoids.
         measure: the size of one set. Logarithms weigh all steps alike, and are -inf for a flat set;
             `volume` is in the units of the states and weighs large sets most.
         options: keyword arguments of `reach`, such as `relaxation` and `solver`.
@@ -70,7 +70,7 @@ def specification_penalty(
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
-    template: Template,
+    template: AbstractTemplate,
     goal: PolyhedralSet | None = None,
     avoid: AvoidSets | None = None,
     safe: PolyhedralSet | None = None,
@@ -87,7 +87,7 @@ def specification_penalty(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number of steps.
-        template: the facet directions of every set.
+        template: what every set looks like: facet directions, or ellipsoids.
         goal: where every state must be at the horizon.
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
             time to a sequence.

@@ -51,6 +51,9 @@ class Settings:
     """Of samples, initial weights and simulated trajectories."""
     simulations: int = 100_000
     """Trajectories simulated, half of them from the boundary of the initial set."""
+    velocity_limits: bool = False
+    """Keep the paper's `|v| <= 1` in place of the goal, which they put out of reach: another MPC,
+    sampled first (minutes)."""
     resample: bool = False
     """Solve the MPC for all samples (minutes) and train on these, under `output/resampled`."""
     retrain: bool = False
@@ -73,14 +76,17 @@ class Settings:
     @property
     def folder(self) -> Path:
         """Where samples and weights are."""
+        if self.velocity_limits:
+            return self.output / "velocity_limits"
         return self.output / "resampled" if self.resample else self.output
 
 
 def learn(settings: Settings) -> tuple[Samples, Fit]:
     """The samples and the network fitted to them, stored ones where there are."""
-    if not settings.resample:
+    if settings.folder == settings.output:
         quadrotor_controller.use_committed(settings.folder)
-    samples = quadrotor_controller.sample(settings.samples, settings.seed, settings.folder)
+    mpc = quadrotor_controller.teacher(settings.velocity_limits)
+    samples = quadrotor_controller.sample(mpc, settings.samples, settings.seed, settings.folder)
     fit = train_network(
         samples,
         settings.hidden,
@@ -105,13 +111,13 @@ def closed_loop(settings: Settings) -> rj.ClosedLoop:
     return loop_with(learn(settings)[1])
 
 
-def error_table(samples: Samples, fit: Fit, states: np.ndarray) -> Table:
+def error_table(mpc: QuadrotorMPC, samples: Samples, fit: Fit, states: np.ndarray) -> Table:
     """How well the network imitates, on held-out samples and where the loop goes."""
     visited = states[:COMPARED, :-1].reshape(-1, states.shape[-1])
     held_out = slice(training_share(samples, VALIDATION), None)
     parts = {
         "held-out samples": (samples.states[held_out], samples.inputs[held_out]),
-        f"{COMPARED} trajectories of the loop": (visited, QuadrotorMPC().batch(visited)),
+        f"{COMPARED} trajectories of the loop": (visited, mpc.batch(visited)),
     }
     title = "errors of the projected network: root mean square / largest"
     shown = Table("", *INPUT_NAMES, title=title)
@@ -132,8 +138,10 @@ def main(settings: Settings) -> None:
     states = quadrotor_simulation.simulate(
         loop, initial_set(), STEPS, settings.simulations, settings.seed
     )
-    rich.print(error_table(samples, fit, states))
-    rich.print(quadrotor_simulation.table(loop, states))
+    mpc = quadrotor_controller.teacher(settings.velocity_limits)
+    rich.print(error_table(mpc, samples, fit, states))
+    limits = settings.velocity_limits
+    rich.print(quadrotor_simulation.table(loop, states, velocity_limits=limits))
     rich.print(f"written: {settings.folder}/samples.npz and weights.npz")
 
 

@@ -9,7 +9,13 @@ from rich.table import Table
 
 import reachjax as rj
 from experiments.progress import at_least_one, bar
-from experiments.quadrotor_model import GOAL, INPUT_LIMITS, INPUT_NAMES, POSITION_LIMITS
+from experiments.quadrotor_model import (
+    GOAL,
+    INPUT_LIMITS,
+    INPUT_NAMES,
+    POSITION_LIMITS,
+    VELOCITY_LIMITS,
+)
 
 BATCH = 10_000
 """Trajectories simulated at once."""
@@ -46,11 +52,16 @@ def inputs_along(
 
 
 def extremes(
-    loop: rj.ClosedLoop, states: Float[ndarray, "count steps+1 6"]
+    loop: rj.ClosedLoop, states: Float[ndarray, "count steps+1 6"], *, velocity_limits: bool = False
 ) -> list[tuple[str, str, Float[ndarray, " 2"], Float[ndarray, " 2"]]]:
-    """For each requirement and coordinate: the range simulated and the range allowed."""
+    """For each requirement and coordinate: the range simulated and the range allowed.
+
+    With the velocity limits there is no goal.
+    """
+    goal = ("goal", AXES, states[:, -1, :3], GOAL)
+    velocity = ("velocity limits", ("v_x", "v_y", "v_z"), states[:, :, 3:], VELOCITY_LIMITS)
     parts = [
-        ("goal", AXES, states[:, -1, :3], GOAL),
+        velocity if velocity_limits else goal,
         ("position limits", AXES, states[:, :, :3], POSITION_LIMITS),
         ("actuator limits", INPUT_NAMES, inputs_along(loop, states), INPUT_LIMITS),
     ]
@@ -68,10 +79,14 @@ def margin(simulated: Float[ndarray, " 2"], allowed: Float[ndarray, " 2"]) -> fl
     return float(min(simulated[0] - allowed[0], allowed[1] - simulated[1]))
 
 
-def table(loop: rj.ClosedLoop, states: Float[ndarray, "count steps+1 6"]) -> Table:
+def table(
+    loop: rj.ClosedLoop, states: Float[ndarray, "count steps+1 6"], *, velocity_limits: bool = False
+) -> Table:
     """`extremes` and their margins."""
     shown = Table("requirement", "", "simulated", "allowed", "margin", title="simulation")
-    for requirement, name, simulated, allowed in extremes(loop, states):
-        ranges = (f"[{lower:.4f}, {upper:.4f}]" for lower, upper in (simulated, allowed))
+    for requirement, name, simulated, allowed in extremes(
+        loop, states, velocity_limits=velocity_limits
+    ):
+        ranges = (f"{lower:.4f} .. {upper:.4f}" for lower, upper in (simulated, allowed))
         shown.add_row(requirement, name, *ranges, f"{margin(simulated, allowed):.4f}")
     return shown

@@ -86,7 +86,7 @@ def teacher(velocity_limits: bool) -> QuadrotorMPC:
     """
     if not velocity_limits:
         return QuadrotorMPC()
-    return QuadrotorMPC(horizon=60, velocity_limit=VELOCITY_LIMITS[1, 0] - VELOCITY_MARGIN)
+    return QuadrotorMPC(horizon=70, velocity_limit=VELOCITY_LIMITS[1, 0] - VELOCITY_MARGIN)
 
 
 def use_committed(folder: Path) -> None:

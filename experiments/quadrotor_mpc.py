@@ -14,20 +14,25 @@ itself would let the quadrotor fall first. `x_0` is measured and not constrained
 In the coordinates `u = (tan(theta), tan(phi), tau)` the dynamics are affine and the limits are
 boxes. The cost is convex in `u` too where `|theta|, |phi| < 0.65` rad, as the square of `atan(s)`
 is convex while `s atan(s) <= 1/2`. So the optimum is unique, what the interior-point method finds
-is global, and no start but hover is needed.
+is global, and no start but hover is needed. Where it finds nothing, a linear program decides
+whether there is a plan at all.
 """
 
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float
 from numpy import ndarray
 from rich.progress import track
+from scipy.optimize import linprog
 
 from experiments.mpc import as_array, positive_definite
 from experiments.quadrotor_model import ANGLE_LIMIT, GRAVITY, PERIOD
 
+MOST_ITERATIONS = 200
+"""Of IPOPT; where there is a plan, it needs some 20."""
 STEEPEST = 0.65
 """Angles, in radians, up to which the program is convex."""
 
@@ -85,17 +90,47 @@ class QuadrotorMPC:
         if status == "Solve_Succeeded":
             angles_and_thrust = np.array(solution["x"])[: 3 * self.horizon].reshape(-1, 3)
             return np.hstack([np.tan(angles_and_thrust[:, :2]), angles_and_thrust[:, 2:]])
-        if status == "Infeasible_Problem_Detected":
+        if not self._has_plan(x):
             return None
-        raise RuntimeError(
-            f"the MPC program at x = {x} was neither solved nor infeasible: {status}"
-        )
+        raise RuntimeError(f"the MPC program at x = {x} has a plan, but IPOPT ended with {status}")
 
     def batch(self, states: Float[ndarray, "count 6"], progress=False) -> Float[ndarray, "count 3"]:
         """The input for each row, NaN where infeasible; `progress` shows a bar."""
         rows = as_array("states", states, (len(states), 6))
         inputs = [self(x) for x in track(rows, "solving the MPC", disable=not progress)]
         return np.reshape(inputs, (-1, 3))
+
+    def _has_plan(self, x):
+        """Whether a plan satisfies the constraints, with `(tan(theta), tan(phi), tau)_k` and
+        `x_1 .. x_N` as variables.
+        """
+        N, h = self.horizon, self.period
+        push = np.diag([GRAVITY, -GRAVITY, 1])
+        A, B = np.eye(6) + h * np.eye(6, k=3), np.vstack([h**2 / 2 * push, h * push])
+        steps = scipy.sparse.hstack(
+            [
+                scipy.sparse.kron(scipy.sparse.eye(N), B),
+                scipy.sparse.kron(scipy.sparse.eye(N, k=-1), A) - scipy.sparse.eye(6 * N),
+            ]
+        )
+        fall = np.tile(GRAVITY * B[:, 2], N)
+        fall[:6] -= A @ x
+        lower, upper = self._bounds(np.tan(self.angle_limit))
+        rest = np.zeros(6)
+        bounds = np.column_stack([np.append(lower, rest), np.append(upper, rest)])
+        answer = linprog(np.zeros(len(bounds)), A_eq=steps, b_eq=fall, bounds=bounds)
+        if answer.status not in (0, 2):  # found, infeasible
+            raise RuntimeError(f"whether x = {x} has a plan is undecided: {answer.message}")
+        return answer.status == 0
+
+    def _bounds(self, steepest):
+        """Limits of all inputs, then of `x_1 .. x_{N-1}`; `steepest` is that of the angles."""
+        inputs = [steepest, steepest, self.thrust_limit]
+        states = [self.position_limit] * 3 + [self.velocity_limit] * 3
+        upper = np.concatenate([np.tile(inputs, self.horizon), np.tile(states, self.horizon - 1)])
+        lower = -upper
+        lower[2 : 3 * self.horizon : 3] = 0
+        return lower, upper
 
     @cached_property
     def _program(self):
@@ -113,11 +148,7 @@ class QuadrotorMPC:
             cost += ca.bilin(ca.DM(self.Q), x, x) + ca.bilin(ca.DM(self.R), deviation, deviation)
             target = X[:, k] if k < N - 1 else ca.DM.zeros(6)
             defects.append(self._successor(ca, x, u) - target)
-        inputs = [self.angle_limit, self.angle_limit, self.thrust_limit]
-        states = [self.position_limit] * 3 + [self.velocity_limit] * 3
-        upper = np.concatenate([np.tile(inputs, N), np.tile(states, N - 1)])
-        lower = -upper
-        lower[2 : 3 * N : 3] = 0
+        lower, upper = self._bounds(self.angle_limit)
         hover = np.zeros(len(upper))
         hover[2 : 3 * N : 3] = GRAVITY
         program = {
@@ -131,6 +162,7 @@ class QuadrotorMPC:
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
             "ipopt.tol": 1e-9,
+            "ipopt.max_iter": MOST_ITERATIONS,
             "ipopt.honor_original_bounds": "yes",
         }
         solver = ca.nlpsol("quadrotor_mpc", "ipopt", program, options)

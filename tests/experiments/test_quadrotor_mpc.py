@@ -6,12 +6,14 @@ feasible plan lies in a direction of descent.
 """
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import linprog, minimize
 
+from experiments import quadrotor_mpc
 from experiments.quadrotor_model import INITIAL_CENTER, INITIAL_RADII
 from experiments.quadrotor_mpc import STEEPEST, QuadrotorMPC
 
@@ -180,6 +182,18 @@ def test_an_input_is_missing_exactly_where_a_linear_program_has_no_plan(mpc):
     x = states[missing][0]
     assert mpc.plan(x) is None
     assert np.all(np.isnan(mpc(x)))
+
+
+def test_giving_up_is_not_taken_for_infeasible(mpc, monkeypatch):
+    monkeypatch.setattr(quadrotor_mpc, "MOST_ITERATIONS", 1)
+    hasty = replace(mpc)
+    states = states_for(mpc, 12, seed=1) * 1.2
+    for x, u in zip(states, mpc.batch(states), strict=True):
+        if np.isnan(u[0]):
+            assert hasty.plan(x) is None
+        else:
+            with pytest.raises(RuntimeError, match="has a plan, but IPOPT ended with Maximum"):
+                hasty.plan(x)
 
 
 def test_the_program_is_convex_up_to_the_steepest_angle_and_not_much_beyond():

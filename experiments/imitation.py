@@ -57,6 +57,7 @@ def train_networks(
     learning_rate: float = 1e-2,
     restarts: int = 4,
     validation: float = 0.1,
+    standardise: bool = False,
     path: str | Path | None = None,
     retrain: bool = False,
     progress: bool = True,
@@ -64,8 +65,10 @@ def train_networks(
     """Adam on full batches, its rate decaying from `learning_rate` to 0 along a cosine.
 
     `restarts` networks are trained side by side from different random weights. The last
-    `validation` share of the samples is never trained on. `retrain` ignores the file at `path` and
-    replaces it.
+    `validation` share of the samples is never trained on. With `standardise` loss and penalty are
+    those of a network between standardised states and inputs (mean 0, deviation 1 over the samples
+    trained on), which is then folded into the first and the last layer. `retrain` ignores the file
+    at `path` and replaces it.
     """
     widths = {f"hidden[{i}]": width for i, width in enumerate(hidden)}
     at_least_one(steps=steps, restarts=restarts, **widths)
@@ -80,11 +83,18 @@ def train_networks(
         "restarts": restarts,
         "validation": validation,
     }
+    if standardise:  # named only then: files of networks trained without it stay valid
+        settings["standardise"] = True
     kept = None if retrain else stored.load(path, settings)
     if kept is None:
         # Single precision whatever JAX's global setting is: the fit needs no more.
-        x, u = (np.asarray(a[:split], np.float32) for a in (samples.states, samples.inputs))
+        x, u = samples.states[:split], samples.inputs[:split]
+        scales = (_scale(x), _scale(u)) if standardise else None
+        if scales:
+            x, u = ((a - m) / s for a, (m, s) in zip((x, u), scales, strict=True))
+        x, u = np.asarray(x, np.float32), np.asarray(u, np.float32)
         trained = _train(x, u, hidden, seed, penalty, steps, learning_rate, restarts, progress)
+        trained = _folded(trained, *scales) if scales else trained
         kept = {f"W{i}": W for i, (W, _) in enumerate(trained)}
         kept |= {f"b{i}": b for i, (_, b) in enumerate(trained)}
         stored.save(path, settings, **kept)
@@ -115,6 +125,21 @@ def evaluate(layers, states: Float[ndarray, "count n"]) -> Float[ndarray, "count
     for W, b in hidden:
         z = np.maximum(z @ W.T + b, 0)
     return z @ W_out.T + b_out
+
+
+def _scale(values):
+    """Mean and standard deviation of each column, 1 for the deviation of a constant."""
+    deviation = values.std(axis=0)
+    return values.mean(axis=0), np.where(deviation > 0, deviation, 1.0)
+
+
+def _folded(layers, of_states, of_inputs):
+    """The network between `(x - mean) / deviation` and the same of `u`, as one from `x` to `u`."""
+    (mean, deviation), (shift, stretch) = of_states, of_inputs
+    W, b = layers[0]
+    layers = [(W / deviation, b - (W / deviation) @ mean), *layers[1:]]
+    W, b = layers[-1]
+    return [*layers[:-1], (W * stretch[:, None], b * stretch + shift)]
 
 
 class _Policy(nnx.Module):

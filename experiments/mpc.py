@@ -57,14 +57,11 @@ class LinearMPC:
             "input_upper": (m,),
         }
         for name, shape in shapes.items():
-            object.__setattr__(self, name, _array(name, getattr(self, name), shape))
+            object.__setattr__(self, name, as_array(name, getattr(self, name), shape))
         if not isinstance(self.horizon, int) or self.horizon < 1:
             raise ValueError(f"horizon must be an integer >= 1, got {self.horizon!r}")
-        for name, least in (("Q", "semidefinite"), ("R", "definite")):
-            matrix = getattr(self, name)
-            smallest = np.linalg.eigvalsh(matrix)[0] if np.allclose(matrix, matrix.T) else -np.inf
-            if smallest < 0 or (least == "definite" and smallest == 0):
-                raise ValueError(f"{name} must be symmetric positive {least}, got\n{matrix}")
+        positive_definite("Q", self.Q, semi=True)
+        positive_definite("R", self.R)
         for name in ("state", "input"):
             lower, upper = getattr(self, f"{name}_lower"), getattr(self, f"{name}_upper")
             if not (np.all(lower < 0) and np.all(upper > 0)):
@@ -98,7 +95,7 @@ class LinearMPC:
 
     def plan(self, x: Float[ndarray, " n"]) -> Float[ndarray, "N m"] | None:
         """All `N` inputs of the optimal plan from `x`, or None where there is none."""
-        x = _array("x", x, (len(self.A),))
+        x = as_array("x", x, (len(self.A),))
         solver, gradient, offset, slope = self._program
         solver.update(q=gradient @ x, b=offset - slope @ x)
         solution = solver.solve()
@@ -115,7 +112,7 @@ class LinearMPC:
         """`input` for each row, NaN where infeasible; `progress` shows a bar."""
         shape = (len(states), len(self.A))
         inputs = np.full((shape[0], self.B.shape[1]), np.nan)
-        rows = track(_array("states", states, shape), "solving the MPC", disable=not progress)
+        rows = track(as_array("states", states, shape), "solving the MPC", disable=not progress)
         for row, x in enumerate(rows):
             u = self.input(x)
             if u is not None:
@@ -204,7 +201,15 @@ def _box_rows(lower: ndarray, upper: ndarray) -> ndarray:
     return np.vstack([np.diag(1 / upper), np.diag(1 / lower)])
 
 
-def _array(name: str, value, shape: tuple[int, ...]) -> ndarray:
+def positive_definite(name: str, matrix: ndarray, *, semi: bool = False) -> None:
+    """Raise an error that names `matrix` unless it is symmetric and positive (semi)definite."""
+    smallest = np.linalg.eigvalsh(matrix)[0] if np.allclose(matrix, matrix.T) else -np.inf
+    if smallest < 0 or (smallest == 0 and not semi):
+        kind = "semidefinite" if semi else "definite"
+        raise ValueError(f"{name} must be symmetric positive {kind}, got\n{matrix}")
+
+
+def as_array(name: str, value, shape: tuple[int, ...]) -> ndarray:
     """`value` as a read-only array of the given shape, or an error that names it."""
     array = np.array(value, float)
     if array.shape != shape:

@@ -1,11 +1,13 @@
-"""What a policy does: states drawn from a box, and its decisions there.
+"""What a policy does: states drawn from a box or otherwise, and its decisions there.
 
 Samples can be kept in a file together with the settings that made them: it is used again when the
 settings agree, continued when it holds too few, and made anew, with a word about it, otherwise.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -28,6 +30,16 @@ class Samples:
     inputs: Float[ndarray, "count m"]
 
 
+class Policy(Protocol):
+    """A frozen dataclass that decides for many states at once; its fields are its settings."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def batch(self, states: Float[ndarray, "count n"]) -> Float[ndarray, "count m"]:
+        """The inputs, NaN where there is none."""
+        ...
+
+
 def sample_policy(
     mpc: LinearMPC,
     count: int,
@@ -40,35 +52,61 @@ def sample_policy(
 ) -> Samples:
     """`count` pairs of the MPC, uniform over the states of `lower <= x <= upper` it can steer.
 
-    The box is the MPC's own `X` unless given. Candidates are drawn in blocks, block `k` from the
-    seed `(seed, k)`, and infeasible ones left out; so a larger `count` only adds pairs, and a
-    file at `path` that holds too few, as an interrupted run leaves it, is continued.
+    The box is the MPC's own `X` unless given. The rest is as in `sample_draws`.
     """
-    at_least_one(count=count)
     lower = np.asarray(mpc.state_lower if lower is None else lower, float)
     upper = np.asarray(mpc.state_upper if upper is None else upper, float)
-    n, m = mpc.B.shape
+    n = len(mpc.A)
     if not lower.shape == upper.shape == (n,) or not np.all(upper - lower >= 0):
         raise ValueError(f"lower <= upper must bound {n} states, got lower {lower}, upper {upper}")
-    settings = {f.name: np.asarray(getattr(mpc, f.name)).tolist() for f in fields(mpc)}
-    settings |= {"seed": int(seed), "lower": lower.tolist(), "upper": upper.tolist()}
-    nothing = {"states": np.empty((0, n)), "inputs": np.empty((0, m)), "block": 0}
-    kept = stored.load(path, settings) or nothing
-    states, inputs, block = kept["states"], kept["inputs"], int(kept["block"])
+    return sample_draws(
+        mpc,
+        count,
+        seed,
+        draw=lambda rng: rng.uniform(lower, upper, (CANDIDATES, n)),
+        settings={"lower": lower.tolist(), "upper": upper.tolist()},
+        path=path,
+        progress=progress,
+    )
+
+
+def sample_draws(
+    policy: Policy,
+    count: int,
+    seed: int,
+    *,
+    draw: Callable[[np.random.Generator], Float[ndarray, "candidates n"]],
+    settings: dict[str, Any],
+    path: str | Path | None = None,
+    progress: bool = True,
+) -> Samples:
+    """`count` pairs of the policy at those states of `draw` where it has an input.
+
+    Candidates are drawn in blocks, block `k` from the seed `(seed, k)`, and infeasible ones left
+    out; so a larger `count` only adds pairs, and a file at `path` that holds too few, as an
+    interrupted run leaves it, is continued. `settings` is what `draw` depends on: a file is used
+    again when these, the policy's fields and the seed agree.
+    """
+    at_least_one(count=count)
+    drawn_with = ", ".join(f"{name} {value}" for name, value in settings.items())
+    settings = settings | {"seed": int(seed)}
+    settings |= {f.name: np.asarray(getattr(policy, f.name)).tolist() for f in fields(policy)}
+    kept = stored.load(path, settings) or {"states": [], "inputs": [], "block": 0}
+    states, inputs, block = [*kept["states"]], [*kept["inputs"]], int(kept["block"])
     with bar(progress) as shown:
         task = shown.add_task("sampling the MPC", total=count, completed=min(count, len(states)))
         while len(states) < count:
-            if block == 10 and not len(states):
+            if block == 10 and not states:
                 raise ValueError(
-                    f"lower and upper must meet the states that the MPC can steer; of the first "
-                    f"{block * CANDIDATES} drawn between {lower} and {upper}, none was feasible"
+                    f"the states drawn must meet those that the MPC can steer; of {block} blocks "
+                    f"drawn with {drawn_with}, none was feasible"
                 )
-            draws = np.random.default_rng([seed, block]).uniform(lower, upper, (CANDIDATES, n))
-            decisions = mpc.batch(draws)
+            draws = draw(np.random.default_rng([seed, block]))
+            decisions = policy.batch(draws)
             feasible = ~np.isnan(decisions[:, 0])
-            states = np.vstack([states, draws[feasible]])
-            inputs = np.vstack([inputs, decisions[feasible]])
+            states += [*draws[feasible]]
+            inputs += [*decisions[feasible]]
             block += 1
             stored.save(path, settings, states=states, inputs=inputs, block=block)
             shown.update(task, completed=min(count, len(states)))
-    return Samples(states[:count], inputs[:count])
+    return Samples(np.array(states[:count]), np.array(inputs[:count]))

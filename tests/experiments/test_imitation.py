@@ -50,6 +50,27 @@ def test_a_penalty_makes_the_weights_smaller(samples):
     assert sizes[1] < sizes[0]
 
 
+def test_standardised_training_does_not_depend_on_units(samples):
+    options = QUICK | {"standardise": True, "steps": 200}
+    fit = train_network(samples, **options)
+    x_scale, x_shift, u_scale, u_shift = np.array([100, 0.01]), np.array([5, -3]), 20, 9.81
+    other = Samples(samples.states * x_scale + x_shift, samples.inputs * u_scale + u_shift)
+    expected = evaluate(fit.layers, samples.states) * u_scale + u_shift
+    found = evaluate(train_network(other, **options).layers, other.states)
+    np.testing.assert_allclose(found, expected, atol=0.02)  # single precision, 200 steps
+    assert not np.allclose(
+        evaluate(train_network(other, **options | {"standardise": False}).layers, other.states),
+        expected,
+        atol=0.1,
+    )
+
+
+def test_a_constant_coordinate_can_be_standardised(samples):
+    states = np.hstack([samples.states, np.full((400, 1), 7.0)])
+    fit = train_network(Samples(states, samples.inputs), standardise=True, **QUICK)
+    assert np.isfinite(fit.validation_error)
+
+
 def test_training_is_reproducible_and_the_seed_matters(samples):
     one, same, other = (train_network(samples, seed=seed, **QUICK) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one.layers[1][0], same.layers[1][0])
@@ -67,13 +88,14 @@ def test_weights_are_reused_until_something_changes(samples, tmp_path, monkeypat
         patch.setattr(imitation, "_train", refuse)
         again = train_network(samples, path=path, **QUICK)
         assert not capsys.readouterr().out
-        for change in ({"retrain": True}, {"penalty": 0.1}):
+        for change in ({"retrain": True}, {"penalty": 0.1}, {"standardise": True}):
             with pytest.raises(AssertionError, match="trained again"):
                 train_network(samples, path=path, **QUICK | change)
         with pytest.raises(AssertionError, match="trained again"):
             train_network(Samples(samples.states, -samples.inputs), path=path, **QUICK)
     said = " ".join(capsys.readouterr().out.split())
     assert "other settings (penalty)" in said
+    assert "other settings (standardise)" in said
     assert "other settings (samples)" in said
     assert again.validation_error == first.validation_error
     for kept, made in zip(again.layers, first.layers, strict=True):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.mpc import LinearMPC
-from experiments.sampling import sample_policy
+from experiments.sampling import sample_draws, sample_policy
 
 MPC = LinearMPC(
     A=np.array([[1.0, 1], [0, 1]]),
@@ -120,6 +120,31 @@ def test_a_file_of_another_mpc_is_replaced_and_it_is_said(tmp_path, capsys):
 def test_a_bad_box_is_named(options, message):
     with pytest.raises(ValueError, match=message):
         sample(10, **options)
+
+
+def test_states_can_be_drawn_by_any_rule_and_blocks_may_differ_in_size(tmp_path):
+    def draw(rng):
+        return rng.normal([0, 0], [2, 0.3], (int(rng.integers(1, 9)), 2))
+
+    path, settings = tmp_path / "samples.npz", {"deviation": [2, 0.3]}
+    options = {"draw": draw, "settings": settings, "progress": False}
+    half = sample_draws(MPC, 20, 3, path=path, **options)
+    whole = sample_draws(MPC, 40, 3, path=path, **options)
+    np.testing.assert_array_equal(half.states, whole.states[:20])
+    np.testing.assert_array_equal(whole.states, sample_draws(MPC, 40, 3, **options).states)
+    np.testing.assert_array_equal(whole.inputs, MPC.batch(whole.states))
+
+
+def test_draws_that_are_never_feasible_are_named():
+    with pytest.raises(ValueError, match=r"drawn with centre 50, none was feasible"):
+        sample_draws(
+            MPC,
+            10,
+            0,
+            draw=lambda rng: rng.normal(50, 1, (5, 2)),
+            settings={"centre": 50},
+            progress=False,
+        )
 
 
 def test_no_samples_is_an_error():

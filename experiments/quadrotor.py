@@ -1,0 +1,154 @@
+"""The 6-D quadrotor of Hu, Fazlyab, Morari, Pappas (CDC 2020), section V-B: a learned controller.
+
+A network of two hidden layers imitates a nonlinear MPC that steers the quadrotor to the origin. The
+question is whether all states of an ellipsoid reach a box of positions within one second, ten steps
+of the loop, while position and actuator limits hold. The model and the task, and where they differ
+from the paper's print, are in `experiments.quadrotor_model`.
+
+    python -m experiments.quadrotor --help
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+import rich
+import tyro
+from rich.table import Table
+
+import reachjax as rj
+from experiments import quadrotor_controller, quadrotor_simulation
+from experiments.imitation import Fit, train_network, training_share
+from experiments.progress import at_least_one
+from experiments.quadrotor_model import INPUT_LIMITS, INPUT_NAMES, STEPS, initial_set, plant
+from experiments.quadrotor_mpc import QuadrotorMPC
+from experiments.sampling import Samples
+
+VALIDATION = 0.1
+"""Share of the samples that is not trained on."""
+COMPARED = 20
+"""Trajectories of the loop along which the network is compared with the MPC."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Learn the quadrotor's controller, and simulate the loop.
+
+    Samples and weights are kept under `output`: first copies of those that come with the
+    experiment, made anew when settings differ from theirs.
+    """
+
+    samples: int = 4531
+    """State-input pairs of the MPC that the network learns from."""
+    hidden: tuple[int, ...] = (32, 32)
+    """Neurons of each hidden layer."""
+    training_steps: int = 10_000
+    """Steps of Adam."""
+    penalty: float = 1e-4
+    """Weight of the squared weights in the training loss: a low gain keeps relaxations tight."""
+    seed: int = 0
+    """Of samples, initial weights and simulated trajectories."""
+    simulations: int = 100_000
+    """Trajectories simulated, half of them from the boundary of the initial set."""
+    velocity_limits: bool = False
+    """Keep the paper's `|v| <= 1` in place of the goal, which they put out of reach: another MPC,
+    sampled first (minutes)."""
+    resample: bool = False
+    """Solve the MPC for all samples (minutes) and train on these, under `output/resampled`."""
+    retrain: bool = False
+    """Train again although the weights are there."""
+    output: Path = Path("results/quadrotor")
+    """Where everything is written."""
+
+    def __post_init__(self):
+        for name in ("training_steps", "simulations"):
+            at_least_one(**{f"--{name.replace('_', '-')}": getattr(self, name)})
+        if self.samples < 2:
+            raise ValueError(f"--samples must be at least 2, but {self.samples} arrived")
+        if self.seed < 0:
+            raise ValueError(f"--seed must be at least 0, but {self.seed} arrived")
+        if not self.penalty >= 0:
+            raise ValueError(f"--penalty must be at least 0, but {self.penalty} arrived")
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"--hidden must be numbers of neurons, but {self.hidden} arrived")
+
+    @property
+    def folder(self) -> Path:
+        """Where samples and weights are."""
+        if self.velocity_limits:
+            return self.output / "velocity_limits"
+        return self.output / "resampled" if self.resample else self.output
+
+
+def learn(settings: Settings) -> tuple[Samples, Fit]:
+    """The samples and the network fitted to them, stored ones where there are."""
+    if settings.folder == settings.output:
+        quadrotor_controller.use_committed(settings.folder)
+    mpc = quadrotor_controller.teacher(settings.velocity_limits)
+    samples = quadrotor_controller.sample(mpc, settings.samples, settings.seed, settings.folder)
+    fit = train_network(
+        samples,
+        settings.hidden,
+        settings.seed,
+        penalty=settings.penalty,
+        steps=settings.training_steps,
+        validation=VALIDATION,
+        standardise=True,
+        path=settings.folder / "weights.npz",
+        retrain=settings.retrain,
+    )
+    return samples, fit
+
+
+def loop_with(fit: Fit) -> rj.ClosedLoop:
+    """The sampled plant under a network, its output projected onto the actuator limits."""
+    return rj.ClosedLoop(plant(), rj.MLP.from_layers(fit.layers), rj.Box(*INPUT_LIMITS))
+
+
+def closed_loop(settings: Settings) -> rj.ClosedLoop:
+    """The loop under the learned controller."""
+    return loop_with(learn(settings)[1])
+
+
+def error_table(mpc: QuadrotorMPC, samples: Samples, fit: Fit, states: np.ndarray) -> Table:
+    """How well the network imitates, on held-out samples and where the loop goes."""
+    visited = states[:COMPARED, :-1].reshape(-1, states.shape[-1])
+    held_out = slice(training_share(samples, VALIDATION), None)
+    parts = {
+        "held-out samples": (samples.states[held_out], samples.inputs[held_out]),
+        f"{COMPARED} trajectories of the loop": (visited, mpc.batch(visited)),
+    }
+    title = "errors of the projected network: root mean square / largest"
+    shown = Table("", *INPUT_NAMES, title=title)
+    for name, (x, u) in parts.items():
+        errors = quadrotor_controller.imitation_errors(fit.layers, x, u)
+        shown.add_row(name, *(f"{typical:.1e} / {largest:.1e}" for typical, largest in errors.T))
+    return shown
+
+
+def main(settings: Settings) -> None:
+    """Learn the controller, simulate the loop, and print how it does."""
+    settings.output.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_compilation_cache_dir", str(settings.output.parent / "jax_cache"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    samples, fit = learn(settings)
+    loop = loop_with(fit)
+    states = quadrotor_simulation.simulate(
+        loop, initial_set(), STEPS, settings.simulations, settings.seed
+    )
+    mpc = quadrotor_controller.teacher(settings.velocity_limits)
+    rich.print(error_table(mpc, samples, fit, states))
+    limits = settings.velocity_limits
+    rich.print(quadrotor_simulation.table(loop, states, velocity_limits=limits))
+    rich.print(f"written: {settings.folder}/samples.npz and weights.npz")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Settings))
+    except (ValueError, OSError, ImportError) as error:
+        raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted: run again to continue with what is stored") from None

@@ -1,0 +1,235 @@
+"""The quadrotor experiment: its samples are the MPC's, its controller does the task in simulation.
+
+Trajectories here are integrated from the original dynamics in angles, apart from the sampled plant
+that the library certifies.
+"""
+
+from itertools import pairwise
+
+import jax
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import reachjax as rj
+from experiments import imitation, quadrotor, quadrotor_controller, quadrotor_simulation
+from experiments.imitation import evaluate
+from experiments.quadrotor import Settings, closed_loop, learn, loop_with, main
+from experiments.quadrotor_controller import Draws
+from experiments.quadrotor_model import (
+    GOAL,
+    INITIAL_CENTER,
+    INPUT_LIMITS,
+    POSITION_LIMITS,
+    STEPS,
+    initial_set,
+    plant,
+)
+from experiments.quadrotor_mpc import QuadrotorMPC
+
+G = 9.81
+FEW = Draws(starts=1, steps=3)
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    """What the defaults give: the committed samples and network, nothing solved or trained."""
+
+    def refuse(*_):
+        raise AssertionError("the committed data was not used")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(imitation, "_train", refuse)
+        patch.setattr(QuadrotorMPC, "batch", refuse)
+        return learn(Settings(output=tmp_path_factory.mktemp("quadrotor")))
+
+
+@pytest.fixture(scope="module")
+def flights(learned):
+    loop = loop_with(learned[1])
+    states = quadrotor_simulation.simulate(loop, initial_set(), STEPS, 20_000, 7, progress=False)
+    return loop, states
+
+
+def flown(policy, x, steps):
+    """The state after each step of the original dynamics under `policy`."""
+    states = [x]
+    for _ in range(steps):
+        s_theta, s_phi, tau = policy(states[-1])
+        theta, phi = np.arctan(s_theta), np.arctan(s_phi)
+
+        def rate(_, x, theta=theta, phi=phi, tau=tau):
+            return [*x[3:], G * np.tan(theta), -G * np.tan(phi), tau - G]
+
+        answer = solve_ivp(rate, (0, 0.1), states[-1], rtol=1e-10, atol=1e-12)
+        states.append(answer.y[:, -1])
+    return np.array(states)
+
+
+def test_the_sampled_plant_is_the_original_dynamics():
+    rng = np.random.default_rng(0)
+    for x, u in zip(rng.normal(size=(5, 6)), rng.normal(size=(5, 3)), strict=True):
+        following = flown(lambda _, u=u: u, x, 1)[1]
+        np.testing.assert_allclose(plant().propagate(x, u), following, atol=1e-9)
+
+
+def test_the_initial_set_is_the_printed_ellipsoid():
+    box = initial_set().bounding_box()
+    np.testing.assert_allclose(box.upper - box.lower, [0.1] * 3 + [0.02] * 3)
+    np.testing.assert_allclose((box.upper + box.lower) / 2, [4.7, 4.7, 3, 0.95, 0, 0])
+
+
+def test_the_mpc_itself_meets_the_goal():
+    start = initial_set().sample_boundary(jax.random.key(1), 3)
+    for x in np.asarray(start):
+        states = flown(QuadrotorMPC(), x, STEPS)
+        assert np.all((GOAL[0] + 0.1 <= states[-1, :3]) & (states[-1, :3] <= GOAL[1] - 0.1))
+        assert np.all(abs(states[:, :3]) <= POSITION_LIMITS[1])
+
+
+def test_stored_samples_are_what_the_mpc_decides(learned):
+    samples, _ = learned
+    assert samples.states.shape == (4531, 6)
+    chosen = np.random.default_rng(0).choice(4531, 40, replace=False)
+    again = QuadrotorMPC().batch(samples.states[chosen])
+    np.testing.assert_allclose(samples.inputs[chosen], again, atol=1e-5)
+
+
+def test_stored_samples_are_drawn_as_documented(learned):
+    samples, _ = learned
+    drawn = Draws()(QuadrotorMPC(), np.random.default_rng([0, 0]))
+    assert len(drawn) == 200
+    distances = np.linalg.norm(samples.states[:150, None] - drawn[None], axis=2).min(axis=1)
+    np.testing.assert_allclose(distances, 0, atol=1e-5)
+    # Half of them are near the tube, where a uniform draw puts one in thousands.
+    near = np.all(abs(samples.states[:, 1:3] - [4, 2.5]) < [1.5, 1], axis=1)
+    assert np.mean(near & (samples.states[:, 0] > 3.2)) > 0.25
+
+
+def test_the_network_imitates_on_samples_it_was_not_trained_on(learned):
+    samples, fit = learned
+    assert [W.shape for W, _ in fit.layers] == [(32, 6), (32, 32), (3, 32)]
+    typical, _ = quadrotor_controller.imitation_errors(
+        fit.layers, samples.states[4078:], samples.inputs[4078:]
+    )
+    assert np.all(typical < [0.005, 0.005, 0.05])
+
+
+def test_every_simulated_flight_does_the_task_with_a_margin(flights):
+    loop, states = flights
+    assert states.shape == (20_000, STEPS + 1, 6)
+    assert np.all(initial_set().contains(states[:, 0], 1e-9))
+    # Every other one starts on the boundary.
+    assert not np.any(initial_set().contains(states[1::2, 0], -1e-9))
+    end = states[:, -1, :3]
+    assert np.all((GOAL[0] + 0.1 < end) & (end < GOAL[1] - 0.1))
+    assert np.all(abs(states[:, :, :3]) < POSITION_LIMITS[1] - 0.1)
+    inputs = quadrotor_simulation.inputs_along(loop, states)
+    assert inputs.shape == (20_000 * STEPS, 3)
+    assert np.all((INPUT_LIMITS[0] - 1e-12 <= inputs) & (inputs <= INPUT_LIMITS[1] + 1e-12))
+
+
+def test_the_simulated_loop_is_the_network_on_the_original_dynamics(learned, flights):
+    _, fit = learned
+    _, states = flights
+    for simulated in states[:3]:
+        expected = flown(
+            lambda x: np.clip(evaluate(fit.layers, x[None])[0], *INPUT_LIMITS), simulated[0], STEPS
+        )
+        np.testing.assert_allclose(simulated, expected, atol=1e-7)
+
+
+def test_extremes_tell_a_loop_that_breaks_each_requirement():
+    class Loop:
+        def input(self, x):
+            return x[:3]
+
+    states = np.zeros((2, 3, 6))
+    states[1, 1, 1], states[0, 2, :3] = 6, [3.9, 3.6, 2]
+    found = {
+        (requirement, name): quadrotor_simulation.margin(simulated, allowed)
+        for requirement, name, simulated, allowed in quadrotor_simulation.extremes(Loop(), states)
+    }
+    assert found["goal", "p_y"] == pytest.approx(-2.5)  # the other trajectory ends at 0
+    assert found["position limits", "p_y"] == pytest.approx(-1)
+    assert found["position limits", "p_z"] == pytest.approx(3)
+    assert found["actuator limits", "tan(phi)"] == pytest.approx(np.tan(np.pi / 9) - 6)
+    assert found["actuator limits", "tau"] == 0
+    states[1, 2, 4] = -1.25
+    rows = quadrotor_simulation.extremes(Loop(), states, velocity_limits=True)
+    assert "goal" not in {row[0] for row in rows}
+    assert quadrotor_simulation.margin(*rows[1][2:]) == pytest.approx(-0.25)
+
+
+def test_the_teacher_with_velocity_limits_has_a_plan_within_them():
+    mpc = quadrotor_controller.teacher(velocity_limits=True)
+    states = flown(mpc, INITIAL_CENTER, STEPS)
+    assert np.all(abs(states[1:, 3:]) <= 0.9 + 1e-6)
+
+
+def test_an_interrupted_resampling_continues(tmp_path, monkeypatch):
+    def sample(folder):
+        return quadrotor_controller.sample(QuadrotorMPC(), 15, 0, folder, draws=FEW, progress=False)
+
+    whole = sample(tmp_path / "whole")
+    draw, drawn = Draws.__call__, []
+
+    def interrupted(self, mpc, rng):
+        drawn.append(1)
+        if len(drawn) == 2:
+            raise KeyboardInterrupt
+        return draw(self, mpc, rng)
+
+    monkeypatch.setattr(Draws, "__call__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        sample(tmp_path / "parts")
+    resumed = sample(tmp_path / "parts")
+    np.testing.assert_array_equal(resumed.states, whole.states)
+    np.testing.assert_array_equal(resumed.inputs, whole.inputs)
+    drawn.clear()
+    sample(tmp_path / "whole")
+    assert not drawn
+
+
+def test_the_command_uses_the_committed_data_and_never_changes_it(tmp_path, capsys, monkeypatch):
+    def untrained(*_):
+        sizes = [6, 32, 32, 3]
+        return [(np.zeros((4, o, i)), np.zeros((4, o))) for i, o in pairwise(sizes)]
+
+    monkeypatch.setattr(quadrotor, "COMPARED", 1)
+    monkeypatch.setattr(imitation, "_train", untrained)
+    committed = quadrotor_controller.DATA / "quadrotor_weights.npz"
+    before = committed.read_bytes()
+    main(Settings(simulations=200, output=tmp_path))
+    said = capsys.readouterr().out
+    assert "other settings" not in said
+    assert (tmp_path / "weights.npz").read_bytes() == before
+    for word in ("goal", "position limits", "actuator limits", "held-out samples"):
+        assert word in said
+    main(Settings(simulations=200, training_steps=1, output=tmp_path))
+    assert "other settings (steps)" in " ".join(capsys.readouterr().out.split())
+    assert committed.read_bytes() == before
+    assert (tmp_path / "weights.npz").read_bytes() != before
+
+
+def test_the_loop_is_made_from_the_settings(tmp_path, learned):
+    loop = closed_loop(Settings(output=tmp_path))
+    assert isinstance(loop, rj.ClosedLoop)
+    expected = np.clip(evaluate(learned[1].layers, INITIAL_CENTER[None])[0], *INPUT_LIMITS)
+    np.testing.assert_allclose(loop.input(INITIAL_CENTER), expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"samples": 1}, "--samples must be at least 2, but 1 arrived"),
+        ({"training_steps": 0}, "--training-steps must be at least 1, got 0"),
+        ({"simulations": 0}, "--simulations must be at least 1, got 0"),
+        ({"hidden": (32, 0)}, "--hidden must be numbers of neurons"),
+        ({"penalty": -1.0}, "--penalty must be at least 0"),
+        ({"seed": -1}, "--seed must be at least 0"),
+    ],
+)
+def test_bad_settings_are_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        Settings(**change)

@@ -61,8 +61,8 @@ class ReachTube(Replaceable):
     start: int = static(default=0)
 
     def __repr__(self) -> str:
-        facets = isinstance(self.template, Template)
-        sets = f"facets={len(self.template)}" if facets else "ellipsoids"
+        template = self.template
+        sets = f"facets={len(template)}" if isinstance(template, Template) else "ellipsoids"
         return f"ReachTube(horizon={self.horizon}, {sets}, states={self.loop.states})"
 
     @property

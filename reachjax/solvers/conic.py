@@ -99,7 +99,8 @@ class _ConicSolver(AbstractSolver, abc.ABC):
             if status not in STALLED:
                 break
         seconds = time.perf_counter() - began
-        assert model is not None and scaled is not None
+        assert model is not None
+        assert scaled is not None
         found, multipliers = model.form, model.multipliers.value
         proposal = proposal._replace(status=np.array(int(status)), seconds=np.array(seconds))
         if found is None or multipliers is None:

@@ -70,8 +70,9 @@ def _bordered(n: int) -> sp.csr_array:
 class EllipsoidModel:
     """The smallest ellipsoid `|V eta| <= 1`, from `sum_k y_k G_k + V' V <= e e'`.
 
-    The Schur complement of that is affine in all unknowns. With `W` the rows of the successor, `V = R W + r e'`. Either `R`, symmetric, and `r` are sought
-    (maximise `log det R`), or `V` is given up to a factor (maximise the factor).
+    The Schur complement of that is affine in all unknowns. With `W` the rows of the successor,
+    `V = R W + r e'`. Either `R`, symmetric, and `r` are sought (maximise `log det R`), or `V` is
+    given up to a factor (maximise the factor).
     """
 
     def __init__(self, program: CompactProgram, given: NormalForm | None = None):

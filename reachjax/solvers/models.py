@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from reachjax.sets import NormalForm
 from reachjax.solvers.compact import CompactProgram
 
-FLAT = 1e-5
+FLAT = 1e-4
 """An ellipsoid has no half-axis below this part of the successors' interval radius (which keeps
 minimum-volume ellipsoids of flat sets from degenerating; the sets grow by no more)."""
 

@@ -31,12 +31,13 @@ SOLVER_PULL = 1 - 1e-7
 def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[Array, "c n_x"]:
     """Corners of a polyhedral set of few dimensions, and `count` points drawn from the set.
 
-    Of an ellipsoid, half of the points are on the surface.
+    Of an ellipsoid, half of the points are on the surface, just inside.
     """
     key = jax.random.key(seed)
     states = X0.sample(key, count)
     if isinstance(X0, Ellipsoid):
-        states = states.at[::2].set(X0.sample_boundary(key, count)[::2])
+        surface = X0.center + PULL * (X0.sample_boundary(key, count) - X0.center)
+        states = states.at[::2].set(surface[::2])
     if isinstance(X0, PolyhedralSet) and X0.dimension <= MOST_DIMENSIONS:
         with contextlib.suppress(RuntimeError):  # too thin to have corners: do without
             states = jnp.concatenate([X0.vertices(), states])

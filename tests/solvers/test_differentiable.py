@@ -41,7 +41,7 @@ PARTS = {
     "A": lambda loop, X0: loop.plant.A,
     "B": lambda loop, X0: loop.plant.B,
     "c": lambda loop, X0: loop.plant.c,
-    "initial set": lambda loop, X0: X0 if isinstance(X0, rj.Box) else X0.b,
+    "initial set": lambda loop, X0: X0.b if isinstance(X0, rj.Polytope) else X0,
     "input limits": lambda loop, X0: loop.input_box,
 }
 

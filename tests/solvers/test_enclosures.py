@@ -1,0 +1,137 @@
+"""Ellipsoids around successors: sound whatever is proposed, and their derivatives."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from reachjax.lmi import step_program
+from reachjax.recheck import sound_level
+from reachjax.sets import NormalForm
+from reachjax.solvers import Enclosure, accepted_enclosure
+from tests.loops import closed_loop, random_loop
+from tests.solvers.test_differentiable import PARTS, along, central_difference, dot
+
+
+def ellipsoid(n, seed, size=0.3):
+    rng = np.random.default_rng(seed)
+    L = np.linalg.qr(rng.normal(size=(n, n)))[0] * rng.uniform(0.5, 1.0, n) * size
+    return rj.Ellipsoid(0.3 * rng.normal(size=n), L @ L.T)
+
+
+def case(n, seed=0, hidden=(5, 3)):
+    return closed_loop(random_loop(n, hidden=hidden, seed=seed)), ellipsoid(n, seed)
+
+
+def program(loop, X, relaxation=rj.LocalBounds()):  # noqa: B008
+    rows = jnp.eye(loop.states)
+    return jax.device_get(step_program(loop, X, X.bounding_box(), rows, 0, relaxation))
+
+
+@pytest.fixture(scope="module", params=[1, 2, 3, 6])
+def solved(request):
+    """(loop, set, its program, what Clarabel proposes)."""
+    loop, X = case(request.param, seed=request.param)
+    held = program(loop, X)
+    return loop, X, held, rj.Clarabel().enclose(held)
+
+
+def successors(loop, X, count=4000):
+    key = jax.random.key(1)
+    states = jnp.concatenate([X.sample_boundary(key, count), X.sample(key, count)])
+    return jax.vmap(lambda x: loop.step(x, 0))(states)
+
+
+def test_any_multipliers_prove_a_level_that_no_trajectory_exceeds(solved):
+    loop, X, held, enclosure = solved
+    reached, rng = np.asarray(successors(loop, X)), np.random.default_rng(0)
+    K, q = len(enclosure.multipliers), loop.states
+    forms = [enclosure.form, NormalForm(rng.normal(size=(q, q)), rng.normal(size=q))]
+    garbage = [
+        np.zeros(K),
+        enclosure.multipliers,
+        -enclosure.multipliers,
+        1e3 * enclosure.multipliers,
+        rng.normal(size=K),
+        1e200 * rng.normal(size=K),
+    ]
+    for A, b in forms:
+        largest = np.linalg.norm(reached @ A.T + b, axis=1).max()
+        for multipliers in garbage:
+            assert sound_level(held, multipliers, NormalForm(A, b)) >= largest
+
+
+def test_what_clarabel_proposes_is_proved_nearly_as_it_stands(solved):
+    _, _, held, enclosure = solved
+    form, level, optimal = accepted_enclosure(held, enclosure)
+    assert optimal
+    assert 1.0 <= level <= 1 + 1e-6
+    np.testing.assert_array_equal(form.A, enclosure.form.A)
+
+
+@pytest.mark.parametrize("broken", ["nothing", "nan", "singular", "tiny", "huge"])
+def test_whatever_form_is_proposed_the_ellipsoid_holds_the_successors(solved, broken):
+    loop, X, held, enclosure = solved
+    A, b = enclosure.form
+    proposed = {
+        "nothing": Enclosure.blank(held),
+        "nan": enclosure._replace(form=NormalForm(np.nan * A, b)),
+        "singular": enclosure._replace(form=NormalForm(0.0 * A, b)),
+        "tiny": enclosure._replace(form=NormalForm(1e-9 * A, 1e-9 * b)),
+        "huge": enclosure._replace(form=NormalForm(1e9 * A, 1e9 * b)),
+    }[broken]
+    form, level, optimal = accepted_enclosure(held, proposed)
+    assert not optimal
+    region = rj.Ellipsoid.enclosing(NormalForm(*map(jnp.asarray, form)), level)
+    assert region.contains(successors(loop, X)).all()
+
+
+def test_a_wrong_shape_of_multipliers_is_named(solved):
+    _, _, held, enclosure = solved
+    with pytest.raises(ValueError, match=r"multipliers must be finite and have shape \(\d+,\)"):
+        sound_level(held, enclosure.multipliers[1:], enclosure.form)
+    with pytest.raises(ValueError, match="multipliers must be finite"):
+        sound_level(held, np.nan * enclosure.multipliers, enclosure.form)
+
+
+def final(template, horizon, solver=rj.Clarabel()):  # noqa: B008
+    """A number that depends on centre and shape of the last set, and on all volumes."""
+
+    def f(loop, X0):
+        tube = rj.reach(loop, X0, horizon, template, solver=solver)
+        n, last = loop.states, tube.sets[-1]
+        weights = jnp.asarray(np.random.default_rng(n).normal(size=(n, n)))
+        linear = last.center @ jnp.arange(1.0, n + 1) + jnp.sum(weights * last.shape)
+        return rj.log_volume(tube) + linear
+
+    return f
+
+
+def errors(f, args, h):
+    """For each part, relative to the difference, the part's gradient, or 1e-2 of the whole one."""
+    value, gradient = jax.jit(f), jax.jit(jax.grad(f, argnums=(0, 1)))(*args)
+    found = {}
+    for part in PARTS:
+        loop, X = along(part, *args, 0)
+        direction = (loop, jax.tree.map(lambda d: (d + d.T) / 2 if d.ndim == 2 else d, X))
+        exact = dot(gradient, direction)
+        difference = central_difference(value, args, direction, h)
+        held = jax.tree.map(lambda g, d: g * (d != 0), gradient, direction)
+        size = max(abs(difference), np.sqrt(dot(held, held)), 1e-2 * np.sqrt(dot(gradient, gradient)))
+        found[part] = abs(exact - difference) / size
+    return found
+
+
+if __name__ == "__main__":
+    import time
+
+    for n, seed in ((2, 0), (2, 1), (3, 0), (1, 0)):
+        for horizon in (1, 3, 10):
+            for name, T in (("free", rj.EllipsoidTemplate()), ("fixed", rj.EllipsoidTemplate(np.eye(n)))):
+                for tol, h in ((1e-11, 1e-4), (1e-9, 3e-4)):
+                    t = time.perf_counter()
+                    e = errors(final(T, horizon, rj.Clarabel(tolerance=tol)), case(n, seed, hidden=(4, 3)), h)
+                    print(n, seed, horizon, name, tol, h, {k: f"{v:.1e}" for k, v in e.items()}, f"{time.perf_counter() - t:.0f}s", flush=True)

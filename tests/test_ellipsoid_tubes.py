@@ -1,0 +1,236 @@
+"""Tubes of ellipsoids, and tubes that start from ellipsoids."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from tests.loops import closed_loop, random_loop
+from tests.networks import box_region, simplex_region
+from tests.solvers.test_enclosures import case, ellipsoid
+
+RELAXATIONS = [rj.LocalBounds(), rj.PaperQC(), rj.PaperQC(repeated=False)]
+
+
+def holds(tube, count=20_000):
+    """Whether simulated states, half of them from the boundary, are in every set."""
+    trajectories = tube.simulate(count, seed=7)
+    return [bool(X.contains(trajectories[:, t]).all()) for t, X in enumerate(tube.sets)]
+
+
+@pytest.mark.parametrize("relaxation", RELAXATIONS, ids=str)
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_no_state_is_outside_an_ellipsoid(n, relaxation):
+    tube = rj.reach(*case(n, seed=n, hidden=(4, 3)), 3, rj.EllipsoidTemplate(), relaxation)
+    assert all(holds(tube))
+    assert all((tube.proof(t).gaps >= -1e-9).all() for t in (1, 2, 3))
+    assert all(tube.proof(t).recheck() <= 1 + 1e-9 for t in (1, 2, 3))
+
+
+@pytest.mark.slow
+def test_no_state_of_six_is_outside_an_ellipsoid_of_a_varying_loop():
+    loop = closed_loop(random_loop(6, hidden=(4, 4), seed=3, steps=2))
+    tube = rj.reach(loop, ellipsoid(6, 3), 2, rj.EllipsoidTemplate())
+    assert all(holds(tube))
+
+
+@pytest.mark.parametrize("X0", ["box", "polytope", "ellipsoid"])
+@pytest.mark.parametrize("template", ["facets", "minimum volume", "given shape"])
+def test_any_set_starts_a_tube_of_any_template(X0, template):
+    region = box_region(2, 1) if X0 == "box" else simplex_region(2, 1)
+    start = {
+        "box": lambda: rj.Box(region.corners.min(axis=0), region.corners.max(axis=0)),
+        "polytope": lambda: rj.Polytope(region.A, region.b),
+        "ellipsoid": lambda: ellipsoid(2, 1),
+    }[X0]()
+    sets = {
+        "facets": rj.Template.octagonal(2),
+        "minimum volume": rj.EllipsoidTemplate(),
+        "given shape": rj.EllipsoidTemplate(shape=[[2.0, 0.5], [0.5, 1.0]]),
+    }[template]
+    tube = rj.reach(case(2, 1)[0], start, 2, sets)
+    assert all(holds(tube))
+    solved = rj.SolverStatus.SOLVED
+    assert all(s is solved for t in (1, 2) for s in tube.proof(t).statuses)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_the_image_of_an_affine_loop_is_exact(n):
+    rng = np.random.default_rng(n)
+    A, B, K, c = (rng.normal(size=s) for s in ((n, n), (n, 1), (1, n), n))
+    net = rj.MLP.from_layers([(0.3 * K, [0.1])])
+    X0, closed = ellipsoid(n, n), A + 0.3 * B @ K
+    following, _ = rj.reach_step(
+        rj.ClosedLoop(rj.AffinePlant(A, B, c), net), X0, rj.EllipsoidTemplate()
+    )
+    np.testing.assert_allclose(following.center, closed @ X0.center + 0.1 * B[:, 0] + c, atol=1e-5)
+    expected = closed @ X0.shape @ closed.T
+    np.testing.assert_allclose(following.shape, expected, atol=1e-5 * abs(expected).max())
+    facets, _ = rj.reach_step(rj.ClosedLoop(rj.AffinePlant(A, B, c), net), X0, rj.Template.box(n))
+    widths = np.sqrt(np.diag(expected))
+    middle = closed @ X0.center + 0.1 * B[:, 0] + c
+    ends = np.stack([middle + widths, widths - middle], axis=1).ravel()
+    np.testing.assert_allclose(facets.b, ends, atol=1e-6 * abs(ends).max())
+
+
+def test_a_given_shape_is_kept_and_larger_than_the_minimum_volume():
+    loop, X0 = case(2, 0)
+    shape = np.array([[2.0, 0.5], [0.5, 1.0]])
+    given = rj.reach(loop, X0, 3, rj.EllipsoidTemplate(shape=shape))
+    least = rj.reach(loop, X0, 3, rj.EllipsoidTemplate())
+    for t in (1, 2, 3):
+        size = given.sets[t].shape[0, 0] / shape[0, 0]
+        np.testing.assert_allclose(given.sets[t].shape, size * shape, rtol=1e-6)
+        assert given.sets[t].volume() >= least.sets[t].volume()
+    np.testing.assert_allclose(given.sets[1].center, loop.step(X0.center, 0))
+
+
+def test_tighter_relaxations_give_smaller_ellipsoids():
+    loop, X0 = case(3, 1)
+    volumes = [
+        float(rj.reach_step(loop, X0, rj.EllipsoidTemplate(), relaxation=r)[0].volume())
+        for r in RELAXATIONS
+    ]
+    assert volumes[0] <= volumes[1] * (1 + 1e-6)
+    assert volumes[1] <= volumes[2] * (1 + 1e-6)
+
+
+def test_a_flat_image_has_an_ellipsoid_that_is_nearly_flat():
+    plant = rj.AffinePlant([[1.0, 1.0], [2.0, 2.0]], [[0.0], [0.0]])
+    loop = rj.ClosedLoop(plant, rj.MLP.from_layers([([[0.0, 0.0]], [0.0])]))
+    tube = rj.reach(loop, rj.Ellipsoid([0.0, 0.0], np.eye(2)), 2, rj.EllipsoidTemplate())
+    assert all(holds(tube))
+    assert tube.sets[1].volume() < 1e-2
+    constant = loop.replace(plant=rj.AffinePlant(np.zeros((2, 2)), np.zeros((2, 1)), [1.0, 2.0]))
+    tube = rj.reach(constant, rj.Ellipsoid([0.0, 0.0], np.eye(2)), 2, rj.EllipsoidTemplate())
+    assert all(holds(tube))
+    assert tube.sets[1].volume() < 1e-6
+
+
+def test_specifications_are_decided_from_ellipsoids():
+    net = rj.MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net)  # x+ = 0.6 x
+    tube = rj.reach(loop, rj.Ellipsoid([1.5], [[0.25]]), 2, rj.EllipsoidTemplate())  # [1, 2]
+    proved = rj.verify(tube, goal=rj.Box([0.3], [0.8]), safe=rj.Box([0.0], [2.1]))
+    assert proved.status is rj.VerdictStatus.PROVED
+    assert proved.margins["goal"][2] == pytest.approx(0.06, abs=1e-4)
+    away = rj.verify(tube, avoid=[rj.Box([3.0], [4.0])])
+    assert away.status is rj.VerdictStatus.PROVED
+    broken = rj.verify(tube, goal=rj.Box([0.3], [0.6]))
+    assert broken.status is rj.VerdictStatus.REFUTED
+
+
+@dataclasses.dataclass(frozen=True)
+class Claiming(rj.AbstractSolver):
+    """Clarabel, with another status and multipliers off by a factor."""
+
+    status: rj.SolverStatus = rj.SolverStatus.SOLVED
+    factor: float = 1.0
+
+    def solve(self, program):
+        return rj.Clarabel().solve(program)
+
+    def enclose(self, program, form=None):
+        found = rj.Clarabel().enclose(program, form)
+        return found._replace(
+            status=np.array(int(self.status)), multipliers=self.factor * found.multipliers
+        )
+
+
+@pytest.mark.parametrize("shape", [None, np.eye(2)], ids=["free", "given"])
+@pytest.mark.parametrize("status", rj.SolverStatus)
+def test_only_a_solved_program_has_a_number_for_a_gradient(status, shape):
+    loop, X0 = case(2, 0, hidden=(3,))
+
+    def size(loop, factor=1.0):
+        solver = Claiming(status, factor)
+        tube = rj.reach(loop, X0, 1, rj.EllipsoidTemplate(shape), solver=solver)
+        return rj.log_volume(tube)
+
+    gradient = jax.grad(size)(loop)
+    finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert finite == (status is rj.SolverStatus.SOLVED)
+    wrong = jax.grad(lambda loop: size(loop, 0.5))(loop)
+    assert not any(np.isfinite(leaf).all() for leaf in jax.tree.leaves(wrong.controller))
+
+
+def test_a_failed_solver_still_gives_a_sound_ellipsoid(monkeypatch):
+    import cvxpy as cp
+
+    def fail(problem, **_):
+        raise cp.SolverError("broken")
+
+    loop, X0 = case(3, 1)
+    monkeypatch.setattr(cp.Problem, "solve", fail)
+    for shape in (None, np.eye(3)):
+        tube = rj.reach(loop, X0, 2, rj.EllipsoidTemplate(shape))
+        assert all(holds(tube))
+        assert tube.proof(1).statuses == (rj.SolverStatus.FAILED,)
+
+
+@pytest.mark.parametrize("shape", [None, np.eye(2)], ids=["free", "given"])
+def test_compiled_batched_and_plain_ellipsoids_agree(shape):
+    loop, X0 = case(2, 0, hidden=(3,))
+
+    def size(net):
+        tube = rj.reach(loop.replace(controller=net), X0, 2, rj.EllipsoidTemplate(shape))
+        return rj.log_volume(tube)
+
+    nets = [jax.tree.map(lambda w, s=s: w * s, loop.controller) for s in (0.9, 1.1)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *nets)
+    values, gradients = jax.jit(jax.vmap(jax.value_and_grad(size)))(stacked)
+    for k, net in enumerate(nets):
+        value, gradient = jax.value_and_grad(size)(net)
+        assert float(values[k]) == pytest.approx(float(value), abs=1e-6)
+        jax.tree.map(
+            lambda a, b, k=k: np.testing.assert_allclose(a[k], b, rtol=1e-3, atol=1e-5),
+            gradients,
+            gradient,
+        )
+
+
+def test_a_gradient_step_lowers_the_volume_penalty():
+    loop, X0 = case(2, 0, hidden=(4, 3))
+
+    def penalty(net):
+        return rj.volume_penalty(loop.replace(controller=net), X0, 3, rj.EllipsoidTemplate())
+
+    before, gradient = jax.value_and_grad(penalty)(loop.controller)
+    size = sum(float(jnp.sum(g**2)) for g in jax.tree.leaves(gradient))
+    after = penalty(jax.tree.map(lambda w, g: w - 1e-3 * g, loop.controller, gradient))
+    assert float(before - after) == pytest.approx(1e-3 * size, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ([[1.0, 0.0]], "EllipsoidTemplate.shape must be square"),
+        ([[1.0, 2.0], [0.0, 1.0]], "EllipsoidTemplate.shape must be symmetric"),
+        ([[1.0, 2.0], [2.0, 1.0]], "EllipsoidTemplate.shape must be positive definite"),
+        ([1.0, 2.0], r"EllipsoidTemplate.shape must be an array of shape \(n, n\)"),
+    ],
+)
+def test_bad_shapes_are_named(shape, message):
+    with pytest.raises(ValueError, match=message):
+        rj.EllipsoidTemplate(shape)
+
+
+def test_mismatches_are_named():
+    loop, X0 = case(2, 0)
+    with pytest.raises(ValueError, match=r"template is 3, but the loop's number of states is 2"):
+        rj.reach(loop, X0, 1, rj.EllipsoidTemplate(np.eye(3)))
+    with pytest.raises(TypeError, match="template must be a template, such as"):
+        rj.reach(loop, X0, 1, rj.EllipsoidTemplate)
+
+    class Facets(rj.AbstractSolver):
+        def solve(self, program):
+            return rj.Clarabel().solve(program)
+
+    with pytest.raises(NotImplementedError, match="Facets solves for facets, not for ellipsoids"):
+        rj.reach(loop, X0, 1, rj.EllipsoidTemplate(), solver=Facets())
+    certificate = rj.reach_step(loop, X0, rj.EllipsoidTemplate())[1]
+    with pytest.raises(ValueError, match=r"multipliers must have shape \(1, \d+\)"):
+        certificate.recheck(certificate.multipliers[0])

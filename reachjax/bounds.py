@@ -44,11 +44,25 @@ class LoopBounds:
     successor: Ball
 
 
-def loop_bounds(loop: ClosedLoop, box: Box, t: int | jax.Array) -> LoopBounds:
-    """Propagate a box of states through one step by interval arithmetic."""
+def loop_bounds(
+    loop: ClosedLoop, box: Box, t: int | jax.Array, known: Ball | None = None
+) -> LoopBounds:
+    """Propagate a box of states through one step by interval arithmetic.
+
+    Args:
+        loop: the closed loop.
+        box: of states.
+        t: the time.
+        known: `(k,)`, other bounds of the units' inputs, if there are any.
+    """
     units: list[tuple[Ball, Ball, Array, Array, Array]] = []
 
     def unit(activation: AbstractActivation, y: Ball) -> Ball:
+        if known is not None:
+            done = sum(len(each[0].mid) for each in units)
+            also = known[done : done + len(y.mid)]
+            lower = jnp.maximum(y.lower, also.lower)
+            y = Ball.between(lower, jnp.maximum(lower, jnp.minimum(y.upper, also.upper)))
         z = Ball.between(*activation.interval(y.lower, y.upper))
         # the ends of `y` may be rounded differently where the midpoint and the radius are formed
         rounding = gamma(8) * (abs(y.mid) + y.rad)

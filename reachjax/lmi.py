@@ -26,10 +26,11 @@ from jaxtyping import Array, Float
 
 from reachjax.basis import Rows, columns, loop_rows
 from reachjax.bounds import LoopBounds, loop_bounds
+from reachjax.preactivations import bounds_over
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.relaxation import AbstractRelaxation, FactLayout, Products
 from reachjax.rounding import Ball, gamma
-from reachjax.sets import AbstractSet, Box, NormalForm
+from reachjax.sets import AbstractSet, Box, Ellipsoid, NormalForm
 from reachjax.systems import ClosedLoop
 
 CONSTANT = 1e-9
@@ -135,7 +136,9 @@ def step_program(
         t: the time.
         relaxation: which products of facts are used.
     """
-    return _step_program(loop, X.facts(), X.cone_facts(), box, directions, t, relaxation)
+    X_round = X if isinstance(X, Ellipsoid) and relaxation.remove_stable else None
+    set_facts = X.facts(), X.cone_facts()
+    return _step_program(loop, *set_facts, X_round, box, directions, t, relaxation)
 
 
 @partial(jax.jit, static_argnames="relaxation")
@@ -143,6 +146,7 @@ def _step_program(
     loop: ClosedLoop,
     set_facts: Float[Array, "m n_x+1"],
     cone_facts: Float[Array, "r n_x+1"],
+    X: Ellipsoid | None,
     box: Box,
     directions: Float[Array, "f n_x"],
     t: int,
@@ -150,7 +154,7 @@ def _step_program(
 ) -> Program:
     n, k = loop.states, loop.units
     size = n + k + 1
-    bounds = loop_bounds(loop, box, t)
+    bounds = loop_bounds(loop, box, t) if X is None else bounds_over(loop, X, box, t)
     rows = loop_rows(loop, columns(0, n, size), n, t, bounds, relaxation.remove_stable)
     one = columns(size - 1, 1, size)
     of_the_set, cone = (

@@ -1,4 +1,4 @@
-"""How a minimum-volume ellipsoid moves with its program, by way of the central path.
+"""Minimum-volume ellipsoids on the central path, and how they move with their program.
 
 The optimum of a semidefinite program need not be differentiable, and its optimality conditions are
 singular there. The minimiser of
@@ -6,7 +6,8 @@ singular there. The minimiser of
     -log det R - mu log det Z - mu sum_k log y_k,    Z = [e e' - sum_k y_k G_k, V'; V, I],
 
 `V = R W + r e'`, is near it, unique and smooth, and moves as the implicit function theorem says,
-with the Hessian of this function. A few Newton steps lead there from a solution.
+with the Hessian of this function. A few Newton steps lead there from a solver's point, also from
+one that stalled: so that point is what is reported, and its derivative is exact.
 
 One more multiplier `t >= 0`, at a price, weighs `sum_i (1 - eta_i^2)`, so that there always is a
 point inside; the price keeps it at the size of `mu`. Everything here is numpy on the host.
@@ -24,9 +25,15 @@ from reachjax.sets import NormalForm
 from reachjax.solvers.compact import CompactProgram, compact
 from reachjax.solvers.models import FLAT
 
-WEIGHTS = (1e-7, 1e-8, 1e-9)
-"""Barrier weights `mu`, followed downwards as long as arithmetic allows: the derivative of the
-ellipsoid is off by about the square root of the last one."""
+WEIGHTS = (1e-6, 1e-7, 1e-8, 1e-9)
+"""Barrier weights `mu`, followed downwards. At the last one the logarithm of the volume is off by
+that times the number of multipliers, at most."""
+
+FROM_AFAR = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
+"""Weights to begin with where a solver stalled far from the path."""
+
+LARGEST = 10_000_000
+"""Numbers in all generators together, beyond which a solver's point is taken as it is."""
 
 STEPS = 60
 """Newton steps after which the centre counts as not found."""
@@ -73,6 +80,28 @@ class Sensitivity(NamedTuple):
         return cls(*half, *half)
 
 
+def centred(
+    program: Program, multipliers: np.ndarray, form: NormalForm
+) -> tuple[np.ndarray, NormalForm] | None:
+    """Multipliers `(K,)` and ellipsoid on the central path near a solution.
+
+    None where the path is not reached, or the program is so large that it would take long.
+    """
+    if not all(np.isfinite(part).all() for part in (multipliers, *form)):
+        return None
+    reduced = compact(program)
+    if len(reduced.kept) * (len(reduced.columns) + len(form.b)) ** 2 > LARGEST:
+        return None
+    reduced = reduced.with_units(reduced.widths)
+    barrier = _Barrier(reduced)
+    found = barrier.followed(reduced.norms * multipliers[reduced.kept], reduced.to_unit_box(form))
+    if found is None:
+        return None
+    weights = np.zeros_like(multipliers)
+    weights[reduced.kept] = found[0][: barrier.count] / reduced.norms
+    return weights, reduced.from_unit_box(barrier.form(found[0]))
+
+
 def sensitivity(
     program: Program, multipliers: np.ndarray, form: NormalForm, cotangent: NormalForm
 ) -> Sensitivity:
@@ -94,7 +123,8 @@ def sensitivity(
     found = barrier.followed(reduced.norms * multipliers[reduced.kept], reduced.to_unit_box(form))
     if found is None:
         return unknown
-    y, weight, hessian = found
+    y, hessian = found
+    weight = WEIGHTS[-1]
     w = _solved(hessian, barrier.vector(reduced.cotangent_to_unit_box(cotangent)))
     inverse = np.linalg.inv(barrier.schur(y))
     moving = np.tensordot(w, barrier.terms, 1)
@@ -150,16 +180,29 @@ class _Barrier:
 
     def followed(
         self, multipliers: np.ndarray, form: NormalForm
-    ) -> tuple[np.ndarray, float, np.ndarray] | None:
-        """The centre at the smallest weight that can be reached, the weight, the Hessian there."""
-        found, y = None, self._start(multipliers, form, WEIGHTS[0])
-        for weight in WEIGHTS:
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """The centre at the last weight and the Hessian there, None where it is not reached."""
+        near = self._start(multipliers, form, WEIGHTS[0])
+        return self._path(near, WEIGHTS) or self._path(self._inside(), FROM_AFAR + WEIGHTS)
+
+    def _path(
+        self, y: np.ndarray | None, weights: tuple[float, ...]
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        hessian = None
+        for weight in weights:
             centre = None if y is None else self._centred(y, weight)
             if centre is None:
-                break
+                return None
             y, hessian = centre
-            found = y, weight, hessian
-        return found
+        return None if y is None or hessian is None else (y, hessian)
+
+    def _inside(self) -> np.ndarray:
+        """A point inside, wherever the solution is: a large `t`, all else small."""
+        y, t = np.zeros(self.terms.shape[0]), 1 / (2 * self.n)
+        y[self.signed] = t / (4 * self.spread)
+        y[self.count] = t
+        y[self.R] = (np.sqrt(t) / (4 * self.n) * np.eye(self.q))[self.pairs]
+        return y
 
     def _start(self, multipliers: np.ndarray, form: NormalForm, weight: float) -> np.ndarray | None:
         """A point inside near a solution: a smaller `V`, and a little of `t`."""
@@ -217,6 +260,8 @@ class _Barrier:
             decrement = -float(gradient @ step)
             if decrement <= CENTRED * weight:
                 return y, hessian
+            if not np.isfinite(decrement):
+                return None
             length, wanted = 1.0, decrement / 4
             if decrement <= QUADRATIC * weight:
                 wanted = -np.inf  # too close for differences of values to be seen
@@ -232,8 +277,14 @@ def _solved(hessian: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """`hessian^-1 vector`, scaled to a unit diagonal and regularised at rounding level."""
     scale = 1 / np.sqrt(np.diag(hessian))
     matrix = hessian * np.outer(scale, scale)
-    matrix[np.diag_indices_from(matrix)] += 1e-14
-    factor = cho_factor(matrix)
+    for shift in 1e-14 * 100.0 ** np.arange(4):
+        try:
+            factor = cho_factor(matrix + shift * np.eye(len(matrix)))
+            break
+        except LinAlgError:
+            continue
+    else:
+        return np.full(len(vector), np.nan)
     solution = cho_solve(factor, scale * vector)
     residual = scale * vector - matrix @ solution  # one step of refinement
     return scale * (solution + cho_solve(factor, residual))

@@ -92,7 +92,7 @@ class _ConicSolver(AbstractSolver, abc.ABC):
         reduced, proposal = compact(program), Enclosure.blank(program)
         began, status = time.perf_counter(), SolverStatus.FAILED
         scaled = model = None
-        for factor in RESCALINGS:
+        for factor in RESCALINGS[: 1 if form is None else None]:
             scaled = reduced.with_units(reduced.widths / factor)
             model = EllipsoidModel(scaled, None if form is None else scaled.to_unit_box(form))
             status = _run(model.problem, name, options)

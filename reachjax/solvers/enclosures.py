@@ -3,8 +3,8 @@
 **A given shape.** Only its size is sought. Its factor is an optimal value, so the envelope theorem
 gives the derivative exactly, as for offsets.
 
-**Any shape.** The ellipsoid is an optimal *point*: its derivative is that of the point on the
-central path at a small barrier weight (see `centring`), and is about as accurate as that weight.
+**Any shape.** The ellipsoid is an optimal *point*. What is reported is the point on the central
+path nearby, at a small barrier weight, and its derivative (see `centring`).
 
 In both cases the derivative is NaN where the solver has no optimum that its multipliers bear out,
 and what the recheck adds to an ellipsoid is not differentiated.
@@ -22,9 +22,9 @@ from jaxtyping import Array, Bool
 
 from reachjax.lmi import Program, form_rows, schur_lagrangian
 from reachjax.sets import Ellipsoid, NormalForm
-from reachjax.solvers.accepted import accepted_enclosure
+from reachjax.solvers.accepted import ANSWERS, accepted_enclosure
 from reachjax.solvers.base import AbstractSolver, Enclosure, SolverStatus
-from reachjax.solvers.centring import Sensitivity, sensitivity
+from reachjax.solvers.centring import Sensitivity, centred, sensitivity
 from reachjax.solvers.differentiable import asked_for
 from reachjax.solvers.host import on_host
 
@@ -59,6 +59,11 @@ def _solve(
         blank = Enclosure.blank(program)
         return blank.form, np.array(np.nan), np.array(False), blank
     enclosure = solver.enclose(program, given)
+    if given is None and int(enclosure.status) in ANSWERS:
+        found = centred(program, enclosure.multipliers, enclosure.form)
+        if found is not None:
+            solved = np.array(int(SolverStatus.SOLVED))
+            enclosure = enclosure._replace(multipliers=found[0], form=found[1], status=solved)
     return *accepted_enclosure(program, enclosure, given), enclosure
 
 

@@ -120,7 +120,9 @@ def errors(f, args, h):
         exact = dot(gradient, direction)
         difference = central_difference(value, args, direction, h)
         held = jax.tree.map(lambda g, d: g * (d != 0), gradient, direction)
-        size = max(abs(difference), np.sqrt(dot(held, held)), 1e-2 * np.sqrt(dot(gradient, gradient)))
+        size = max(
+            abs(difference), np.sqrt(dot(held, held)), 1e-2 * np.sqrt(dot(gradient, gradient))
+        )
         found[part] = abs(exact - difference) / size
     return found
 
@@ -130,8 +132,25 @@ if __name__ == "__main__":
 
     for n, seed in ((2, 0), (2, 1), (3, 0), (1, 0)):
         for horizon in (1, 3, 10):
-            for name, T in (("free", rj.EllipsoidTemplate()), ("fixed", rj.EllipsoidTemplate(np.eye(n)))):
+            for name, T in (
+                ("free", rj.EllipsoidTemplate()),
+                ("fixed", rj.EllipsoidTemplate(np.eye(n))),
+            ):
                 for tol, h in ((1e-11, 1e-4), (1e-9, 3e-4)):
                     t = time.perf_counter()
-                    e = errors(final(T, horizon, rj.Clarabel(tolerance=tol)), case(n, seed, hidden=(4, 3)), h)
-                    print(n, seed, horizon, name, tol, h, {k: f"{v:.1e}" for k, v in e.items()}, f"{time.perf_counter() - t:.0f}s", flush=True)
+                    e = errors(
+                        final(T, horizon, rj.Clarabel(tolerance=tol)),
+                        case(n, seed, hidden=(4, 3)),
+                        h,
+                    )
+                    print(
+                        n,
+                        seed,
+                        horizon,
+                        name,
+                        tol,
+                        h,
+                        {k: f"{v:.1e}" for k, v in e.items()},
+                        f"{time.perf_counter() - t:.0f}s",
+                        flush=True,
+                    )

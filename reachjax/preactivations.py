@@ -27,6 +27,8 @@ def bounds_over(loop: ClosedLoop, X: Ellipsoid, box: Box, t: int | jax.Array) ->
         box: a box around it.
         t: the time.
     """
+    if loop.units == 0:
+        return loop_bounds(loop, box, t)
     n, size = loop.states, loop.states + loop.units + 1
 
     def once(_, bounds: LoopBounds) -> LoopBounds:

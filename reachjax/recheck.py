@@ -90,7 +90,7 @@ def sound_level(program: Program, multipliers: np.ndarray, form: NormalForm) -> 
         size, squares = abs(V.mid), V.mid.T @ V.mid
         error = gamma(q + 4) * (size.T @ size) + V.rad.T @ (size + V.rad) + size.T @ V.rad
         half = _proved(program, multipliers, Ball(squares, error * (1 + gamma(8))), by_intervals)
-    return float(np.sqrt(max(2 * half, 0.0)) * (1 + gamma(4)))
+    return float(np.sqrt(max(2 * np.fmin(half, by_intervals), 0.0)) * (1 + gamma(4)))
 
 
 def _proved(program: Program, multipliers: np.ndarray, goal: Ball, by_intervals: float) -> float:

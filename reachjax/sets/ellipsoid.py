@@ -146,7 +146,9 @@ class Ellipsoid(AbstractSet):
         Q, q = self.shape, self.center
         squares = jnp.einsum("mi,ij,mj->m", D, Q, D)
         sizes = jnp.einsum("mi,ij,mj->m", abs(D), abs(Q), abs(D))
-        reach = jnp.sqrt(squares + gamma(2 * n) * sizes)
+        above = squares + gamma(2 * n) * sizes
+        some = above > 0  # the root has no derivative at zero
+        reach = jnp.where(some, jnp.sqrt(jnp.where(some, above, 1.0)), 0.0)
         rounding = gamma(n + 4) * (abs(D) @ abs(q) + reach)
         return D @ q + reach + rounding
 

@@ -76,15 +76,16 @@ def accepted_enclosure(
     Returns:
         The form, the level, and whether it is the relaxation's optimum.
     """
-    form, level = _interval_form(program) if given is None else given, np.inf
-    for candidate in (form, enclosure.form):
-        if not _invertible(candidate):
-            continue
-        proved = max(1.0, sound_level(program, np.asarray(enclosure.multipliers), candidate))
-        if _log_volume(candidate, proved) <= _log_volume(form, level):
-            form, level = candidate, proved
-    proposed = np.array_equal(form.A, enclosure.form.A)
-    optimal = proposed and int(enclosure.status) in ANSWERS and level <= 1 + SHORTFALL
+    multipliers = np.asarray(enclosure.multipliers)
+    form, level = enclosure.form, np.inf
+    if _invertible(form):
+        level = max(1.0, sound_level(program, multipliers, form))
+    optimal = int(enclosure.status) in ANSWERS and level <= 1 + SHORTFALL
+    if not optimal:
+        other = _interval_form(program) if given is None else given
+        proved = sound_level(program, multipliers, other)
+        if not _log_volume(form, level) <= _log_volume(other, proved):
+            form, level = other, proved
     return form, np.array(level), np.array(optimal)
 
 

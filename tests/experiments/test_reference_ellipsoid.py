@@ -1,8 +1,8 @@
 """The library's minimum-volume ellipsoids are those of a program written from the paper alone.
 
 Each set of a tube is compared with the reference's step from the library's set before it. The sets
-are small enough for theorem 1 to prove less than intervals do: the library reports an ellipsoid
-around interval bounds where that is the smaller one.
+are small enough for theorem 1 to prove smaller ones than intervals do: the library reports the box
+of interval bounds, in an ellipsoid, where that is smaller.
 """
 
 import math

@@ -20,8 +20,8 @@ PLANES = ((0, 1), (0, 2))
 """Of the paper's two figures."""
 NOTE = """\
 |A x + b|: largest simulated value; at most 1 on the certified ellipsoid
-beyond: by how much the certified range exceeds the simulated one at its looser end
-actuator limits: hold by construction, the network's output is projected onto them"""
+beyond: excess of the certified range over the simulated one, at its looser end
+actuator limits: hold by construction, as outputs are projected onto them"""
 
 
 @dataclasses.dataclass(frozen=True)

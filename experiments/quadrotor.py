@@ -1,24 +1,29 @@
-"""The 6-D quadrotor of Hu, Fazlyab, Morari, Pappas (CDC 2020), section V-B: a learned controller.
+"""The 6-D quadrotor of Hu, Fazlyab, Morari, Pappas (CDC 2020), section V-B, certified.
 
-A network of two hidden layers imitates a nonlinear MPC that steers the quadrotor to the origin. The
-question is whether all states of an ellipsoid reach a box of positions within one second, ten steps
-of the loop, while position and actuator limits hold. The model and the task, and where they differ
-from the paper's print, are in `experiments.quadrotor_model`.
+A network of two hidden layers imitates a nonlinear MPC that steers the quadrotor to the origin.
+Reach-SDP bounds the states of the loop by ellipsoids, and decides whether all states of the initial
+one reach a box of positions within one second, ten steps, while position limits hold at all times.
+Actuator limits hold by construction: the network's output is projected onto them. The model and the
+task, and where they differ from the paper's print, are in `experiments.quadrotor_model`.
 
     python -m experiments.quadrotor --help
 """
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import jax
 import numpy as np
 import rich
 import tyro
+from rich.progress import track
 from rich.table import Table
 
 import reachjax as rj
-from experiments import quadrotor_controller, quadrotor_simulation
+from experiments import quadrotor_controller, quadrotor_report, quadrotor_simulation
+from experiments.double_integrator import RELAXATIONS
 from experiments.imitation import Fit, train_network, training_share
 from experiments.progress import at_least_one
 from experiments.quadrotor_model import INPUT_LIMITS, INPUT_NAMES, STEPS, initial_set, plant
@@ -33,12 +38,15 @@ COMPARED = 20
 
 @dataclass(frozen=True)
 class Settings:
-    """Learn the quadrotor's controller, and simulate the loop.
+    """Learn the quadrotor's controller, simulate the loop, and certify it with Reach-SDP.
 
-    Samples and weights are kept under `output`: first copies of those that come with the
-    experiment, made anew when settings differ from theirs.
+    Samples, weights, results and the figure are kept under `output`; samples and weights are first
+    copies of those that come with the experiment, made anew when settings differ from theirs.
     """
 
+    relaxation: Literal["local-bounds", "paper-repeated", "paper"] = "local-bounds"
+    """Which products of facts are used; "paper" leaves out lambda_ij. The paper's two keep every
+    neuron in the program: minutes a step, and here too loose or too hard for the solver."""
     samples: int = 4531
     """State-input pairs of the MPC that the network learns from."""
     hidden: tuple[int, ...] = (32, 32)
@@ -75,7 +83,7 @@ class Settings:
 
     @property
     def folder(self) -> Path:
-        """Where samples and weights are."""
+        """Where samples and weights are, and where results go."""
         if self.velocity_limits:
             return self.output / "velocity_limits"
         return self.output / "resampled" if self.resample else self.output
@@ -127,11 +135,34 @@ def error_table(mpc: QuadrotorMPC, samples: Samples, fit: Fit, states: np.ndarra
     return shown
 
 
+def certify(loop: rj.ClosedLoop, states, settings: Settings) -> quadrotor_report.Analysis:
+    """The tube of the loop, and the verdict."""
+    began = time.perf_counter()
+    tube = rj.reach(
+        loop,
+        initial_set(),
+        STEPS,
+        rj.EllipsoidTemplate(),
+        RELAXATIONS[settings.relaxation],
+        seed=settings.seed,
+        progress=lambda steps: track(steps, f"certifying, {settings.relaxation}"),
+    )
+    seconds = time.perf_counter() - began
+    verdict = rj.verify(
+        tube,
+        goal=None if settings.velocity_limits else quadrotor_report.goal_set(),
+        safe=quadrotor_report.safe_set(settings.velocity_limits),
+        samples=settings.simulations,
+        seed=settings.seed,
+    )
+    return quadrotor_report.Analysis(settings.relaxation, tube, verdict, states, seconds)
+
+
 def main(settings: Settings) -> None:
-    """Learn the controller, simulate the loop, and print how it does."""
+    """Learn, simulate, certify, print, and write the figure and the results."""
     settings.output.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", str(settings.output.parent / "jax_cache"))
+    jax.config.update("jax_compilation_cache_dir", str(settings.output / "jax_cache"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     samples, fit = learn(settings)
     loop = loop_with(fit)
@@ -142,7 +173,15 @@ def main(settings: Settings) -> None:
     rich.print(error_table(mpc, samples, fit, states))
     limits = settings.velocity_limits
     rich.print(quadrotor_simulation.table(loop, states, velocity_limits=limits))
-    rich.print(f"written: {settings.folder}/samples.npz and weights.npz")
+    analysis = certify(loop, states, settings)
+    rich.print(quadrotor_report.step_table(analysis))
+    rich.print(quadrotor_report.position_table(analysis))
+    rich.print(quadrotor_report.requirement_table(analysis))
+    rich.print(quadrotor_report.NOTE)
+    rich.print(f"\n{analysis.verdict}")
+    quadrotor_report.draw(analysis, settings.folder / "tubes.png")
+    quadrotor_report.write(settings, analysis, settings.folder / "results.json")
+    rich.print(f"written: {settings.folder}/tubes.png, results.json, samples.npz and weights.npz")
 
 
 if __name__ == "__main__":

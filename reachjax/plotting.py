@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from reachjax.reach import ReachTube
-from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
+from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,60 +20,105 @@ OUTLINE = 200
 SAMPLES = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
 
 
-def plot_set(region: AbstractSet, ax: Axes | None = None, **style: Any) -> Axes:
-    """Draw the outline of a bounded set in the plane.
+def plot_set(
+    region: AbstractSet,
+    ax: Axes | None = None,
+    coordinates: tuple[int, int] | None = None,
+    **style: Any,
+) -> Axes:
+    """Draw the outline of a bounded set, or of its shadow on two coordinates.
 
     Args:
-        region: a set of two dimensions.
+        region: a set of two or more dimensions.
         ax: where to draw; a new figure by default.
+        coordinates: the two to draw, counted from 0: the horizontal axis, then the vertical one. A
+            set of more than two dimensions needs them.
         style: keyword arguments of `matplotlib.patches.Polygon`.
 
     Raises:
-        ValueError: the set has another dimension, or is unbounded.
+        ValueError: the set has one dimension, or is unbounded, or the coordinates are not two of
+            its own.
+
+    Example:
+        >>> from reachjax import Box
+        >>> ax = plot_set(Box([0, 1, 2], [1, 3, 5]), coordinates=(2, 0))
+        >>> ax.dataLim.extents.tolist()
+        [2.0, 0.0, 5.0, 1.0]
     """
-    if region.dimension != 2:
-        raise ValueError(f"a set of dimension 2 can be drawn, but {region.dimension} arrived")
+    if coordinates is None and region.dimension > 2:
+        raise ValueError(
+            f"a set of dimension {region.dimension} arrived: choose the two coordinates to draw, "
+            "such as coordinates=(0, 1)"
+        )
+    i, j = _two_of(region.dimension, (0, 1) if coordinates is None else coordinates)
     from matplotlib.patches import Polygon
 
     ax = _axes(ax)
-    ax.add_patch(Polygon(_outline(region), closed=True, **{**SET, **style}))
+    ax.add_patch(Polygon(_outline(region, i, j), closed=True, **{**SET, **style}))
     ax.autoscale_view()
     return ax
 
 
-def _outline(region: AbstractSet) -> np.ndarray:
-    """Points around a set of the plane, in order."""
+def _two_of(dimension: int, coordinates: Any) -> tuple[int, int]:
+    """Two different coordinates of a space, or an error that says what was wrong."""
+    if dimension < 2:
+        raise ValueError(f"two or more dimensions can be drawn, but {dimension} arrived")
+    chosen = tuple(coordinates) if np.ndim(coordinates) == 1 else ()
+    known = [i for i in range(dimension) if i in chosen]
+    if len(chosen) != 2 or len(known) != 2:
+        raise ValueError(
+            f"coordinates must be two different ones of 0 .. {dimension - 1}, "
+            f"but {coordinates!r} arrived"
+        )
+    return int(chosen[0]), int(chosen[1])
+
+
+def _outline(region: AbstractSet, i: int, j: int) -> np.ndarray:
+    """Points around a set's shadow on two coordinates, in order."""
     if isinstance(region, Ellipsoid):
+        shadow = region.projection(i, j)
         angles = np.linspace(0, 2 * np.pi, OUTLINE, endpoint=False)
         circle = np.column_stack([np.cos(angles), np.sin(angles)])
-        return np.asarray(region.center) + circle @ np.linalg.cholesky(region.shape).T
+        return np.asarray(shadow.center) + circle @ np.linalg.cholesky(shadow.shape).T
+    if isinstance(region, Box):
+        box = region.bounding_box()  # a box of many dimensions has too many corners to list
+        region = Box(box.lower[np.array([i, j])], box.upper[np.array([i, j])])
+        i, j = 0, 1
     assert isinstance(region, PolyhedralSet)
-    corners = np.asarray(region.vertices())
-    around = corners - corners.mean(axis=0)
-    return corners[np.argsort(np.arctan2(around[:, 1], around[:, 0]))]
+    corners = np.asarray(region.vertices())[:, [i, j]]
+    try:
+        return corners[ConvexHull(corners).vertices]
+    except QhullError:  # on a line: its two ends
+        return corners[np.lexsort(corners.T)[[0, -1]]]
 
 
-def plot_tube(tube: ReachTube, ax: Axes | None = None, samples: int = 2000) -> Axes:
-    """Draw the sets of a tube over simulated states, in the plane.
+def plot_tube(
+    tube: ReachTube,
+    ax: Axes | None = None,
+    samples: int = 2000,
+    coordinates: tuple[int, int] = (0, 1),
+) -> Axes:
+    """Draw the sets of a tube over simulated states: shadows, where there are more than two.
 
     Args:
-        tube: of a loop with two states.
+        tube: of a loop with two or more states.
         ax: where to draw; a new figure by default.
         samples: how many trajectories to show.
+        coordinates: the two states to draw, counted from 0: the horizontal axis, then the vertical
+            one.
 
     Raises:
-        ValueError: the loop has another number of states.
+        ValueError: the loop has one state, or the coordinates are not two of its states.
     """
-    if tube.loop.states != 2:
-        raise ValueError(f"a tube of 2 states can be drawn, but {tube.loop.states} arrived")
+    i, j = _two_of(tube.loop.states, coordinates)
     ax = _axes(ax)
-    trajectories = np.asarray(tube.simulate(samples))
+    trajectories = np.asarray(tube.simulate(samples))[:, :, [i, j]]
     for t, region in enumerate(tube.sets):
         ax.scatter(*trajectories[:, t].T, **SAMPLES, label="simulated" if t == 0 else None)
         first = {"edgecolor": "black", "label": "initial set"} if t == 0 else {}
-        plot_set(region, ax, **(first or {"label": "certified" if t == 1 else None}))
-    ax.set_xlabel("$x_1$")
-    ax.set_ylabel("$x_2$")
+        plot_set(region, ax, (i, j), **(first or {"label": "certified" if t == 1 else None}))
+    ax.set_xlabel(f"$x_{{{i + 1}}}$")
+    ax.set_ylabel(f"$x_{{{j + 1}}}$")
     return ax
 
 

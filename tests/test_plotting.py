@@ -42,11 +42,90 @@ def test_a_tube_is_drawn_on_the_axes_given():
     plt.close("all")
 
 
-def test_sets_of_other_dimensions_are_refused():
+def outline(region, *coordinates):
+    """The points drawn, and the Axes closed."""
+    import matplotlib.pyplot as plt
+
     from reachjax.plotting import plot_set
 
-    with pytest.raises(ValueError, match="dimension 2 can be drawn, but 3 arrived"):
-        plot_set(rj.Box([0, 0, 0], [1, 1, 1]))
+    ax = plot_set(region, coordinates=coordinates or None)
+    plt.close("all")
+    return np.asarray(ax.patches[0].get_xy()[:-1])
+
+
+def test_the_shadow_of_an_ellipsoid_reaches_its_support_in_every_direction_of_the_plane():
+    root = np.random.default_rng(0).normal(size=(6, 6))
+    ellipsoid = rj.Ellipsoid(np.arange(6.0), root @ root.T)
+    points = outline(ellipsoid, 4, 1)
+    for angle in np.linspace(0, 2 * np.pi, 11):
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        lifted = np.zeros((1, 6))
+        lifted[0, [4, 1]] = direction
+        reached = (points @ direction).max() - direction @ [4, 1]
+        support = float(ellipsoid.support(lifted)[0]) - direction @ [4, 1]
+        assert 0.999 * support <= reached <= support
+
+
+def test_the_shadow_of_a_polytope_is_the_hull_of_its_shadowed_corners():
+    octahedron = rj.Polytope(
+        [[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)], [1, 1, 1, 1, 1, 1, 1, 1]
+    )
+    points = outline(octahedron, 2, 0)
+    assert {tuple(np.round(p, 9) + 0.0) for p in points} == {(1, 0), (0, 1), (-1, 0), (0, -1)}
+
+
+def test_the_shadow_of_a_box_of_any_dimension_is_a_rectangle():
+    lower = np.arange(40.0)
+    points = outline(rj.Box(lower, lower + 0.5), 30, 2)
+    assert {tuple(p) for p in points} == {(30, 2), (30.5, 2), (30, 2.5), (30.5, 2.5)}
+
+
+def test_a_flat_set_is_drawn_as_a_line():
+    prism = rj.Box([0, 0, 1], [1, 2, 1])
+    assert {tuple(p) for p in outline(prism, 2, 1)} == {(1, 0), (1, 2)}
+    assert {tuple(p) for p in outline(rj.Polytope(*prism.facets), 2, 1)} == {(1, 0), (1, 2)}
+
+
+def test_the_coordinates_of_a_planar_set_may_be_swapped():
+    assert {tuple(p) for p in outline(rj.Box([0, 1], [0, 3]), 1, 0)} == {(1, 0), (3, 0)}
+
+
+def loop_of(states):
+    net = rj.MLP.from_layers([(np.zeros((1, states)), [0.0])])
+    return rj.ClosedLoop(rj.AffinePlant(np.eye(states) / 2, np.zeros((states, 1))), net)
+
+
+@pytest.mark.parametrize("template", [rj.Template.box(3), rj.EllipsoidTemplate()])
+def test_a_tube_of_three_states_is_drawn_on_the_coordinates_given(template):
+    import matplotlib.pyplot as plt
+
+    from reachjax.plotting import plot_tube
+
+    X0 = rj.Ellipsoid([1.0, 2.0, 3.0], np.diag([0.25, 1.0, 4.0]))
+    ax = plot_tube(rj.reach(loop_of(3), X0, 1, template), samples=50, coordinates=(2, 0))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$x_{3}$", "$x_{1}$")
+    lower, upper = ax.patches[1].get_xy().min(axis=0), ax.patches[1].get_xy().max(axis=0)
+    np.testing.assert_allclose([lower, upper], [[0.5, 0.25], [2.5, 0.75]], atol=1e-3)
+    assert ax.collections[1].get_offsets().shape == (50, 2)
+    plt.close("all")
+
+
+def test_what_cannot_be_drawn_is_refused():
+    from reachjax.plotting import plot_set, plot_tube
+
+    cube = rj.Box([0, 0, 0], [1, 1, 1])
+    with pytest.raises(ValueError, match="dimension 3 arrived: choose the two coordinates"):
+        plot_set(cube)
+    for wrong in [(0, 3), (1, 1), (0,), (0, 1, 2), (-1, 0), (0.5, 1), 1, "01"]:
+        with pytest.raises(ValueError, match=r"two different ones of 0 \.\. 2, but .* arrived"):
+            plot_set(cube, coordinates=wrong)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="two or more dimensions can be drawn, but 1 arrived"):
+        plot_set(rj.Box([0], [1]))
+    tube = rj.reach(loop_of(1), rj.Box([0], [1]), 1, rj.Template.box(1))
+    with pytest.raises(ValueError, match="two or more dimensions can be drawn, but 1 arrived"):
+        plot_tube(tube)
+    with pytest.raises(ValueError, match="unbounded"):
+        plot_set(rj.Polytope([[1, 0]], [1]))
 
 
 def test_importing_the_package_changes_no_flag_and_loads_neither_cvxpy_nor_matplotlib():

@@ -1,9 +1,10 @@
-"""The quadrotor experiment: its samples are the MPC's, its controller does the task in simulation.
+"""The quadrotor experiment: its samples are the MPC's, its controller does the task, and provably.
 
 Trajectories here are integrated from the original dynamics in angles, apart from the sampled plant
 that the library certifies.
 """
 
+import json
 from itertools import pairwise
 
 import jax
@@ -12,9 +13,15 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import reachjax as rj
-from experiments import imitation, quadrotor, quadrotor_controller, quadrotor_simulation
+from experiments import (
+    imitation,
+    quadrotor,
+    quadrotor_controller,
+    quadrotor_report,
+    quadrotor_simulation,
+)
 from experiments.imitation import evaluate
-from experiments.quadrotor import Settings, closed_loop, learn, loop_with, main
+from experiments.quadrotor import Settings, certify, closed_loop, learn, loop_with, main
 from experiments.quadrotor_controller import Draws
 from experiments.quadrotor_model import (
     GOAL,
@@ -49,6 +56,11 @@ def flights(learned):
     loop = loop_with(learned[1])
     states = quadrotor_simulation.simulate(loop, initial_set(), STEPS, 20_000, 7, progress=False)
     return loop, states
+
+
+@pytest.fixture(scope="module")
+def analysis(flights):
+    return certify(*flights, Settings(simulations=1000))
 
 
 def flown(policy, x, steps):
@@ -161,6 +173,61 @@ def test_extremes_tell_a_loop_that_breaks_each_requirement():
     assert quadrotor_simulation.margin(*rows[1][2:]) == pytest.approx(-0.25)
 
 
+@pytest.mark.slow
+def test_no_simulated_state_is_outside_its_ellipsoid_and_none_is_much_too_large(analysis):
+    tube = analysis.tube
+    starts = 100_000
+    states = quadrotor_simulation.simulate(
+        tube.loop, initial_set(), STEPS, starts, seed=11, progress=False
+    )
+    for t, region in enumerate(tube.sets):
+        values = np.asarray(region.bounded_values(states[:, t]))
+        # starts on the boundary are rounded
+        assert values.max() <= (1 + 1e-12 if t == 0 else 1), t
+        assert values.max() > 0.97, t
+    assert analysis.verdict.status is rj.VerdictStatus.PROVED
+
+
+@pytest.mark.slow
+def test_the_report_agrees_with_the_verdict(analysis):
+    margins = {
+        (requirement, name): quadrotor_simulation.margin(certified, allowed)
+        for requirement, name, certified, allowed in analysis.requirements()
+    }
+    for requirement, reported in (("goal", "goal"), ("safe", "position limits")):
+        smallest = min(value for (name, _), value in margins.items() if name == reported)
+        expected = np.nanmin(analysis.verdict.margins[requirement])
+        assert smallest == pytest.approx(expected, abs=1e-12)
+        assert smallest > 0.1
+    for row in analysis.steps():
+        certified, simulated = (
+            np.array(row[f"{kind}_positions"]) for kind in ("certified", "simulated")
+        )
+        assert np.all((certified[0] < simulated[0]) & (simulated[1] < certified[1]))
+
+
+def test_goal_and_safe_set_bound_positions_and_on_request_velocities():
+    goal, safe = quadrotor_report.goal_set(), quadrotor_report.safe_set(velocity_limits=False)
+    slow = quadrotor_report.safe_set(velocity_limits=True)
+    states = np.array([[3.9, 3, 2, 9, 9, 9], [3.9, 3.6, 2, 0, 0, 0], [3.9, 3, 5.1, 0, 0, 0]])
+    assert goal.contains(states).tolist() == [True, False, False]
+    assert safe.contains(states).tolist() == [True, True, False]
+    assert slow.contains(states).tolist() == [False, True, False]
+
+
+@pytest.mark.slow
+def test_with_velocity_limits_these_replace_the_goal(flights, tmp_path):
+    loop, states = flights
+    settings = Settings(velocity_limits=True, simulations=1000, output=tmp_path)
+    analysis = certify(loop, states, settings)  # the controller that is made for the goal
+    assert analysis.verdict.status is rj.VerdictStatus.REFUTED
+    assert {row[0] for row in analysis.requirements()} == {"velocity limits", "position limits"}
+    quadrotor_report.draw(analysis, tmp_path / "tubes.png")
+    quadrotor_report.write(settings, analysis, tmp_path / "results.json")
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert np.abs(np.array(results["counterexample"])[:, 3:]).max() > 1
+
+
 def test_the_teacher_with_velocity_limits_has_a_plan_within_them():
     mpc = quadrotor_controller.teacher(velocity_limits=True)
     states = flown(mpc, INITIAL_CENTER, STEPS)
@@ -191,6 +258,14 @@ def test_an_interrupted_resampling_continues(tmp_path, monkeypatch):
     assert not drawn
 
 
+def certify_one_step(loop, states, settings):
+    """Quickly, for a controller about which nothing is claimed."""
+    tube = rj.reach(loop, initial_set(), 1, rj.EllipsoidTemplate())
+    verdict = rj.verify(tube, goal=quadrotor_report.goal_set(), samples=100)
+    return quadrotor_report.Analysis(settings.relaxation, tube, verdict, states, 0.0)
+
+
+@pytest.mark.slow
 def test_the_command_uses_the_committed_data_and_never_changes_it(tmp_path, capsys, monkeypatch):
     def untrained(*_):
         sizes = [6, 32, 32, 3]
@@ -206,6 +281,16 @@ def test_the_command_uses_the_committed_data_and_never_changes_it(tmp_path, caps
     assert (tmp_path / "weights.npz").read_bytes() == before
     for word in ("goal", "position limits", "actuator limits", "held-out samples"):
         assert word in said
+    assert "PROVED" in said
+    assert "actuator limits: hold by construction" in said
+    written = {path.name for path in tmp_path.glob("*.*")}
+    assert written == {"samples.npz", "weights.npz", "tubes.png", "results.json"}
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["verdict"] == "PROVED"
+    assert [step["step"] for step in results["steps"]] == list(range(1, STEPS + 1))
+    assert all(0 < step["simulated"] <= 1 for step in results["steps"])
+    assert results["certified_margins"]["goal p_x"] > 0.1
+    monkeypatch.setattr(quadrotor, "certify", certify_one_step)
     main(Settings(simulations=200, training_steps=1, output=tmp_path))
     assert "other settings (steps)" in " ".join(capsys.readouterr().out.split())
     assert committed.read_bytes() == before

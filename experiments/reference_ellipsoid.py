@@ -106,9 +106,12 @@ def paper_ellipsoid_step(
     middle, spread = _whitening(xi @ E_out[:-1].T)
     best = EllipsoidStep(np.full(n_x, np.nan), np.full((n_x, n_x), np.nan), "solver_error", 0.0)
     for unit in UNITS:
-        root, offset, status = _smallest(facts, signs, E_out @ T, middle, unit * spread, options)
+        found = _smallest(facts, signs, E_out @ T, middle, unit * spread, options)
+        root, offset, status = found
         if status != best.status:
-            best = EllipsoidStep(middle - root @ offset, root @ root.T, status, 0.0)
+            best = EllipsoidStep(
+                middle - np.asarray(root) @ np.asarray(offset), root @ root.T, status, 0.0
+            )
         if status == cp.OPTIMAL:
             break
     return best._replace(seconds=time.perf_counter() - start)

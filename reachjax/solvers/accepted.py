@@ -66,12 +66,16 @@ def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
 
 
 def accepted_enclosure(
-    program: Program, enclosure: Enclosure, given: NormalForm | None = None
+    program: Program,
+    enclosure: Enclosure,
+    given: NormalForm | None = None,
+    centred: bool = False,
 ) -> tuple[NormalForm, np.ndarray, np.ndarray]:
-    """The ellipsoid `|A x+ + b| <= level` to report, its level being what is proved, at least 1.
+    """The ellipsoid `|A x+ + b| <= level` to report, its level being what is proved.
 
-    Where the solver proposes nothing of use, it is `given`, or the ellipsoid around the box of
-    successors.
+    It counts as the relaxation's optimum if it is on the central path, or if the solver answers and
+    what is proved is as large as what it proposes; the level is then 1 at least. Where the solver
+    proposes nothing of use, the ellipsoid is `given`, or that around the box of successors.
 
     Returns:
         The form, the level, and whether it is the relaxation's optimum.
@@ -79,9 +83,12 @@ def accepted_enclosure(
     multipliers = np.asarray(enclosure.multipliers)
     form, level = enclosure.form, np.inf
     if _invertible(form):
-        level = max(1.0, sound_level(program, multipliers, form))
-    optimal = int(enclosure.status) in ANSWERS and level <= 1 + SHORTFALL
-    if not optimal:
+        level = sound_level(program, multipliers, form)
+    borne_out = int(enclosure.status) in ANSWERS and 1 - SHORTFALL <= level <= 1 + SHORTFALL
+    optimal = borne_out or (centred and level <= 1 + SHORTFALL)
+    if optimal:
+        level = max(1.0, level)
+    else:
         other = _interval_form(program) if given is None else given
         proved = sound_level(program, multipliers, other)
         if not _log_volume(form, level) <= _log_volume(other, proved):
@@ -90,7 +97,9 @@ def accepted_enclosure(
 
 
 def _log_volume(form: NormalForm, level: float) -> float:
-    return len(form.b) * np.log(level) - np.linalg.slogdet(form.A)[1]
+    if not np.isfinite(level):
+        return np.inf
+    return len(form.b) * np.log(max(level, 1e-300)) - np.linalg.slogdet(form.A)[1]
 
 
 def _interval_form(program: Program) -> NormalForm:

@@ -112,12 +112,12 @@ def _implied_by_cone(program: Program, facts: np.ndarray, generators: sp.csc_arr
     """
     cone = np.asarray(program.products.sign) < 0
     if not cone.any():
-        return np.zeros(generators.shape[1], dtype=bool)
+        return np.zeros(len(program.products.free), dtype=bool)
     state = (facts[np.asarray(program.products.left)[cone]] != 0).any(axis=0)
     state[-1] = True
     outside = ~np.outer(state, state).ravel()
     beyond = abs(generators[np.flatnonzero(outside)]).sum(axis=0) > 0
-    its_own = np.zeros(generators.shape[1], dtype=bool)
+    its_own = np.zeros(len(program.products.free), dtype=bool)
     its_own[np.asarray(program.products.multiplier)[cone]] = True
     return ~np.asarray(beyond).ravel() & ~its_own
 

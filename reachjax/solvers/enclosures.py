@@ -59,12 +59,13 @@ def _solve(
         blank = Enclosure.blank(program)
         return blank.form, np.array(np.nan), np.array(False), blank
     enclosure = solver.enclose(program, given)
+    found = None
     if given is None and int(enclosure.status) in ANSWERS:
-        found = centred(program, enclosure.multipliers, enclosure.form)
-        if found is not None:
-            solved = np.array(int(SolverStatus.SOLVED))
-            enclosure = enclosure._replace(multipliers=found[0], form=found[1], status=solved)
-    return *accepted_enclosure(program, enclosure, given), enclosure
+        found = centred(program, np.asarray(enclosure.multipliers), enclosure.form)
+    if found is not None:
+        solved = np.array(int(SolverStatus.SOLVED))
+        enclosure = enclosure._replace(multipliers=found[0], form=found[1], status=solved)
+    return *accepted_enclosure(program, enclosure, given, found is not None), enclosure
 
 
 def _shapes(program: Program) -> tuple[NormalForm, Any, Any, Enclosure]:

@@ -23,6 +23,10 @@ from reachjax.rounding import Ball
 from reachjax.systems import AbstractActivation, ClosedLoop
 from reachjax.systems.activations import UnitFacts
 
+CONSTANT = 1e-6
+"""An input that varies by no more than this part of itself has no caps among its facts: they would
+be as small, their multipliers as large as its inverse, and derivatives would lose those digits."""
+
 
 @pytree
 class Rows(Ball):
@@ -87,7 +91,9 @@ def loop_rows(
             passing, blocking = bounds.passing[here], bounds.blocking[here]
             z = (z.where(~passing & ~blocking) + y.where(passing)).widened(bounds.excess[here])
         interval = bounds.preactivation[here]
-        units.append((y, z, activation.facts(y, z, interval.lower, interval.upper)))
+        facts = activation.facts(y, z, interval.lower, interval.upper)
+        telling = interval.rad > CONSTANT * abs(interval.mid)
+        units.append((y, z, facts.capped_where(telling)))
         return z
 
     successor = loop.step(state, t, unit)

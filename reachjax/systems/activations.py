@@ -12,7 +12,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 class UnitFacts(NamedTuple):
@@ -25,6 +25,11 @@ class UnitFacts(NamedTuple):
     slack: Any
     output_cap: Any
     slack_cap: Any
+
+    def capped_where(self, mask: Bool[Array, " k"]) -> UnitFacts:
+        """The caps only of some units; those of the others become `0 >= 0`."""
+        output_cap, slack_cap = self.output_cap.where(mask), self.slack_cap.where(mask)
+        return self._replace(output_cap=output_cap, slack_cap=slack_cap)
 
 
 class AbstractActivation(abc.ABC):

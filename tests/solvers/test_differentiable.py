@@ -371,3 +371,17 @@ def test_a_failed_solve_has_no_number_for_a_gradient(monkeypatch):
     bound, gradient = jax.value_and_grad(value)(loop, X0)
     assert np.isfinite(bound)  # the interval bound
     assert all(np.isnan(leaf).any() for leaf in jax.tree.leaves(gradient.controller.layers[-1]))
+
+
+def test_a_neuron_whose_weights_have_decayed_does_not_spoil_the_gradient():
+    """Its input is constant but for 1e-10: facts of that size would have multipliers of 1e5."""
+    loop, X0 = planar(3)
+    (W0, b0), (W1, b1), last = loop.controller.layers
+    faint = W1.at[0].set(1e-10 * W1[0]), b1.at[0].set(-0.2)
+    net = loop.controller.replace(layers=((W0, b0), faint, last))
+    args = (loop.replace(controller=net), X0)
+    gradient = jax.grad(value, argnums=(0, 1))(*args)
+    assert abs(gradient[0].controller.layers[1][0][0]).max() <= 1e-3
+    assert (
+        relative_error(jax.jit(value), args, gradient, along("weights", *args, 0), 1e-5) <= PROMISED
+    )

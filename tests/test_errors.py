@@ -110,7 +110,7 @@ BAD_TYPES = {
     r"ClosedLoop\.input_box must .* a tuple": lambda: rj.ClosedLoop(PLANT, NET, (-1, 1)),
     r"X0 must be .*\[\[0, 0\], \[1, 1\]\]": lambda: reach(X0=[[0, 0], [1, 1]]),
     "loop must be a ClosedLoop": lambda: reach(loop=NET),
-    "template must be a Template": lambda: reach(template=TEMPLATE.directions),
+    "template must be a template": lambda: reach(template=TEMPLATE.directions),
     "relaxation must be a relaxation object.*class.*LocalBounds": lambda: reach(
         relaxation=rj.LocalBounds
     ),

@@ -8,7 +8,18 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 from pathlib import Path
 
 import jax
+import pytest
+
+# One cache a worker: JAX writes entries in place, so another process could read half of one.
+CACHE = Path(__file__).parent / ".jax_cache" / os.environ.get("PYTEST_XDIST_WORKER", "main")
 
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent / ".jax_cache"))
+jax.config.update("jax_compilation_cache_dir", str(CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_code_is_dropped():
+    """Forget a file's compiled functions after it: kept, they fill gigabytes and end the process."""
+    yield
+    jax.clear_caches()

@@ -29,12 +29,12 @@ import jax
 import numpy as np
 import rich
 import tyro
-from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import reachjax as rj
 from experiments import double_integrator
+from experiments.command import blank_table
 from experiments.double_integrator import INITIAL_BOX, INPUT_BOX, A, B
 from experiments.reference import basis_sizes, paper_step
 from reachjax.solvers.compact import compact
@@ -243,7 +243,7 @@ def compare(rows: list[dict]) -> list[dict]:
 def table(rows: list[dict]) -> Table:
     """One case, a method a row."""
     title = f"{rows[0]['case']}, {rows[0]['clock']} seconds"
-    shown = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title_style="bold")
+    shown = blank_table(title)
     shown.add_column("method", no_wrap=True)
     for heading in ("n", "mult", "s/step", "first", "faster", "diff", "slack"):
         shown.add_column(heading, justify="right", no_wrap=True)

@@ -14,14 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import jax
 import numpy as np
 import rich
-import tyro
 from rich.progress import track
 
 import reachjax as rj
 from experiments import report
+from experiments.command import configure_jax, run_experiment
 from experiments.imitation import Fit, train_network
 from experiments.mpc import LinearMPC
 from experiments.sampling import sample_policy
@@ -170,10 +169,7 @@ def certify(name: str, fit: Fit, relaxation: str, settings: Settings) -> report.
 
 def main(settings: Settings) -> None:
     """Train, certify, print, and write the figure and the results."""
-    settings.output.mkdir(parents=True, exist_ok=True)
-    jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", str(settings.output / "jax_cache"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    configure_jax(settings.output)
     margins = {"as printed": 0.0, "with margin": settings.margin}
     fits = {name: controller(name, margin, settings) for name, margin in margins.items()}
     analyses = [
@@ -196,9 +192,4 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Settings))
-    except (ValueError, OSError) as error:
-        raise SystemExit(f"error: {error}") from None
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted: run again to continue with what is stored") from None
+    run_experiment(main, Settings)

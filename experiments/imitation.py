@@ -25,7 +25,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from experiments import stored
-from experiments.progress import at_least_one, bar
+from experiments.command import at_least_one, bar
 from experiments.sampling import Samples
 
 # Training steps are compiled in blocks of this size.

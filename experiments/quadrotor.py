@@ -14,18 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import jax
 import numpy as np
 import rich
-import tyro
 from rich.progress import track
 from rich.table import Table
 
 import reachjax as rj
 from experiments import quadrotor_controller, quadrotor_report, quadrotor_simulation
+from experiments.command import at_least_one, blank_table, configure_jax, run_experiment
 from experiments.double_integrator import RELAXATIONS
 from experiments.imitation import Fit, train_network, training_share
-from experiments.progress import at_least_one
 from experiments.quadrotor_model import INPUT_LIMITS, INPUT_NAMES, STEPS, initial_set, plant
 from experiments.quadrotor_mpc import QuadrotorMPC
 from experiments.sampling import Samples
@@ -128,7 +126,7 @@ def error_table(mpc: QuadrotorMPC, samples: Samples, fit: Fit, states: np.ndarra
         f"{COMPARED} trajectories of the loop": (visited, mpc.batch(visited)),
     }
     title = "errors of the projected network: root mean square / largest"
-    shown = Table("", *INPUT_NAMES, title=title)
+    shown = blank_table(title, "", *INPUT_NAMES)
     for name, (x, u) in parts.items():
         errors = quadrotor_controller.imitation_errors(fit.layers, x, u)
         shown.add_row(name, *(f"{typical:.1e} / {largest:.1e}" for typical, largest in errors.T))
@@ -160,10 +158,7 @@ def certify(loop: rj.ClosedLoop, states, settings: Settings) -> quadrotor_report
 
 def main(settings: Settings) -> None:
     """Learn, simulate, certify, print, and write the figure and the results."""
-    settings.output.mkdir(parents=True, exist_ok=True)
-    jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", str(settings.output / "jax_cache"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    configure_jax(settings.output)
     samples, fit = learn(settings)
     loop = loop_with(fit)
     states = quadrotor_simulation.simulate(
@@ -185,9 +180,4 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Settings))
-    except (ValueError, OSError, ImportError) as error:
-        raise SystemExit(f"error: {error}") from None
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted: run again to continue with what is stored") from None
+    run_experiment(main, Settings)

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 import reachjax as rj
+from experiments.command import blank_table
 from experiments.quadrotor_model import GOAL, POSITION_LIMITS, VELOCITY_LIMITS
 from experiments.quadrotor_simulation import extremes, margin
 from experiments.report import COLOURS
@@ -96,7 +96,7 @@ def _positions(box: Float[ndarray, "2 3"]) -> rj.Polytope:
 
 def step_table(analysis: Analysis) -> Table:
     """A row a step: how the solver ended, the ellipsoid's size and how tight it is."""
-    table = _table(f"certified ellipsoids, {analysis.relaxation}")
+    table = blank_table(f"certified ellipsoids, {analysis.relaxation}")
     for heading in ("t", "solver", "volume", "|A x + b|", "seconds"):
         table.add_column(heading, justify="right", no_wrap=True)
     for row in analysis.steps():
@@ -107,7 +107,7 @@ def step_table(analysis: Analysis) -> Table:
 
 def position_table(analysis: Analysis) -> Table:
     """A row a step: where the quadrotor surely is, beside where it was simulated."""
-    table = _table("certified positions, and how far beyond the simulated ones")
+    table = blank_table("certified positions, and how far beyond the simulated ones")
     table.add_column("t", justify="right", no_wrap=True)
     for name in AXES:
         table.add_column(name, no_wrap=True)
@@ -128,17 +128,13 @@ def requirement_table(analysis: Analysis) -> Table:
     """The certified ranges and their margins, under the verdict."""
     name = analysis.verdict.status.name
     title = f"[{COLOURS[name]}]{name}[/] with {analysis.relaxation}, {analysis.seconds:.1f} s"
-    table = _table(title)
+    table = blank_table(title)
     for heading in ("requirement", "", "certified", "allowed", "margin"):
         table.add_column(heading, no_wrap=True)
     for requirement, coordinate, certified, allowed in analysis.requirements():
         ranges = (f"{lower:.4f} .. {upper:.4f}" for lower, upper in (certified, allowed))
         table.add_row(requirement, coordinate, *ranges, f"{margin(certified, allowed):.4f}")
     return table
-
-
-def _table(title: str) -> Table:
-    return Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title_style="bold")
 
 
 def draw(analysis: Analysis, path: Path) -> None:

@@ -8,7 +8,7 @@ from numpy import ndarray
 from rich.table import Table
 
 import reachjax as rj
-from experiments.progress import at_least_one, bar
+from experiments.command import at_least_one, bar, blank_table
 from experiments.quadrotor_model import (
     GOAL,
     INPUT_LIMITS,
@@ -83,7 +83,7 @@ def table(
     loop: rj.ClosedLoop, states: Float[ndarray, "count steps+1 6"], *, velocity_limits: bool = False
 ) -> Table:
     """`extremes` and their margins."""
-    shown = Table("requirement", "", "simulated", "allowed", "margin", title="simulation")
+    shown = blank_table("simulation", "requirement", "", "simulated", "allowed", "margin")
     for requirement, name, simulated, allowed in extremes(
         loop, states, velocity_limits=velocity_limits
     ):

@@ -91,7 +91,7 @@ def paper_ellipsoid_step(
     start = time.perf_counter()
     boxed, n_x = u_lower is not None, len(center)
     factor = np.linalg.cholesky(shape)
-    xi = basis_points(layers, u_lower, u_upper, center + _ball(n_x, SAMPLES) @ factor.T)
+    xi = basis_points(layers, u_lower, u_upper, center + unit_ball(n_x, SAMPLES) @ factor.T)
     E_in, E_out = paper_E_in(layers, boxed), paper_E_out(layers, A, B, c, boxed)
     affine = not boxed and len(layers) == 1
     E_mid = np.eye(1, n_x + 1, n_x) if affine else paper_E_mid(layers, u_lower, u_upper)
@@ -103,18 +103,29 @@ def paper_ellipsoid_step(
     if not affine:
         Q, signs = _relu_multipliers(E_mid @ T, repeated)
         facts = facts + (E_mid @ T).T @ Q @ (E_mid @ T)
-    middle, spread = _whitening(xi @ E_out[:-1].T)
+    found = smallest_ellipsoid(facts, signs, E_out @ T, xi @ E_out[:-1].T, options)
+    return found._replace(seconds=time.perf_counter() - start)
+
+
+def smallest_ellipsoid(facts, signs, E_out, successors, options=None):
+    """The Schur complement's problem in the units in which it is solved best.
+
+    facts (n, n): an expression that is never negative on a trajectory; signs: its multipliers'
+    constraints; E_out (n_x + 1, n): rows of the successor and of 1; successors (k, n_x): samples,
+    for the units. `options` as in `paper_ellipsoid_step`. Returns an EllipsoidStep of 0 seconds.
+    """
+    n_x = len(E_out) - 1
+    middle, spread = _whitening(successors)
     best = EllipsoidStep(np.full(n_x, np.nan), np.full((n_x, n_x), np.nan), "solver_error", 0.0)
     for unit in UNITS:
-        found = _smallest(facts, signs, E_out @ T, middle, unit * spread, options)
-        root, offset, status = found
+        root, offset, status = _smallest(facts, signs, E_out, middle, unit * spread, options)
         if status != best.status:
             best = EllipsoidStep(
                 middle - np.asarray(root) @ np.asarray(offset), root @ root.T, status, 0.0
             )
         if status == cp.OPTIMAL:
             break
-    return best._replace(seconds=time.perf_counter() - start)
+    return best
 
 
 def _smallest(facts, signs, E_out, middle, spread, options):
@@ -178,7 +189,7 @@ def _whitening(points):
     return middle, axes * np.sqrt(np.maximum(squares, 1e-8 * squares.max()))
 
 
-def _ball(n, count):
+def unit_ball(n, count):
     """Points (count, n) of the unit ball, half of them on its surface."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(count, n))

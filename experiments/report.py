@@ -5,11 +5,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from scipy.spatial import ConvexHull, QhullError
 
 import reachjax as rj
+from experiments.command import blank_table
 from experiments.imitation import Fit
 
 NOTE = """\
@@ -58,7 +58,7 @@ def _hull_area(points: np.ndarray) -> float:
 
 def step_table(analyses: list[Analysis]) -> Table:
     """Controllers side by side, a row a step."""
-    table = _table(f"{analyses[0].relaxation}, window 1")
+    table = blank_table(f"{analyses[0].relaxation}, window 1")
     table.add_column("\nt", justify="right")
     for analysis in analyses:
         for k, column in enumerate(("area", "hull", "gap", "solver")):
@@ -75,7 +75,7 @@ def step_table(analyses: list[Analysis]) -> Table:
 
 def verdict_table(analyses: list[Analysis]) -> Table:
     """What each relaxation decides of each controller, with the smallest margins."""
-    table = _table("verdicts")
+    table = blank_table("verdicts")
     for heading in ("controller", "relaxation", "verdict"):
         table.add_column(heading, no_wrap=True)
     for heading in ("goal", "constraint", "reach"):
@@ -92,10 +92,6 @@ def verdict_table(analyses: list[Analysis]) -> Table:
             f"{analysis.seconds:.1f} s",
         )
     return table
-
-
-def _table(title: str) -> Table:
-    return Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title_style="bold")
 
 
 def draw(analyses: list[Analysis], goal: np.ndarray, safe: np.ndarray, path: Path) -> None:

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from experiments import stored
+from experiments.command import at_least_one, bar
 from experiments.mpc import LinearMPC
-from experiments.progress import at_least_one, bar
 
 # Candidate states are drawn in blocks of this size. The file is written after each block, so an
 # interruption loses a fraction of a second.

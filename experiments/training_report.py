@@ -5,10 +5,10 @@ import json
 from pathlib import Path
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 import reachjax as rj
+from experiments.command import blank_table
 from experiments.double_integrator import GOAL_BOX, STATE_BOX
 from experiments.fine_tuning import HORIZON, Outcome, certified_tube
 from experiments.report import COLOURS
@@ -31,7 +31,7 @@ def tables(outcomes: Outcomes, goals: tuple[float, ...], cost: StepCost) -> list
 
 def verdict_table(outcomes: Outcomes) -> Table:
     """How many controllers are proved, and at what imitation error."""
-    table = _table("verdicts, and root mean square errors on samples not trained on")
+    table = blank_table("verdicts, and root mean square errors on samples not trained on")
     table.add_column("trained", no_wrap=True)
     for status in COLOURS:
         table.add_column(status.lower(), justify="right", no_wrap=True)
@@ -51,7 +51,7 @@ def verdict_table(outcomes: Outcomes) -> Table:
 
 def seed_table(outcomes: Outcomes) -> Table:
     """Each network: error, and certified margin of the constraint in the colour of the verdict."""
-    table = _table("each network: imitation error, and certified margin of the constraint")
+    table = blank_table("each network: imitation error, and certified margin of the constraint")
     table.add_column("\nseed", justify="right")
     for heading in ("error", "margin"):
         for k, way in enumerate(outcomes):
@@ -68,7 +68,7 @@ def seed_table(outcomes: Outcomes) -> Table:
 
 def area_table(outcomes: Outcomes) -> Table:
     """Areas at each step: certified and simulated."""
-    table = _table("areas: of plain training, and ratios to it (medians over networks)")
+    table = blank_table("areas: of plain training, and ratios to it (medians over networks)")
     table.add_column("\nt", justify="right")
     for way in outcomes:
         for k, column in enumerate(("certified", "hull")):
@@ -87,7 +87,7 @@ def area_table(outcomes: Outcomes) -> Table:
 
 def goal_table(outcomes: Outcomes, goals: tuple[float, ...]) -> Table:
     """The share of networks that verify for goals of shrinking size."""
-    table = _table("networks proved to reach the goal box of this half-width, and to be safe")
+    table = blank_table("networks proved to reach the goal box of this half-width, and to be safe")
     table.add_column("trained", no_wrap=True)
     for half in goals:
         table.add_column(f"{half:g}", justify="right")
@@ -99,7 +99,7 @@ def goal_table(outcomes: Outcomes, goals: tuple[float, ...]) -> Table:
 
 def cost_table(outcomes: Outcomes, cost: StepCost) -> Table:
     """Seconds of training steps."""
-    table = _table("seconds of a training step")
+    table = blank_table("seconds of a training step")
     table.add_column("what", no_wrap=True)
     table.add_column("seconds", justify="right")
     for way, group in outcomes.items():
@@ -224,7 +224,3 @@ def _save(figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     plt.close(figure)
-
-
-def _table(title: str) -> Table:
-    return Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title_style="bold")

@@ -18,16 +18,14 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes run side by side
 
-import jax
 import rich
-import tyro
 
 from experiments import training_report
+from experiments.command import at_least_one, bar, configure_jax, run_experiment
 from experiments.double_integrator import Settings as Teacher
 from experiments.double_integrator import linear_mpc
 from experiments.fine_tuning import Outcome, Tuning, run
 from experiments.imitation import train_networks
-from experiments.progress import at_least_one, bar
 from experiments.sampling import Samples, sample_policy
 from experiments.step_cost import step_cost
 
@@ -118,20 +116,13 @@ def ways(settings: Settings) -> dict[str, Tuning]:
     }
 
 
-def configure(cache: Path) -> None:
-    """JAX as every process needs it."""
-    jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", str(cache))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-
-
 def train_on(networks, samples: Samples, settings: Settings) -> dict[str, list[Outcome]]:
     """Every network in every way, in processes side by side."""
     pool = ProcessPoolExecutor(
         settings.workers,
         mp_context=multiprocessing.get_context("spawn"),
-        initializer=configure,
-        initargs=(settings.output / "jax_cache",),
+        initializer=configure_jax,
+        initargs=(settings.output,),
     )
     with bar() as shown, pool:
         jobs = {
@@ -153,8 +144,7 @@ def train_on(networks, samples: Samples, settings: Settings) -> dict[str, list[O
 
 def main(settings: Settings) -> None:
     """Sample, train, certify, print, and write figures and results."""
-    settings.output.mkdir(parents=True, exist_ok=True)
-    configure(settings.output / "jax_cache")
+    configure_jax(settings.output)
     mpc = linear_mpc(margin=0.0)
     lower, upper = mpc.state_lower, mpc.state_upper
     path = settings.output / "samples.npz"
@@ -183,9 +173,4 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Settings))
-    except (ValueError, OSError) as error:
-        raise SystemExit(f"error: {error}") from None
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted: run again to continue with what is stored") from None
+    run_experiment(main, Settings)

@@ -23,7 +23,7 @@ from reachjax.rounding import Ball
 from reachjax.systems import AbstractActivation, ClosedLoop
 from reachjax.systems.activations import UnitFacts
 
-CONSTANT = 1e-6
+STEADY = 1e-6
 """An input that varies by no more than this part of itself has no caps among its facts: they would
 be as small, their multipliers as large as its inverse, and derivatives would lose those digits."""
 
@@ -92,7 +92,7 @@ def loop_rows(
             z = (z.where(~passing & ~blocking) + y.where(passing)).widened(bounds.excess[here])
         interval = bounds.preactivation[here]
         facts = activation.facts(y, z, interval.lower, interval.upper)
-        telling = interval.rad > CONSTANT * abs(interval.mid)
+        telling = interval.rad > STEADY * abs(interval.mid)
         units.append((y, z, facts.capped_where(telling)))
         return z
 

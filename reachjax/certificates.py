@@ -20,8 +20,21 @@ from reachjax.sets import Ellipsoid, NormalForm
 from reachjax.solvers import Enclosure, Solution, SolverStatus, accepted_offsets
 
 
+@pytree
 class AbstractCertificate(Replaceable, abc.ABC):
-    """What the proof of one step's set has, whatever the set: see its two kinds."""
+    """What the proof of one step's set has, whatever the set.
+
+    Attributes:
+        program: facts, products and objective rows over the scaled basis.
+        multipliers: `(f, K)`, one row for each semidefinite program.
+        moments: `(f, n, n)`, dual matrices over the unscaled basis with corner 1; NaN where the
+            solver gave none.
+        codes: `(f,)`, how the solver ended, as values of `SolverStatus`.
+        bounds: `(f,)`, what was proved.
+        witnesses: `(f,)`, the largest simulated values of what is bounded.
+        witness_states: `(f, n_x)`, the initial states that attain them.
+        seconds: `(f,)`, solver time.
+    """
 
     program: Program
     multipliers: Float[Array | np.ndarray, "f K"]
@@ -49,30 +62,13 @@ class AbstractCertificate(Replaceable, abc.ABC):
 
 @pytree
 class Certificate(AbstractCertificate):
-    """Proof of the offsets of one step, `directions x[t] <= bounds`.
+    """Proof of the offsets of one step, `directions x[t] <= bounds`: one program a facet.
 
     Attributes:
-        program: facts, products and objectives over the scaled basis.
-        multipliers: `(f, K)`, one row a facet.
-        moments: `(f, n, n)`, dual matrices over the unscaled basis with corner 1; NaN where the
-            solver gave none.
-        codes: `(f,)`, how the solver ended, as values of `SolverStatus`.
         solver_offsets: `(f,)`, what the solver itself claimed; not bounds.
-        bounds: `(f,)`, the offsets that were proved.
-        witnesses: `(f,)`, the largest simulated value of each direction.
-        witness_states: `(f, n_x)`, the initial states that attain them.
-        seconds: `(f,)`, solver time.
     """
 
-    program: Program
-    multipliers: Float[Array | np.ndarray, "f K"]
-    moments: Float[Array | np.ndarray, "f n n"]
-    codes: Int[Array | np.ndarray, " f"]
     solver_offsets: Float[Array | np.ndarray, " f"]
-    bounds: Float[Array | np.ndarray, " f"]
-    witnesses: Float[Array | np.ndarray, " f"]
-    witness_states: Float[Array | np.ndarray, "f n_x"]
-    seconds: Float[Array | np.ndarray, " f"]
 
     @classmethod
     def from_solution(
@@ -126,28 +122,13 @@ class Certificate(AbstractCertificate):
 class EllipsoidCertificate(AbstractCertificate):
     """Proof of the ellipsoid of one step, `|A x[t] + b| <= 1`: one program, so `f = 1`.
 
+    What is bounded, by 1, is `|A x[t] + b|`.
+
     Attributes:
-        program: facts, products and the rows of the successor over the scaled basis.
         form: `A` and `b` of the set.
-        multipliers: `(1, K)`.
-        moments: `(1, n, n)`, the dual matrix over the unscaled basis with corner 1; NaN where the
-            solver gave none.
-        codes: `(1,)`, how the solver ended, as a value of `SolverStatus`.
-        bounds: `(1,)`, what `|A x + b|` surely does not exceed: 1.
-        witnesses: `(1,)`, its largest simulated value.
-        witness_states: `(1, n_x)`, the initial state that attains it.
-        seconds: `(1,)`, solver time.
     """
 
-    program: Program
     form: NormalForm
-    multipliers: Float[Array | np.ndarray, "1 K"]
-    moments: Float[Array | np.ndarray, "1 n n"]
-    codes: Int[Array | np.ndarray, " 1"]
-    bounds: Float[Array | np.ndarray, " 1"]
-    witnesses: Float[Array | np.ndarray, " 1"]
-    witness_states: Float[Array | np.ndarray, "1 n_x"]
-    seconds: Float[Array | np.ndarray, " 1"]
 
     @classmethod
     def from_enclosure(

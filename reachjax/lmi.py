@@ -57,6 +57,12 @@ class Program(Replaceable):
     shift: Float[Array, " n"]
     scale: Float[Array, " n"]
 
+    def with_midpoints(self, facts: Float[Array, "m n"], objective: Float[Array, "f n"]) -> Program:
+        """The same program with other coefficients and the rounding errors of these."""
+        return self.replace(
+            facts=Rows(facts, self.facts.rad), objective=Rows(objective, self.objective.rad)
+        )
+
 
 def scaling(shift: Float[Array, " n"], scale: Float[Array, " n"]) -> Float[Array, "n n"]:
     """`T` with `T eta = shift + scale * eta`, the constant entry staying 1."""

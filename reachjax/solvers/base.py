@@ -10,7 +10,6 @@ import abc
 import enum
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -66,12 +65,6 @@ class Solution(NamedTuple):
     moments: Float[Array | np.ndarray, "f n n"]
     statuses: Int[Array | np.ndarray, " f"]
     seconds: Float[Array | np.ndarray, " f"]
-
-    @classmethod
-    def shapes(cls, facets: int, multipliers: int, size: int) -> Solution:
-        """The shapes and types of all fields, as JAX wants to know them beforehand."""
-        blank = cls.blank(facets, multipliers, size)
-        return jax.tree.map(lambda field: jax.ShapeDtypeStruct(field.shape, field.dtype), blank)
 
     @classmethod
     def blank(cls, facets: int, multipliers: int, size: int) -> Solution:

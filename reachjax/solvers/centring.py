@@ -23,6 +23,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 from reachjax.lmi import Program
 from reachjax.sets import NormalForm
 from reachjax.solvers.compact import CompactProgram, compact
+from reachjax.solvers.host import all_finite
 from reachjax.solvers.models import FLAT
 
 WEIGHTS = (1e-6, 1e-7, 1e-8, 1e-9)
@@ -87,19 +88,12 @@ def centred(
 
     None where the path is not reached, or the program is so large that it would take long.
     """
-    if not all(np.isfinite(part).all() for part in (multipliers, *form)):
-        return None
     reduced = compact(program)
     if len(reduced.kept) * (len(reduced.columns) + len(form.b)) ** 2 > LARGEST:
         return None
-    reduced = reduced.with_units(reduced.widths)
     barrier = _Barrier(reduced)
-    found = barrier.followed(reduced.norms * multipliers[reduced.kept], reduced.to_unit_box(form))
-    if found is None:
-        return None
-    weights = np.zeros_like(multipliers)
-    weights[reduced.kept] = found[0][: barrier.count] / reduced.norms
-    return weights, reduced.from_unit_box(barrier.form(found[0]))
+    found = barrier.followed(multipliers, form)
+    return None if found is None else barrier.unscaled(found[0], len(multipliers))
 
 
 def sensitivity(
@@ -113,29 +107,22 @@ def sensitivity(
         form: the solution.
         cotangent: weights of `A` and `b`.
     """
-    unknown = Sensitivity.unknown(program)
-    given = (multipliers, *form, *cotangent)
-    if not all(np.isfinite(part).all() for part in given):
-        return unknown
-    reduced = compact(program)
-    reduced = reduced.with_units(reduced.widths)
-    barrier = _Barrier(reduced)
-    found = barrier.followed(reduced.norms * multipliers[reduced.kept], reduced.to_unit_box(form))
+    barrier = _Barrier(compact(program))
+    found = barrier.followed(multipliers, form) if all_finite(cotangent) else None
     if found is None:
-        return unknown
+        return Sensitivity.unknown(program)
     y, hessian = found
     weight = WEIGHTS[-1]
-    w = _solved(hessian, barrier.vector(reduced.cotangent_to_unit_box(cotangent)))
+    w = _solved(hessian, barrier.vector(cotangent))
     inverse = np.linalg.inv(barrier.schur(y))
     moving = np.tensordot(w, barrier.terms, 1)
     size, q = len(program.scale), len(form.b)
-    used = np.ix_(*2 * [np.r_[reduced.columns, size + np.arange(q)]])
+    used = np.ix_(*2 * [np.r_[barrier.program.columns, size + np.arange(q)]])
     halves = []
     for vector, moments in ((y, -weight * inverse @ moving @ inverse), (w, -weight * inverse)):
-        whole, weights = np.zeros((size + q, size + q)), np.zeros(len(multipliers))
+        whole = np.zeros((size + q, size + q))
         whole[used] = moments
-        weights[reduced.kept] = vector[: barrier.count] / reduced.norms
-        halves += [weights, reduced.from_unit_box(barrier.form(vector)), whole]
+        halves += [*barrier.unscaled(vector, len(multipliers)), whole]
     return Sensitivity(*halves)
 
 
@@ -143,6 +130,7 @@ class _Barrier:
     """The function of this module's docstring, of `[multipliers, t, R, r]` in one vector."""
 
     def __init__(self, program: CompactProgram):
+        self.program = program = program.with_units(program.widths)
         W = program.objective
         self.q, self.n = q, n = W.shape
         self.count = len(program.kept)
@@ -174,15 +162,29 @@ class _Barrier:
         return NormalForm(np.tensordot(y[self.R], self.symmetric, 1), y[-self.q :])
 
     def vector(self, cotangent: NormalForm) -> np.ndarray:
-        """The gradient of `<cotangent, (R, r)>` in the variables."""
-        zero = np.zeros(self.count + 1)
+        """The gradient of `<cotangent, (A, b)>` in the variables."""
+        zero, cotangent = np.zeros(self.count + 1), self.program.cotangent_to_unit_box(cotangent)
         return np.r_[zero, np.tensordot(self.symmetric, cotangent.A, 2), cotangent.b]
+
+    def unscaled(self, y: np.ndarray, count: int) -> tuple[np.ndarray, NormalForm]:
+        """Multipliers `(count,)` of the whole program, and `A` and `b`; linear."""
+        multipliers = np.zeros(count)
+        multipliers[self.program.kept] = y[: self.count] / self.program.norms
+        return multipliers, self.program.from_unit_box(self.form(y))
 
     def followed(
         self, multipliers: np.ndarray, form: NormalForm
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The centre at the last weight and the Hessian there, None where it is not reached."""
-        near = self._start(multipliers, form, WEIGHTS[0])
+        """The centre at the last weight and the Hessian there, None where it is not reached.
+
+        Args:
+            multipliers: `(K,)`, near it or not.
+            form: the same.
+        """
+        if not all_finite((multipliers, form)):
+            return None
+        scaled = self.program.norms * multipliers[self.program.kept]
+        near = self._start(scaled, self.program.to_unit_box(form), WEIGHTS[0])
         return self._path(near, WEIGHTS) or self._path(self._inside(), FROM_AFAR + WEIGHTS)
 
     def _path(

@@ -34,7 +34,7 @@ from jaxtyping import Array, Bool, Float
 from reachjax.lmi import Program, lagrangian
 from reachjax.solvers.accepted import accepted_offsets
 from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
-from reachjax.solvers.host import on_host
+from reachjax.solvers.host import all_finite, on_host, shapes_of
 
 
 def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Array, " f"], Solution]:
@@ -51,7 +51,7 @@ def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Arra
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _proved_offsets(solver, facts, objective, program) -> tuple[Array, Array, Solution]:
     facets, size = objective.shape
-    shapes = Solution.shapes(facets, program.products.free.shape[0], size)
+    shapes = shapes_of(Solution.blank(facets, program.products.free.shape[0], size))
     offsets = jax.ShapeDtypeStruct((facets,), float)
     optimal = jax.ShapeDtypeStruct((facets,), bool)
     return on_host(partial(_solve, solver), (offsets, optimal, shapes), program)
@@ -69,11 +69,7 @@ def _backward(solver, residual, cotangents):
     program, multipliers, moments = residual
 
     def value(facts, objective):
-        held = program.replace(
-            facts=type(program.facts)(facts, program.facts.rad),
-            objective=type(program.objective)(objective, program.objective.rad),
-        )
-        return lagrangian(held, multipliers, moments)
+        return lagrangian(program.with_midpoints(facts, objective), multipliers, moments)
 
     pull: Any = jax.vjp(value, program.facts.mid, program.objective.mid)[1]
     offsets, _, proposal = cotangents
@@ -91,7 +87,7 @@ _proved_offsets.defvjp(_forward, _backward)
 
 def _solve(solver: AbstractSolver, program: Program) -> tuple[np.ndarray, np.ndarray, Solution]:
     facets, size = program.objective.mid.shape
-    if not all(np.isfinite(part).all() for part in jax.tree.leaves(program)):
+    if not all_finite(program):
         blank = Solution.blank(facets, len(program.products.free), size)
         return np.full(facets, np.nan), np.zeros(facets, dtype=bool), blank
     solution = solver.solve(program)

@@ -26,7 +26,7 @@ from reachjax.solvers.accepted import ANSWERS, accepted_enclosure
 from reachjax.solvers.base import AbstractSolver, Enclosure, SolverStatus
 from reachjax.solvers.centring import Sensitivity, centred, sensitivity
 from reachjax.solvers.differentiable import asked_for
-from reachjax.solvers.host import on_host
+from reachjax.solvers.host import all_finite, on_host, shapes_of
 
 
 def proved_ellipsoid(program: Program, solver: AbstractSolver) -> tuple[Ellipsoid, Enclosure]:
@@ -55,7 +55,7 @@ def _solve(
     solver: AbstractSolver, argument: tuple[Program, NormalForm | None]
 ) -> tuple[NormalForm, np.ndarray, np.ndarray, Enclosure]:
     program, given = argument
-    if not all(np.isfinite(part).all() for part in jax.tree.leaves(argument)):
+    if not all_finite(argument):
         blank = Enclosure.blank(program)
         return blank.form, np.array(np.nan), np.array(False), blank
     enclosure = solver.enclose(program, given)
@@ -69,9 +69,7 @@ def _solve(
 
 
 def _shapes(program: Program) -> tuple[NormalForm, Any, Any, Enclosure]:
-    blank = jax.tree.map(
-        lambda field: jax.ShapeDtypeStruct(field.shape, field.dtype), Enclosure.blank(program)
-    )
+    blank = shapes_of(Enclosure.blank(program))
     number, truth = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), bool)
     return blank.form, number, truth, blank
 
@@ -94,14 +92,12 @@ def _ellipsoid_forward(solver, facts, objective, program):
 def _ellipsoid_backward(solver, residual, cotangents):
     program, form, trusted, multipliers = residual
     trusted = trusted & ~asked_for(cotangents[3])
-    shapes = jax.tree.map(
-        lambda field: jax.ShapeDtypeStruct(field.shape, float), Sensitivity.unknown(program)
-    )
+    shapes = shapes_of(Sensitivity.unknown(program))
     arguments = (program, multipliers, form, cotangents[0])
     held: Any = on_host(lambda given: sensitivity(*given), shapes, arguments)
 
     def value(facts, objective):
-        rows = _with_rows(program, facts, objective)
+        rows = program.with_midpoints(facts, objective)
         at_centre = schur_lagrangian(rows, held.multipliers, held.form, held.moments)
         return at_centre - schur_lagrangian(
             rows, held.multipliers_slope, held.form_slope, held.moments_slope
@@ -112,13 +108,6 @@ def _ellipsoid_backward(solver, residual, cotangents):
 
 
 _ellipsoid.defvjp(_ellipsoid_forward, _ellipsoid_backward)
-
-
-def _with_rows(program: Program, facts: Array, objective: Array) -> Program:
-    return program.replace(
-        facts=type(program.facts)(facts, program.facts.rad),
-        objective=type(program.objective)(objective, program.objective.rad),
-    )
 
 
 def proved_size(
@@ -163,7 +152,7 @@ def _size_backward(solver, residual, cotangents):
 
     def value(facts, objective, given):
         scaled = NormalForm(factor * given.A, factor * given.b)
-        rows = _with_rows(program, facts, objective)
+        rows = program.with_midpoints(facts, objective)
         return schur_lagrangian(rows, enclosure.multipliers, scaled, moments) / unit
 
     slopes = jax.grad(value, (0, 1, 2))(program.facts.mid, program.objective.mid, given)

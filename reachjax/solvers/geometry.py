@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from reachjax.checks import is_concrete, require_double_precision
 from reachjax.sets import AbstractSet, Box, PolyhedralSet, Polytope, hulls, polyhedra
-from reachjax.solvers.host import on_host
+from reachjax.solvers.host import all_finite, on_host
 
 Slopes = tuple[np.ndarray, ...]
 Values = Callable[..., tuple[np.ndarray, Slopes]]
@@ -82,7 +82,7 @@ def _forward(compute, count, *arrays):
 
     def computed(arguments):
         try:
-            if all(np.isfinite(array).all() for array in arguments):
+            if all_finite(arguments):
                 return compute(*arguments)
         except (ValueError, RuntimeError):
             if not traced:

@@ -15,6 +15,16 @@ import numpy as np
 from reachjax.checks import is_concrete
 
 
+def shapes_of(tree: Any) -> Any:
+    """The shapes and types of a tree of arrays, as `on_host` wants to know them beforehand."""
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype), tree)
+
+
+def all_finite(tree: Any) -> bool:
+    """Whether a tree of numpy arrays holds neither NaN nor infinity."""
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
+
+
 def on_host(function: Any, shapes: Any, argument: Any) -> Any:
     """`function(argument)` in numpy, for concrete arrays, tracers and batches of either.
 

@@ -47,7 +47,7 @@ def volume_penalty(
 
     Example:
         >>> import jax
-        >>> from reachjax import MLP, AffinePlant, Box
+        >>> from reachjax import MLP, AffinePlant, Box, Template
         >>> X0, template = Box([1.0], [2.0]), Template.box(1)
         >>> def penalty(gain):
         ...     net = MLP.from_layers([([[gain]], [0.0])])
@@ -100,7 +100,7 @@ def specification_penalty(
         RuntimeError, TypeError, ValueError: as `reach` and `verify` do.
 
     Example:
-        >>> from reachjax import MLP, AffinePlant, Box
+        >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template
         >>> net = MLP.from_layers([([[-0.5]], [0.0])])
         >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net)  # x+ = x / 2
         >>> penalty = specification_penalty(

@@ -5,6 +5,7 @@ that the library certifies.
 """
 
 import json
+from functools import partial
 from itertools import pairwise
 
 import jax
@@ -33,6 +34,7 @@ from experiments.quadrotor_model import (
     plant,
 )
 from experiments.quadrotor_mpc import QuadrotorMPC
+from experiments.reference_local_bounds import local_bounds_ellipsoid_step
 
 G = 9.81
 FEW = Draws(starts=1, steps=3)
@@ -186,6 +188,20 @@ def test_no_simulated_state_is_outside_its_ellipsoid_and_none_is_much_too_large(
         assert values.max() <= (1 + 1e-12 if t == 0 else 1), t
         assert values.max() > 0.97, t
     assert analysis.verdict.status is rj.VerdictStatus.PROVED
+
+
+@pytest.mark.slow
+def test_volumes_are_those_of_an_independent_program(learned, analysis):
+    layers = [
+        (np.asarray(W, dtype=float), np.asarray(b, dtype=float)) for W, b in learned[1].layers
+    ]
+    dynamics = (np.asarray(part) for part in (plant().A, plant().B, plant().c))
+    step = partial(local_bounds_ellipsoid_step, layers, *dynamics, *INPUT_LIMITS)
+    for before, after in pairwise(analysis.tube.sets):
+        found = step(np.asarray(before.center), np.asarray(before.shape))
+        assert found.status == "optimal"
+        volume = np.pi**3 / 6 * np.sqrt(np.linalg.det(found.shape))
+        assert after.volume() == pytest.approx(volume, rel=1e-5)
 
 
 @pytest.mark.slow

@@ -167,16 +167,16 @@ def test_rows_at_rounding_level_and_empty_columns_do_not_reach_the_solver(settin
 
 
 def test_the_model_is_built_once_for_all_facets(setting, monkeypatch):
-    import reachjax.solvers.conic as conic
+    from reachjax.solvers.conic import FacetModel
 
     built = []
-    original = conic._Model.__init__
+    original = FacetModel.__init__
 
     def counted(self, program):
         built.append(program)
         original(self, program)
 
-    monkeypatch.setattr(conic._Model, "__init__", counted)
+    monkeypatch.setattr(FacetModel, "__init__", counted)
     rj.Clarabel().solve(setting[2])
     assert len(built) == 1
 

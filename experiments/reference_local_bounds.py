@@ -1,7 +1,7 @@
 """Minimum-volume ellipsoids from pre-activation bounds: the relaxation of DeepSDP, independently.
 
-Written in numpy and cvxpy from Fazlyab, Morari, Pappas, "Safety verification and robustness analysis
-of neural networks via quadratic constraints and semidefinite programming" (2020), beside
+Written in numpy and cvxpy from Fazlyab, Morari, Pappas, "Safety verification and robustness
+analysis of neural networks via quadratic constraints and semidefinite programming" (2020), beside
 `experiments.reference_ellipsoid`, whose program it solves with other facts. With bounds
 `l <= y <= u` of a neuron's input, `z = max(y, 0)` and `r = z - y`, these are never negative:
 

@@ -2,10 +2,10 @@
 
 from reachjax.solvers.accepted import accepted_enclosure, accepted_offsets
 from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, SolverStatus
-from reachjax.solvers.conic import SCS, Clarabel, CvxpySolver
 from reachjax.solvers.differentiable import proved_offsets
 from reachjax.solvers.enclosures import proved_ellipsoid, proved_size
 from reachjax.solvers.geometry import bounding_box, polytope_volume, separation, support
+from reachjax.solvers.named import SCS, Clarabel, CvxpySolver
 
 __all__ = [
     "SCS",

@@ -1,13 +1,10 @@
-"""Semidefinite programs by cvxpy: Clarabel by default, any other solver that cvxpy knows alike."""
+"""Semidefinite programs by cvxpy, with a solver that it calls by name."""
 
 from __future__ import annotations
 
 import abc
-import dataclasses
-import numbers
 import time
 import warnings
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -37,7 +34,7 @@ STATUSES = {
 """cvxpy's words for how a solver ended."""
 
 
-class _ConicSolver(AbstractSolver, abc.ABC):
+class AbstractConicSolver(AbstractSolver, abc.ABC):
     """A solver that cvxpy calls by name."""
 
     @abc.abstractmethod
@@ -148,93 +145,3 @@ def _run(problem: Any, name: str, options: dict) -> SolverStatus:
                 raise
             return SolverStatus.FAILED
     return STATUSES.get(problem.status, SolverStatus.FAILED)
-
-
-def _require_positive(solver: Any) -> None:
-    for field in dataclasses.fields(solver):
-        value: Any = getattr(solver, field.name)
-        name = f"{type(solver).__name__}.{field.name}"
-        if isinstance(value, bool) or not isinstance(value, numbers.Real):
-            raise TypeError(f"{name} must be a number, but {value!r} arrived")
-        if not float(value) > 0:
-            raise ValueError(f"{name} must be positive, but {value!r} arrived")
-
-
-@dataclasses.dataclass(frozen=True)
-class Clarabel(_ConicSolver):
-    """The interior-point code Clarabel, the default.
-
-    Args:
-        tolerance: of feasibility and of the gap, relative and absolute.
-        max_iterations: a facet that needs more is reported with status `LIMIT`.
-        time_limit: seconds for each facet.
-    """
-
-    tolerance: float = 1e-9
-    max_iterations: int = 200
-    time_limit: float = float("inf")
-
-    def __post_init__(self):
-        _require_positive(self)
-
-    def settings(self) -> tuple[str, dict[str, Any]]:
-        """Clarabel's own names; a stalled run still returns its last iterate, as inaccurate.
-
-        Chordal decomposition stays off: with it, programs whose dual has no interior (dead neurons,
-        the paper's constraints without `lambda_ij`) stalled at two digits; without it, at nine.
-        """
-        tight = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
-        loose = ("reduced_tol_gap_abs", "reduced_tol_gap_rel", "reduced_tol_feas")
-        return "CLARABEL", {
-            **dict.fromkeys(tight, self.tolerance),
-            **dict.fromkeys(loose, max(1e-3, self.tolerance)),
-            "max_iter": self.max_iterations,
-            "time_limit": self.time_limit,
-            "accept_unknown": True,
-            "chordal_decomposition_enable": False,
-        }
-
-
-@dataclasses.dataclass(frozen=True)
-class SCS(_ConicSolver):
-    """The splitting conic solver: many cheap iterations, few digits.
-
-    Args:
-        tolerance: of feasibility and of the gap, relative and absolute.
-        max_iterations: a facet that needs more is reported with status `LIMIT` or `INACCURATE`.
-    """
-
-    tolerance: float = 1e-7
-    max_iterations: int = 50_000
-
-    def __post_init__(self):
-        _require_positive(self)
-
-    def settings(self) -> tuple[str, dict[str, Any]]:
-        """SCS's own names."""
-        return "SCS", {
-            "eps_abs": self.tolerance,
-            "eps_rel": self.tolerance,
-            "max_iters": self.max_iterations,
-        }
-
-
-@dataclasses.dataclass(frozen=True)
-class CvxpySolver(_ConicSolver):
-    """Any other solver that cvxpy knows, by cvxpy's name for it.
-
-    Args:
-        name: such as `cvxpy.MOSEK`.
-        options: keyword arguments of `cvxpy.Problem.solve` for this solver.
-
-    Example:
-        >>> CvxpySolver("SCS", {"eps_abs": 1e-6}).settings()
-        ('SCS', {'eps_abs': 1e-06})
-    """
-
-    name: str
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
-
-    def settings(self) -> tuple[str, dict[str, Any]]:
-        """As given; the names cvxpy has are in capitals."""
-        return self.name.upper(), dict(self.options)

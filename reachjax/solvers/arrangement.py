@@ -1,0 +1,146 @@
+"""Generators laid out for the interior-point method: multipliers with the most pairs first.
+
+The layout is built from gathers alone, so that it serves numpy arrays on the host, where what is
+unused is cut away and shapes are padded to a few sizes, and traced arrays inside `jax.jit`, where
+the program keeps its shape and what is unused is masked.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from reachjax.relaxation import Products
+from reachjax.solvers.generators import Generators, Pairs
+from reachjax.solvers.trimming import Trimmed, namespace
+
+SLOTS = 2
+"""Pairs that a multiplier may have without becoming a general generator."""
+
+
+class Arrangement(NamedTuple):
+    """Generators, and where each of their multipliers comes from.
+
+    Attributes:
+        generators: of unit size.
+        objective: `(f, n)`, in their columns.
+        order: `(K,)`, the program's multipliers in the order of the generators.
+        scale: `(K,)`, the program's multiplier is this times the generator's; zero where dead.
+        columns: `(n,)`, the program's columns in the order of the generators.
+    """
+
+    generators: Generators
+    objective: Float[Array | np.ndarray, "f n"]
+    order: Int[Array | np.ndarray, " K"]
+    scale: Float[Array | np.ndarray, " K"]
+    columns: Int[Array | np.ndarray, " n"]
+
+
+def arranged(
+    trimmed: Trimmed, products: Products, doubles: int | None = None, general: int | None = None
+) -> Arrangement:
+    """Lay out a trimmed program.
+
+    Args:
+        trimmed: its numbers.
+        products: its pairs.
+        doubles: how many multipliers may have more than one pair; counted if None.
+        general: how many of these may have more than two; counted if None. What is beyond is left
+            out, which is sound.
+    """
+    xp, facts, count = namespace(trimmed.facts), trimmed.facts, len(products.free)
+    m, n = facts.shape
+    used = trimmed.kept[products.multiplier]
+    key = xp.where(used, products.multiplier, count)
+    by_owner = xp.argsort(key, stable=True)
+    start = xp.searchsorted(key[by_owner], xp.arange(count + 1))
+    pairs = start[1:] - start[:-1]
+    order = xp.argsort(-pairs, stable=True)
+    pairs = pairs[order]
+    doubles = int((pairs > 1).sum()) if doubles is None else doubles
+    general = int((pairs > SLOTS).sum()) if general is None else general
+    several = pairs > SLOTS
+    dead = (pairs == 0) | (several & (xp.arange(count) >= general))
+    scale = xp.where(dead, 0.0, 1 / xp.where(dead, 1.0, trimmed.sizes[order]))
+
+    def slot(number: int, length: int) -> Pairs:
+        there = (pairs > number) & ~several
+        which = by_owner[xp.clip(start[:-1][order] + number, 0, len(by_owner) - 1)]
+        weight = xp.where(there, scale * products.sign[which], 0.0)
+        return Pairs(
+            xp.where(there, products.left[which], m)[:length],
+            xp.where(there, products.right[which], m)[:length],
+            weight[:length],
+        )
+
+    def dense(number: int):
+        mine = used & (products.multiplier == order[number]) & several[number]
+        weights = xp.where(mine, scale[number] * products.sign, 0.0)
+        half = (weights[:, None] * facts[products.left]).T @ facts[products.right]
+        return (half + half.T) / 2
+
+    last = xp.arange(n) == n - 1
+    first, offset = slot(0, count), xp.full(1, m)
+    matrices = [dense(number) for number in range(general)]
+    generators = Generators(
+        rows=xp.concatenate([facts, 1.0 * last[None]]),
+        first=Pairs(
+            xp.concatenate([first.left, offset]),
+            xp.concatenate([first.right, offset]),
+            xp.concatenate([first.weight, -xp.ones(1)]),
+        ),
+        second=slot(1, doubles),
+        general=xp.stack(matrices) if matrices else xp.zeros((0, n, n)),
+        free=xp.concatenate([products.free[order] & ~dead, xp.full(1, True)]),
+        target=-xp.concatenate([1.0 * dead, xp.ones(1)]),
+        idle=1.0 * ~(trimmed.columns | last),
+    )
+    return Arrangement(generators, trimmed.objective, order, scale, xp.arange(n))
+
+
+def cut(whole: Arrangement) -> Arrangement:
+    """Without unused multipliers, rows and columns, padded to one of a few shapes; numpy only."""
+    old, count = whole.generators, int((whole.scale > 0).sum())
+    columns, doubles = np.flatnonzero(old.idle == 0), len(old.second.weight)
+    slots = Pairs(*(part[:count] for part in old.first)), old.second
+    touched = [part[pairs.weight != 0] for pairs in slots for part in pairs[:2]]
+    kept = np.unique(np.concatenate(touched))
+    m, n = bucket(len(kept) + 1, 16, 4), bucket(len(columns), 8, 8)
+    K = bucket(count + 1, 32, 4)
+    rows = np.zeros((m, n))
+    rows[: len(kept), n - len(columns) :] = old.rows[np.ix_(kept, columns)]
+    rows[-1, -1] = 1.0
+    number = np.full(len(old.rows), m - 1)
+    number[kept] = np.arange(len(kept))
+
+    def padded(pairs: Pairs, size: int) -> Pairs:
+        more = (0, size - len(pairs.weight))
+        left, right = (np.pad(number[part], more, constant_values=m - 1) for part in pairs[:2])
+        return Pairs(left, right, np.pad(pairs.weight, more))
+
+    first, second = padded(slots[0], K), padded(slots[1], bucket(doubles, 32, 4) * (doubles > 0))
+    first.weight[-1] = -1.0
+    general = np.zeros((len(old.general), n, n))
+    general[:, n - len(columns) :, n - len(columns) :] = old.general[
+        np.ix_(range(len(old.general)), columns, columns)
+    ]
+    free, target = np.zeros(K, dtype=bool), np.full(K, -1.0)
+    free[:count], target[:count], free[-1] = old.free[:count], old.target[:count], True
+    objective = np.zeros((len(whole.objective), n))
+    objective[:, n - len(columns) :] = whole.objective[:, columns]
+    idle = 1.0 * (np.arange(n) < n - len(columns))
+    generators = Generators(rows, first, second, general, free, target, idle)
+    return Arrangement(generators, objective, whole.order[:count], whole.scale[:count], columns)
+
+
+def bucket(size: int, least: int, steps: int) -> int:
+    """The smallest padded size that holds `size`: `steps` of them for each doubling.
+
+    Example:
+        >>> [bucket(size, 8, 8) for size in (5, 45, 69, 205, 405)]
+        [8, 48, 72, 208, 416]
+    """
+    step = max(least, 2 ** (max(size, 1).bit_length() - 1) // steps)
+    return -(-size // step) * step

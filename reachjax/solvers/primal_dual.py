@@ -1,0 +1,219 @@
+"""One step of an infeasible-start primal-dual method for the program of a facet.
+
+    minimise b   over b, y   with   S = b e' e - C - sum_k y_k G_k >= 0,   y_k >= 0 unless free,
+    maximise <C, X>          with   X >= 0,  X_ee = 1,  <G_k, X> = z_k >= 0 (0 where free).
+
+The offset counts as a last, free multiplier with generator `-e' e`. The direction is that of
+Helmberg, Rendl, Vanderbei and Wolkowicz (HKM), with Mehrotra's predictor and corrector: with
+`W = S^-1`,
+
+    dX = s mu W - X - sym(X dS W),    y_k dz_k + z_k dy_k = s mu - y_k z_k.
+
+Every equation of `X` is relaxed by `kappa mu y_k`: where `X` has no interior (dead neurons, flat
+sets, products that others imply), the multipliers of the central path would grow without bound.
+What this adds to the objective vanishes with `mu`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from reachjax.solvers.generators import Generators, inverse_factor, symmetric
+
+DAMPING = 1e-4
+"""`kappa` of this module's docstring. Measured on degenerate programs: at 1e-3 some stall at the
+start, without it some multipliers grow to 1e7 and six digits are lost."""
+
+REGULAR = 1e-14
+"""What is added to the unit diagonal of the scaled Schur matrix at first."""
+
+REFINEMENTS = 3
+"""Steps of iterative refinement; conjugate gradients in their place blew up flat directions."""
+
+
+class Point(NamedTuple):
+    """An iterate.
+
+    Attributes:
+        X: `(n, n)`, positive definite.
+        S: `(n, n)`, positive definite.
+        y: `(K,)`, multipliers.
+        z: `(K,)`, their slacks; 0 where free.
+    """
+
+    X: Float[Array, "n n"]
+    S: Float[Array, "n n"]
+    y: Float[Array, " K"]
+    z: Float[Array, " K"]
+
+
+class Residuals(NamedTuple):
+    """What an iterate misses.
+
+    Attributes:
+        primal: `(K,)`, `target - <G_k, X> + z_k`.
+        dual: `(n, n)`, `-C - sum_k y_k G_k - S`.
+        complementarity: `mu`, the mean of the products that should vanish.
+        merit: the largest of both residuals and of the gap, relative.
+    """
+
+    primal: Float[Array, " K"]
+    dual: Float[Array, "n n"]
+    complementarity: Float[Array, ""]
+    merit: Float[Array, ""]
+
+
+def start(generators: Generators) -> Point:
+    """`X = I`, `S = 10 I`, and multipliers of the same size; free ones are zero."""
+    eye, signed = jnp.eye(generators.rows.shape[1]), ~generators.free
+    return Point(eye, 10.0 * eye, 1.0 * signed, 1.0 * signed)
+
+
+def bordered(generators: Generators, row: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """`C`: `<C, X> = row . X e`; idle columns have -1 on the diagonal, so that `S` is 1 there."""
+    last = generators.rows[-1]
+    return symmetric(jnp.outer(row, last)) * 1.0 - jnp.diag(generators.idle)
+
+
+def residuals(
+    generators: Generators,
+    row: Float[Array, " n"],
+    point: Point,
+    paired: Float[Array, " K"],
+) -> Residuals:
+    """What an iterate misses, given `<G_k, X>`."""
+    X, S, y, z = point
+    primal = generators.target - paired + z
+    dual = -bordered(generators, row) - generators.weighted(y) - S
+    products = jnp.sum(X * S) + y @ z
+    gap = abs(y[-1] - row @ X[:, -1]) / (1 + abs(y[-1]))
+    missed = jnp.max(abs(primal)) / jnp.maximum(1.0, jnp.linalg.norm(X))
+    merit = jnp.maximum(jnp.maximum(missed, jnp.max(abs(dual))), gap)
+    return Residuals(primal, dual, products / (X.shape[0] + jnp.sum(~generators.free)), merit)
+
+
+def step(
+    generators: Generators, row: Float[Array, " n"], point: Point
+) -> tuple[Point, Residuals, Float[Array, ""]]:
+    """The next iterate, what this one misses, and the shorter of the two step lengths."""
+    signed = ~generators.free
+    X_inverse, X = inverse_cholesky(point.X)
+    S_inverse, S = inverse_cholesky(point.S)
+    y, z = point.y, point.z
+    W = S_inverse.T @ S_inverse
+    A, B = generators.gram(X), generators.gram(W)
+    X_paired, W_paired = generators.paired_gram(A, X), generators.paired_gram(B, W)
+    missed = residuals(generators, row, Point(X, S, y, z), X_paired)
+    mu = missed.complementarity
+    ratio = jnp.where(signed, z / jnp.where(signed, y, 1.0), 0.0)
+    inverse_y = jnp.where(signed, 1 / jnp.where(signed, y, 1.0), 0.0)
+    # the offset has no part in the damping: its equation holds the corner of X at one
+    damping = DAMPING * mu * (jnp.arange(len(y)) < len(y) - 1)
+    schur = generators.schur(X, W, A, B) + jnp.diag(ratio + damping)
+    solve = _solver(schur)
+    constant = missed.primal + X_paired - damping * y - z
+    constant += generators.paired(symmetric(X @ missed.dual @ W))
+
+    def direction(target, cross, cross_z):
+        """Towards complementarity `target`, less second-order terms."""
+        pushed = (target - cross_z) * inverse_y
+        dy = solve(constant - target * W_paired + generators.paired(cross) + pushed)
+        dS = missed.dual - generators.weighted(dy)
+        dX = target * W - X - symmetric(X @ dS @ W) - cross
+        return Point(dX, dS, dy, pushed - z * signed - ratio * dy)
+
+    def lengths(move: Point, share):
+        primal = jnp.minimum(_to_boundary(X_inverse, move.X), _to_zero(z, move.z))
+        dual = jnp.minimum(_to_boundary(S_inverse, move.S), _to_zero(y, jnp.where(signed, move.y, 0)))
+        return jnp.minimum(1.0, share * primal), jnp.minimum(1.0, share * dual)
+
+    predictor = direction(0.0, jnp.zeros_like(X), jnp.zeros_like(y))
+    a, b = lengths(predictor, 1.0)
+    products = jnp.sum((X + a * predictor.X) * (S + b * predictor.S))
+    products += jnp.sum(jnp.where(signed, (y + b * predictor.y) * (z + a * predictor.z), 0.0))
+    share = jnp.clip(products / (mu * (X.shape[0] + jnp.sum(signed))), 0.0, 1.0)
+    both = jnp.minimum(a, b)
+    share = share ** jnp.where(mu > 1e-6, jnp.maximum(1.0, 3 * both**2), 1.0)
+    share = jnp.maximum(share, jnp.where(both < 0.1, 0.5, 1e-4))
+    cross = symmetric(predictor.X @ predictor.S @ W)
+    move = direction(share * mu, cross, jnp.where(signed, predictor.y * predictor.z, 0.0))
+    a, b = lengths(move, 0.9 + 0.09 * both)
+    following = Point(
+        symmetric(X + a * move.X), symmetric(S + b * move.S), y + b * move.y, z + a * move.z
+    )
+    return following, missed, jnp.minimum(a, b)
+
+
+def inverse_cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """The inverse of the Cholesky factor, and the matrix: shifted where rounding made it indefinite."""
+    unit = 1e-16 * jnp.trace(matrix) / len(matrix)
+    factor, shift = _factor(matrix, unit, 0.0)
+    return inverse_factor(factor), matrix + shift * jnp.eye(len(matrix))
+
+
+def _factor(matrix: Array, unit: Array | float, first: float) -> tuple[Array, Array]:
+    """The Cholesky factor of `matrix + shift I`, and the first `shift` for which it exists."""
+    eye = jnp.eye(len(matrix))
+
+    def attempt(shift):
+        return jax.lax.linalg.cholesky(matrix + shift * eye, symmetrize_input=False)
+
+    def failing(state):
+        factor, _, tries = state
+        return ~jnp.isfinite(factor[-1, -1]) & (tries < 12)
+
+    def again(state):
+        _, shift, tries = state
+        shift = jnp.maximum(10 * shift, unit)
+        return attempt(shift), shift, tries + 1
+
+    factor, shift, _ = jax.lax.while_loop(
+        failing, again, (attempt(first), jnp.asarray(first, dtype=float), 0)
+    )
+    return factor, shift
+
+
+def _solver(schur: Float[Array, "K K"]):
+    """Solves with the Schur matrix: scaled to a unit diagonal, regularised, refined."""
+    scale = 1 / jnp.sqrt(jnp.diagonal(schur))
+    matrix = schur * scale[:, None] * scale
+    factor, _ = _factor(matrix, 1e-12, REGULAR)
+
+    def approximate(vector):
+        half = jax.lax.linalg.triangular_solve(factor, vector[:, None], left_side=True, lower=True)
+        return jax.lax.linalg.triangular_solve(
+            factor, half, left_side=True, lower=True, transpose_a=True
+        )[:, 0]
+
+    def solve(vector):
+        vector = scale * vector
+
+        def refine(_, state):
+            solution, residual, best, least = state
+            solution = solution + approximate(residual)
+            residual = vector - matrix @ solution
+            size = jnp.linalg.norm(residual)
+            better = size < least
+            return solution, residual, jnp.where(better, solution, best), jnp.where(better, size, least)
+
+        zero = jnp.zeros_like(vector)
+        state = zero, vector, zero, jnp.inf
+        return scale * jax.lax.fori_loop(0, REFINEMENTS + 1, refine, state)[2]
+
+    return solve
+
+
+def _to_boundary(inverse: Float[Array, "n n"], move: Float[Array, "n n"]) -> Float[Array, ""]:
+    """The longest step that keeps `M + t dM` semidefinite, given the inverse of `M`'s factor."""
+    least = jnp.linalg.eigvalsh(inverse @ move @ inverse.T)[0]
+    return jnp.where(least < 0, -1 / jnp.where(least < 0, least, -1.0), jnp.inf)
+
+
+def _to_zero(value: Float[Array, " K"], move: Float[Array, " K"]) -> Float[Array, ""]:
+    """The longest step that keeps a vector nonnegative."""
+    falling = move < 0
+    return jnp.min(jnp.where(falling, -value / jnp.where(falling, move, -1.0), jnp.inf))

@@ -1,0 +1,111 @@
+"""What of a program a solver should see: nothing empty, nothing at rounding level, nothing implied.
+
+Rows whose coefficients are rounding noise are dropped (one of size 1e-16 scaled up to 1 made a
+solver report "solved" for an offset below the true support), so are columns that the others use at
+that level or not at all. Dropping is masking here: shapes stay, so that the same code serves numpy
+arrays on the host and traced arrays inside `jax.jit`.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from reachjax.lmi import Program
+from reachjax.relaxation import Products
+from reachjax.rounding import Ball
+
+NOISE = 16.0
+"""Coefficients no larger than this many times the rounding error of their row count as zero."""
+
+
+class Trimmed(NamedTuple):
+    """A program's numbers, zero where they say nothing.
+
+    Attributes:
+        facts: `(m, n)`.
+        objective: `(f, n)`, of unit 1-norm and without a constant.
+        centers: `(f,)`, the constants; a facet's offset is `centers + units b`.
+        units: `(f,)`, zero where the objective has one value.
+        columns: `(n,)`, which are used.
+        kept: `(K,)`, which multipliers are.
+        sizes: `(K,)`, of the generators: the root of the sum of squares over their pairs.
+    """
+
+    facts: Float[Array | np.ndarray, "m n"]
+    objective: Float[Array | np.ndarray, "f n"]
+    centers: Float[Array | np.ndarray, " f"]
+    units: Float[Array | np.ndarray, " f"]
+    columns: Bool[Array | np.ndarray, " n"]
+    kept: Bool[Array | np.ndarray, " K"]
+    sizes: Float[Array | np.ndarray, " K"]
+
+
+def namespace(array: Array | np.ndarray) -> ModuleType:
+    """`numpy` for its own arrays, `jax.numpy` for others."""
+    return np if isinstance(array, np.ndarray) else jnp
+
+
+def summed(values: Array | np.ndarray, owner: Array | np.ndarray, count: int):
+    """Sums `(count,)` of the values that belong to each owner."""
+    if isinstance(values, np.ndarray):
+        return np.bincount(owner, values, count)
+    return jax.ops.segment_sum(values, owner, count)
+
+
+def trimmed(program: Program) -> Trimmed:
+    """Mask what is empty or noise, and bring the objective to unit size."""
+    xp = namespace(program.facts.mid)
+    solid, wanted = _solid(program.facts), _solid(program.objective)
+    columns = solid.any(axis=0) | wanted.any(axis=0)
+    facts = xp.where(solid.any(axis=1)[:, None] & columns, program.facts.mid, 0.0)
+    products, count = program.products, len(program.products.free)
+    squares = (facts**2).sum(axis=1)
+    inner = (facts[products.left] * facts[products.right]).sum(axis=1)
+    of_pairs = (squares[products.left] * squares[products.right] + inner**2) / 2
+    sizes = summed(of_pairs, products.multiplier, count) ** 0.5
+    objective = xp.where(columns, program.objective.mid, 0.0)
+    centers = objective[:, -1]
+    # solvers' tolerances are absolute, objectives come in the size of the set of states
+    objective = objective * (xp.arange(objective.shape[1]) < objective.shape[1] - 1)
+    units = abs(objective).sum(axis=1)
+    return Trimmed(
+        facts=facts,
+        objective=objective / xp.where(units > 0, units, 1.0)[:, None],
+        centers=centers,
+        units=units,
+        columns=columns,
+        kept=(sizes > 0) & ~implied_by_cone(products, facts),
+        sizes=sizes,
+    )
+
+
+def _solid(rows: Ball) -> Bool[Array | np.ndarray, "k n"]:
+    """Which coefficients stand out from the rounding errors of their row."""
+    noise = (rows.rad**2).sum(axis=1) ** 0.5
+    return abs(rows.mid) > NOISE * noise[:, None]
+
+
+def implied_by_cone(products: Products, facts: Array | np.ndarray) -> Bool[Array, " K"]:
+    """Multipliers `(K,)` of products that say nothing beyond an ellipsoid's own fact.
+
+    A quadratic function of the state that is not negative on the ellipsoid is a positive multiple
+    of its fact and a positive semidefinite term (the S-lemma loses nothing for one constraint).
+    Products of neurons that are affine on the set are of this kind; kept, hundreds of them made a
+    solver stall at its second digit.
+    """
+    xp = namespace(facts)
+    cone, count = products.sign < 0, len(products.free)
+    state = (cone[:, None] & (facts[products.left] != 0)).any(axis=0)
+    state = state | (xp.arange(facts.shape[1]) == facts.shape[1] - 1)
+    present = (facts != 0).any(axis=1)
+    outside = ((facts != 0) & ~state).any(axis=1)
+    left, right = products.left, products.right
+    beyond = (outside[left] & present[right]) | (outside[right] & present[left])
+    says_more = summed((beyond | cone) * 1.0, products.multiplier, count) > 0
+    return cone.any() & ~says_more

@@ -24,7 +24,14 @@ from reachjax.sets import (
     Template,
 )
 from reachjax.sizes import log_volume, log_widths, volume
-from reachjax.solvers import SCS, AbstractSolver, Clarabel, CvxpySolver, SolverStatus
+from reachjax.solvers import (
+    SCS,
+    AbstractSolver,
+    Clarabel,
+    CvxpySolver,
+    InteriorPoint,
+    SolverStatus,
+)
 from reachjax.specs import Counterexample, Verdict, VerdictStatus, verify
 from reachjax.systems import (
     MLP,
@@ -65,6 +72,7 @@ __all__ = [
     "Ellipsoid",
     "EllipsoidCertificate",
     "EllipsoidTemplate",
+    "InteriorPoint",
     "LocalBounds",
     "PaperQC",
     "PenaltySchedule",

@@ -5,6 +5,7 @@ from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, SolverSta
 from reachjax.solvers.differentiable import proved_offsets
 from reachjax.solvers.enclosures import proved_ellipsoid, proved_size
 from reachjax.solvers.geometry import bounding_box, polytope_volume, separation, support
+from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import SCS, Clarabel, CvxpySolver
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "Clarabel",
     "CvxpySolver",
     "Enclosure",
+    "InteriorPoint",
     "Solution",
     "SolverStatus",
     "accepted_enclosure",

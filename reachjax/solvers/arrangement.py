@@ -107,8 +107,8 @@ def cut(whole: Arrangement) -> Arrangement:
     slots = Pairs(*(part[:count] for part in old.first)), old.second
     touched = [part[pairs.weight != 0] for pairs in slots for part in pairs[:2]]
     kept = np.unique(np.concatenate(touched))
-    m, n = bucket(len(kept) + 1, 16, 4), bucket(len(columns), 8, 8)
-    K = bucket(count + 1, 32, 4)
+    m, K = bucket(len(kept) + 1, 32), bucket(count + 1, 64)
+    n = bucket(len(columns), 16 if len(columns) <= 32 else 8)
     rows = np.zeros((m, n))
     rows[: len(kept), n - len(columns) :] = old.rows[np.ix_(kept, columns)]
     rows[-1, -1] = 1.0
@@ -120,7 +120,7 @@ def cut(whole: Arrangement) -> Arrangement:
         left, right = (np.pad(number[part], more, constant_values=m - 1) for part in pairs[:2])
         return Pairs(left, right, np.pad(pairs.weight, more))
 
-    first, second = padded(slots[0], K), padded(slots[1], bucket(doubles, 32, 4) * (doubles > 0))
+    first, second = padded(slots[0], K), padded(slots[1], K if doubles else 0)
     first.weight[-1] = -1.0
     general = np.zeros((len(old.general), n, n))
     general[:, n - len(columns) :, n - len(columns) :] = old.general[
@@ -135,12 +135,12 @@ def cut(whole: Arrangement) -> Arrangement:
     return Arrangement(generators, objective, whole.order[:count], whole.scale[:count], columns)
 
 
-def bucket(size: int, least: int, steps: int) -> int:
-    """The smallest padded size that holds `size`: `steps` of them for each doubling.
+def bucket(size: int, least: int) -> int:
+    """The smallest padded size that holds `size`: multiples of `least`, at most 8 a doubling.
 
     Example:
-        >>> [bucket(size, 8, 8) for size in (5, 45, 69, 205, 405)]
+        >>> [bucket(size, 8) for size in (5, 45, 69, 205, 405)]
         [8, 48, 72, 208, 416]
     """
-    step = max(least, 2 ** (max(size, 1).bit_length() - 1) // steps)
+    step = max(least, 2 ** (max(size, 1).bit_length() - 1) // 8)
     return -(-size // step) * step

@@ -7,14 +7,17 @@ proposes zero multipliers, which prove the interval bound and no more.
 from __future__ import annotations
 
 import abc
+import dataclasses
 import enum
-from typing import NamedTuple
+import numbers
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.lmi import Program
 from reachjax.sets import NormalForm
+from reachjax.solvers.host import all_finite, on_host, shapes_of
 
 
 class SolverStatus(enum.IntEnum):
@@ -109,12 +112,43 @@ class Enclosure(NamedTuple):
         )
 
 
+def require_positive(solver: Any) -> None:
+    """Check that every option of a solver is a positive number.
+
+    Raises:
+        TypeError: one is no number.
+        ValueError: one is not positive.
+    """
+    for field in dataclasses.fields(solver):
+        value: Any = getattr(solver, field.name)
+        name = f"{type(solver).__name__}.{field.name}"
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            raise TypeError(f"{name} must be a number, but {value!r} arrived")
+        if not float(value) > 0:
+            raise ValueError(f"{name} must be positive, but {value!r} arrived")
+
+
 class AbstractSolver(abc.ABC):
     """Solves the programs of one step. Hashable and immutable: its options are its fields."""
 
     @abc.abstractmethod
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet of a program whose leaves are numpy arrays."""
+
+    def propose(self, program: Program) -> Solution:
+        """Propose multipliers for every facet of a program of JAX arrays, traced ones too.
+
+        A solver that runs in numpy is called on the host; one that is written in JAX says here how
+        it is traced, since no JAX call may be made from a callback. A program that holds NaN or
+        infinity gets a blank proposal.
+        """
+        facets, size = program.objective.mid.shape
+        blank = Solution.blank(facets, len(program.products.free), size)
+
+        def solve(program: Program) -> Solution:
+            return self.solve(program) if all_finite(program) else blank
+
+        return on_host(solve, shapes_of(blank), program)
 
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
         """Propose the smallest ellipsoid around the successors, and its multipliers.

@@ -34,7 +34,7 @@ from jaxtyping import Array, Bool, Float
 from reachjax.lmi import Program, lagrangian
 from reachjax.solvers.accepted import accepted_offsets
 from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
-from reachjax.solvers.host import all_finite, on_host, shapes_of
+from reachjax.solvers.host import all_finite, on_host
 
 
 def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Array, " f"], Solution]:
@@ -50,11 +50,10 @@ def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Arra
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _proved_offsets(solver, facts, objective, program) -> tuple[Array, Array, Solution]:
-    facets, size = objective.shape
-    shapes = shapes_of(Solution.blank(facets, program.products.free.shape[0], size))
-    offsets = jax.ShapeDtypeStruct((facets,), float)
-    optimal = jax.ShapeDtypeStruct((facets,), bool)
-    return on_host(partial(_solve, solver), (offsets, optimal, shapes), program)
+    solution = solver.propose(program)
+    offsets = jax.ShapeDtypeStruct(objective.shape[:1], float)
+    optimal = jax.ShapeDtypeStruct(objective.shape[:1], bool)
+    return *on_host(_judged, (offsets, optimal), (program, solution)), solution
 
 
 def _forward(solver, facts, objective, program):
@@ -85,10 +84,10 @@ def asked_for(proposal: Any) -> Bool[Array, ""]:
 _proved_offsets.defvjp(_forward, _backward)
 
 
-def _solve(solver: AbstractSolver, program: Program) -> tuple[np.ndarray, np.ndarray, Solution]:
-    facets, size = program.objective.mid.shape
-    if not all_finite(program):
-        blank = Solution.blank(facets, len(program.products.free), size)
-        return np.full(facets, np.nan), np.zeros(facets, dtype=bool), blank
-    solution = solver.solve(program)
-    return *accepted_offsets(program, solution), solution
+def _judged(argument: tuple[Program, Solution]) -> tuple[np.ndarray, np.ndarray]:
+    """The offsets that a proposal proves, and which of them are optimal; NaN without numbers."""
+    program, solution = argument
+    if all_finite(program):
+        return accepted_offsets(program, solution)
+    facets = len(solution.offsets)
+    return np.full(facets, np.nan), np.zeros(facets, dtype=bool)

@@ -39,7 +39,7 @@ class Generators(NamedTuple):
         rows: `(m, n)`, the facts; the last one is the constant's unit row `e`.
         first: a pair of each multiplier; the last is the offset's, `-e' e`.
         second: the other pair of the first few multipliers.
-        general: `(g, n, n)`, generators of the first `g` multipliers, which have no pairs.
+        general: `(g, n, n)`, generators of the first `g` multipliers that have no pairs, else zero.
         free: `(K,)`, multipliers of either sign.
         target: `(K,)`, what `<G_k, X>` is at least, or equal to where the multiplier is free: 0,
             and -1 for the offset and for multipliers that have no generator.
@@ -100,6 +100,8 @@ class Generators(NamedTuple):
             H = H.at[:k, :k].add(_block(A, B, self.second, self.second))
         for j in range(len(self.general)):
             row = self.paired(symmetric(X @ self.general[j] @ W))
+            # one that is empty here has pairs instead
+            row = jnp.where(jnp.any(self.general[j] != 0), row, H[j])
             H = H.at[j].set(row).at[:, j].set(row)
         return symmetric(H)
 

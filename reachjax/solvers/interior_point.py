@@ -22,11 +22,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.checks import is_concrete, require_double_precision, whole_number
 from reachjax.lmi import Program
-from reachjax.solvers.arrangement import Arrangement, arranged, cut
-from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
+from reachjax.solvers.arrangement import arranged, cut
+from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus, require_positive
 from reachjax.solvers.generators import Generators
-from reachjax.solvers.host import all_finite
-from reachjax.solvers.primal_dual import Point, residuals, start, step
+from reachjax.solvers.primal_dual import Point, start, step
 from reachjax.solvers.trimming import trimmed
 
 FURTHER = 1e-2
@@ -135,4 +134,96 @@ def _found(search: Search, tolerance, max_iterations) -> Facet:
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class InteriorPoint(AbstractSolver):
+    """The library's own interior-point method: JAX, and fast where there are many neurons.
+
+    It compiles once for each of a few padded sizes; on the CPU facets are solved one by one.
+
+    Args:
+        tolerance: of residuals and gap, relative. Iterations go on to a hundredth of it as long as
+            they gain.
+        max_iterations: a facet that needs more is reported with status `LIMIT`.
+
+    Raises:
+        TypeError: an option is no number.
+        ValueError: an option is not positive.
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach_step
+        >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+        >>> box, facets = Box([1.0], [2.0]), Template.box(1)
+        >>> following, certificate = reach_step(loop, box, facets, solver=InteriorPoint())
+        >>> following.b.round(6).tolist(), [status.name for status in certificate.statuses]
+        ([1.0, -0.5], ['SOLVED', 'SOLVED'])
+    """
+
+    tolerance: float = 1e-7
+    max_iterations: int = 200
+
+    def __post_init__(self):
+        require_positive(self)
+        whole_number("InteriorPoint.max_iterations", self.max_iterations, 1)
+
+    def solve(self, program: Program) -> Solution:
+        """Propose multipliers for every facet, from a program cut to what it uses.
+
+        Raises:
+            RuntimeError: JAX's 64-bit floats are off.
+        """
+        require_double_precision()
+        facets, size = program.objective.mid.shape
+        solution = Solution.blank(facets, len(program.products.free), size)
+        given = trimmed(program)
+        layout = cut(arranged(given, program.products))
+        generators, count = jax.device_put(layout.generators), len(layout.columns)
+        used = np.ix_(layout.columns, layout.columns)
+        for i, row in enumerate(layout.objective):
+            began = time.perf_counter()
+            found = jax.device_get(_run(generators, row, self.tolerance, self.max_iterations))
+            solution.seconds[i] = time.perf_counter() - began
+            solution.statuses[i] = found.status
+            solution.offsets[i] = given.centers[i] + given.units[i] * found.offset
+            factor = 2 * given.units[i] * layout.scale
+            solution.multipliers[i, layout.order] = factor * found.multipliers[: len(factor)]
+            if np.isfinite(found.offset):
+                solution.moments[i] = 0.0
+                solution.moments[i][used] = found.moment[-count:, -count:]
+        return solution
+
+    def propose(self, program: Program) -> Solution:
+        """Propose multipliers for every facet; traced where the program is, at its full shape.
+
+        Inside `jax.jit` one multiplier at most may weigh more than two products (an ellipsoid's
+        does); others are left out there. Seconds are NaN.
+        """
+        if is_concrete(program):
+            return super().propose(program)
+        given = trimmed(program)
+        extra = len(program.products.left) - len(program.products.free)
+        layout = arranged(given, program.products, max(extra, 0), int(extra > 1))
+
+        def solve(row: Float[Array, " n"]) -> Facet:
+            return solve_alone(layout.generators, row, self.tolerance, self.max_iterations)
+
+        found: Facet = jax.lax.map(solve, layout.objective)
+        count = len(layout.order)
+        factors = 2 * given.units[:, None] * layout.scale
+        ordered = jnp.where(jnp.isfinite(factors), factors, 0.0) * found.multipliers[:, :count]
+        used = 1 - layout.generators.idle
+        return Solution(
+            offsets=given.centers + given.units * found.offset,
+            multipliers=jnp.zeros_like(ordered).at[:, layout.order].set(ordered),
+            moments=found.moment * used[:, None] * used,
+            statuses=found.status,
+            seconds=jnp.full_like(given.units, jnp.nan),
+        )
+
+
 _run = jax.jit(solve_facet)
+
+
+@jax.custom_batching.sequential_vmap
+def solve_alone(generators: Generators, row: Array, tolerance: Array, limit: Array) -> Facet:
+    """`solve_facet`, one after the other under `jax.vmap`: batches of factorisations hung on a CPU."""
+    return solve_facet(generators, row, tolerance, limit)

@@ -3,21 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import numbers
 from collections.abc import Mapping
 from typing import Any
 
+from reachjax.solvers.base import require_positive
 from reachjax.solvers.conic import AbstractConicSolver
-
-
-def _require_positive(solver: Any) -> None:
-    for field in dataclasses.fields(solver):
-        value: Any = getattr(solver, field.name)
-        name = f"{type(solver).__name__}.{field.name}"
-        if isinstance(value, bool) or not isinstance(value, numbers.Real):
-            raise TypeError(f"{name} must be a number, but {value!r} arrived")
-        if not float(value) > 0:
-            raise ValueError(f"{name} must be positive, but {value!r} arrived")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +25,7 @@ class Clarabel(AbstractConicSolver):
     time_limit: float = float("inf")
 
     def __post_init__(self):
-        _require_positive(self)
+        require_positive(self)
 
     def settings(self) -> tuple[str, dict[str, Any]]:
         """Clarabel's own names; a stalled run still returns its last iterate, as inaccurate.
@@ -68,7 +58,7 @@ class SCS(AbstractConicSolver):
     max_iterations: int = 50_000
 
     def __post_init__(self):
-        _require_positive(self)
+        require_positive(self)
 
     def settings(self) -> tuple[str, dict[str, Any]]:
         """SCS's own names."""

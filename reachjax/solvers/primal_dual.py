@@ -67,6 +67,26 @@ class Residuals(NamedTuple):
     merit: Float[Array, ""]
 
 
+class Plan(NamedTuple):
+    """What the next direction aims at, and the last one.
+
+    Attributes:
+        target: the complementarity aimed at.
+        cross: `(n, n)`, second-order terms of `X S`.
+        cross_z: `(K,)`, second-order terms of `y z`.
+        share: of the way to the boundary that a step may go.
+        lengths: of the last direction's steps, in `X, z` and in `S, y`.
+        move: the last direction.
+    """
+
+    target: Float[Array, ""]
+    cross: Float[Array, "n n"]
+    cross_z: Float[Array, " K"]
+    share: Float[Array, ""]
+    lengths: tuple[Float[Array, ""], Float[Array, ""]]
+    move: Point
+
+
 def start(generators: Generators) -> Point:
     """`X = I`, `S = 10 I`, and multipliers of the same size; free ones are zero."""
     eye, signed = jnp.eye(generators.rows.shape[1]), ~generators.free
@@ -76,7 +96,7 @@ def start(generators: Generators) -> Point:
 def bordered(generators: Generators, row: Float[Array, " n"]) -> Float[Array, "n n"]:
     """`C`: `<C, X> = row . X e`; idle columns have -1 on the diagonal, so that `S` is 1 there."""
     last = generators.rows[-1]
-    return symmetric(jnp.outer(row, last)) * 1.0 - jnp.diag(generators.idle)
+    return symmetric(jnp.outer(row, last)) - jnp.diag(generators.idle)
 
 
 def residuals(
@@ -118,12 +138,11 @@ def step(
     constant = missed.primal + X_paired - damping * y - z
     constant += generators.paired(symmetric(X @ missed.dual @ W))
 
-    def direction(target, cross, cross_z):
-        """Towards complementarity `target`, less second-order terms."""
-        pushed = (target - cross_z) * inverse_y
-        dy = solve(constant - target * W_paired + generators.paired(cross) + pushed)
+    def direction(plan: Plan) -> Point:
+        pushed = (plan.target - plan.cross_z) * inverse_y
+        dy = solve(constant - plan.target * W_paired + generators.paired(plan.cross) + pushed)
         dS = missed.dual - generators.weighted(dy)
-        dX = target * W - X - symmetric(X @ dS @ W) - cross
+        dX = plan.target * W - X - symmetric(X @ dS @ W) - plan.cross
         return Point(dX, dS, dy, pushed - z * signed - ratio * dy)
 
     def lengths(move: Point, share):
@@ -131,17 +150,30 @@ def step(
         dual = jnp.minimum(_to_boundary(S_inverse, move.S), _to_zero(y, jnp.where(signed, move.y, 0)))
         return jnp.minimum(1.0, share * primal), jnp.minimum(1.0, share * dual)
 
-    predictor = direction(0.0, jnp.zeros_like(X), jnp.zeros_like(y))
-    a, b = lengths(predictor, 1.0)
-    products = jnp.sum((X + a * predictor.X) * (S + b * predictor.S))
-    products += jnp.sum(jnp.where(signed, (y + b * predictor.y) * (z + a * predictor.z), 0.0))
-    share = jnp.clip(products / (mu * (X.shape[0] + jnp.sum(signed))), 0.0, 1.0)
-    both = jnp.minimum(a, b)
-    share = share ** jnp.where(mu > 1e-6, jnp.maximum(1.0, 3 * both**2), 1.0)
-    share = jnp.maximum(share, jnp.where(both < 0.1, 0.5, 1e-4))
-    cross = symmetric(predictor.X @ predictor.S @ W)
-    move = direction(share * mu, cross, jnp.where(signed, predictor.y * predictor.z, 0.0))
-    a, b = lengths(move, 0.9 + 0.09 * both)
+    def attempt(_, plan: Plan) -> Plan:
+        """A direction and its step lengths; what they leave decides the next one's target."""
+        move = direction(plan)
+        a, b = lengths(move, plan.share)
+        left = jnp.sum((X + a * move.X) * (S + b * move.S))
+        left += jnp.sum(jnp.where(signed, (y + b * move.y) * (z + a * move.z), 0.0))
+        left = jnp.clip(left / (mu * (X.shape[0] + jnp.sum(signed))), 0.0, 1.0)
+        both = jnp.minimum(a, b)
+        left = left ** jnp.where(mu > 1e-6, jnp.maximum(1.0, 3 * both**2), 1.0)
+        return Plan(
+            target=mu * jnp.maximum(left, jnp.where(both < 0.1, 0.5, 1e-4)),
+            cross=symmetric(move.X @ move.S @ W),
+            cross_z=jnp.where(signed, move.y * move.z, 0.0),
+            share=0.9 + 0.09 * both,
+            lengths=(a, b),
+            move=move,
+        )
+
+    zero = jnp.zeros_like(mu)
+    nothing = jax.tree.map(jnp.zeros_like, Point(X, S, y, z))
+    plan = Plan(zero, nothing.X, nothing.z, zero + 1, (zero, zero), nothing)
+    # predictor, then corrector
+    plan = jax.lax.fori_loop(0, 2, attempt, plan)
+    move, (a, b) = plan.move, plan.lengths
     following = Point(
         symmetric(X + a * move.X), symmetric(S + b * move.S), y + b * move.y, z + a * move.z
     )

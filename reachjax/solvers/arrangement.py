@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.relaxation import Products
-from reachjax.solvers.generators import Generators, Pairs
+from reachjax.solvers.generators import Generators
 from reachjax.solvers.trimming import Trimmed, namespace
 
 SLOTS = 2
@@ -39,16 +39,17 @@ class Arrangement(NamedTuple):
 
 
 def arranged(
-    trimmed: Trimmed, products: Products, doubles: int | None = None, general: int | None = None
+    trimmed: Trimmed, products: Products, slots: int | None = None, general: int | None = None
 ) -> Arrangement:
     """Lay out a trimmed program.
 
     Args:
         trimmed: its numbers.
         products: its pairs.
-        doubles: how many multipliers may have more than one pair; counted if None.
-        general: how many of these may have more than two; counted if None. What is beyond is left
-            out, which is sound.
+        slots: how many pairs a multiplier may have before it needs a matrix, 1 or 2; counted if
+            None.
+        general: how many multipliers may have more; counted if None. What is beyond is left out,
+            which is sound.
     """
     xp, facts, count = namespace(trimmed.facts), trimmed.facts, len(products.free)
     m, n = facts.shape
@@ -59,21 +60,19 @@ def arranged(
     pairs = start[1:] - start[:-1]
     order = xp.argsort(-pairs, stable=True)
     pairs = pairs[order]
-    doubles = int((pairs > 1).sum()) if doubles is None else doubles
+    slots = int(1 + ((pairs > 1) & (pairs <= SLOTS)).any()) if slots is None else slots
     general = int((pairs > SLOTS).sum()) if general is None else general
     several = pairs > SLOTS
     dead = (pairs == 0) | (several & (xp.arange(count) >= general))
     scale = xp.where(dead, 0.0, 1 / xp.where(dead, 1.0, trimmed.sizes[order]))
 
-    def slot(number: int, length: int) -> Pairs:
+    def slot(number: int):
         there = (pairs > number) & ~several
         which = by_owner[xp.clip(start[:-1][order] + number, 0, len(by_owner) - 1)]
+        left, right = (xp.where(there, part[which], m) for part in (products.left, products.right))
         weight = xp.where(there, scale * products.sign[which], 0.0)
-        return Pairs(
-            xp.where(there, products.left[which], m)[:length],
-            xp.where(there, products.right[which], m)[:length],
-            weight[:length],
-        )
+        ends = xp.full(1, m), xp.full(1, m), xp.full(1, -1.0 * (number == 0))
+        return [xp.concatenate(each) for each in zip((left, right, weight), ends, strict=True)]
 
     def dense(number: int):
         mine = used & (products.multiplier == order[number]) & several[number]
@@ -82,16 +81,14 @@ def arranged(
         return (half + half.T) / 2
 
     last = xp.arange(n) == n - 1
-    first, offset = slot(0, count), xp.full(1, m)
+    parts = zip(*(slot(number) for number in range(slots)), strict=True)
+    left, right, weight = (xp.stack(part) for part in parts)
     matrices = [dense(number) for number in range(general)]
     generators = Generators(
         rows=xp.concatenate([facts, 1.0 * last[None]]),
-        first=Pairs(
-            xp.concatenate([first.left, offset]),
-            xp.concatenate([first.right, offset]),
-            xp.concatenate([first.weight, -xp.ones(1)]),
-        ),
-        second=slot(1, doubles),
+        left=left,
+        right=right,
+        weight=weight,
         general=xp.stack(matrices) if matrices else xp.zeros((0, n, n)),
         free=xp.concatenate([products.free[order] & ~dead, xp.full(1, True)]),
         target=-xp.concatenate([1.0 * dead, xp.ones(1)]),
@@ -103,35 +100,27 @@ def arranged(
 def cut(whole: Arrangement) -> Arrangement:
     """Without unused multipliers, rows and columns, padded to one of a few shapes; numpy only."""
     old, count = whole.generators, int((whole.scale > 0).sum())
-    columns, doubles = np.flatnonzero(old.idle == 0), len(old.second.weight)
-    slots = Pairs(*(part[:count] for part in old.first)), old.second
-    touched = [part[pairs.weight != 0] for pairs in slots for part in pairs[:2]]
-    kept = np.unique(np.concatenate(touched))
-    m, K = bucket(len(kept) + 1, 32), bucket(count + 1, 64)
+    columns, slots = np.flatnonzero(old.idle == 0), len(old.weight)
+    there = old.weight[:, :count] != 0
+    used = np.union1d(old.left[:, :count][there], old.right[:, :count][there]).astype(int)
+    m, K = bucket(len(used) + 1, 32), bucket(count + 1, 64)
     n = bucket(len(columns), 16 if len(columns) <= 32 else 8)
-    rows = np.zeros((m, n))
-    rows[: len(kept), n - len(columns) :] = old.rows[np.ix_(kept, columns)]
+    here = slice(n - len(columns), n)
+    rows, number = np.zeros((m, n)), np.full(len(old.rows), m - 1)
+    rows[: len(used), here] = old.rows[np.ix_(used, columns)]
     rows[-1, -1] = 1.0
-    number = np.full(len(old.rows), m - 1)
-    number[kept] = np.arange(len(kept))
-
-    def padded(pairs: Pairs, size: int) -> Pairs:
-        more = (0, size - len(pairs.weight))
-        left, right = (np.pad(number[part], more, constant_values=m - 1) for part in pairs[:2])
-        return Pairs(left, right, np.pad(pairs.weight, more))
-
-    first, second = padded(slots[0], K), padded(slots[1], K if doubles else 0)
-    first.weight[-1] = -1.0
-    general = np.zeros((len(old.general), n, n))
-    general[:, n - len(columns) :, n - len(columns) :] = old.general[
-        np.ix_(range(len(old.general)), columns, columns)
-    ]
+    number[used] = np.arange(len(used))
+    left, right = np.full((2, slots, K), m - 1)
+    weight, general = np.zeros((slots, K)), np.zeros((len(old.general), n, n))
+    left[:, :count], right[:, :count] = number[old.left[:, :count]], number[old.right[:, :count]]
+    weight[:, :count], weight[0, -1] = old.weight[:, :count], -1.0
+    general[:, here, here] = old.general[:, columns[:, None], columns]
     free, target = np.zeros(K, dtype=bool), np.full(K, -1.0)
     free[:count], target[:count], free[-1] = old.free[:count], old.target[:count], True
     objective = np.zeros((len(whole.objective), n))
-    objective[:, n - len(columns) :] = whole.objective[:, columns]
+    objective[:, here] = whole.objective[:, columns]
     idle = 1.0 * (np.arange(n) < n - len(columns))
-    generators = Generators(rows, first, second, general, free, target, idle)
+    generators = Generators(rows, left, right, weight, general, free, target, idle)
     return Arrangement(generators, objective, whole.order[:count], whole.scale[:count], columns)
 
 

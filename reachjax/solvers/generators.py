@@ -17,19 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-
-class Pairs(NamedTuple):
-    """One product of rows for each of the first `k` multipliers.
-
-    Attributes:
-        left: `(k,)`, row numbers.
-        right: `(k,)`, row numbers.
-        weight: `(k,)`, zero where the multiplier has no such product.
-    """
-
-    left: Int[Array, " k"]
-    right: Int[Array, " k"]
-    weight: Float[Array, " k"]
+LEAF = 192
+"""Triangular matrices up to this size are inverted in one piece."""
 
 
 class Generators(NamedTuple):
@@ -37,8 +26,9 @@ class Generators(NamedTuple):
 
     Attributes:
         rows: `(m, n)`, the facts; the last one is the constant's unit row `e`.
-        first: a pair of each multiplier; the last is the offset's, `-e' e`.
-        second: the other pair of the first few multipliers.
+        left: `(s, K)`, row numbers: multiplier `k` weighs the `s` pairs `left[:, k], right[:, k]`.
+        right: `(s, K)`, row numbers. The last multiplier is the offset's, `-e' e`.
+        weight: `(s, K)`, zero where a multiplier has no such pair.
         general: `(g, n, n)`, generators of the first `g` multipliers that have no pairs, else zero.
         free: `(K,)`, multipliers of either sign.
         target: `(K,)`, what `<G_k, X>` is at least, or equal to where the multiplier is free: 0,
@@ -47,8 +37,9 @@ class Generators(NamedTuple):
     """
 
     rows: Float[Array, "m n"]
-    first: Pairs
-    second: Pairs
+    left: Int[Array, "s K"]
+    right: Int[Array, "s K"]
+    weight: Float[Array, "s K"]
     general: Float[Array, "g n n"]
     free: Bool[Array, " K"]
     target: Float[Array, " K"]
@@ -56,20 +47,21 @@ class Generators(NamedTuple):
 
     def weighted(self, y: Float[Array, " K"]) -> Float[Array, "n n"]:
         """`sum_k y_k G_k`."""
-        half = jnp.zeros_like(self.rows)
-        for pairs in (self.first, self.second):
-            weights = pairs.weight * y[: len(pairs.weight)]
-            half = half.at[pairs.left].add(weights[:, None] * self.rows[pairs.right])
+        weights = (self.weight * y).ravel()[:, None]
+        half = jnp.zeros_like(self.rows).at[self.left.ravel()].add(
+            weights * self.rows[self.right.ravel()]
+        )
         general = jnp.tensordot(y[: len(self.general)], self.general, 1)
         return symmetric(self.rows.T @ half) + general
 
     def paired(self, matrix: Float[Array, "n n"]) -> Float[Array, " K"]:
         """`<G_k, M>` for a symmetric matrix."""
-        image, found = self.rows @ matrix, jnp.zeros_like(self.target)
-        for pairs in (self.first, self.second):
-            values = jnp.einsum("kn,kn->k", image[pairs.left], self.rows[pairs.right])
-            found = found.at[: len(values)].add(pairs.weight * values)
-        return found.at[: len(self.general)].add(jnp.tensordot(self.general, matrix, 2))
+        values = jnp.sum((self.rows @ matrix)[self.left] * self.rows[self.right], axis=2)
+        return self._with_general(jnp.sum(self.weight * values, axis=0), matrix)
+
+    def _with_general(self, values: Array, matrix: Array) -> Float[Array, " K"]:
+        more = jnp.tensordot(self.general, matrix, 2)
+        return values.at[: len(self.general)].add(more)
 
     def gram(self, matrix: Float[Array, "n n"]) -> Float[Array, "m m"]:
         """`F M F'`."""
@@ -79,11 +71,8 @@ class Generators(NamedTuple):
         self, gram: Float[Array, "m m"], matrix: Float[Array, "n n"]
     ) -> Float[Array, " K"]:
         """`<G_k, M>` for a symmetric matrix whose Gram matrix `F M F'` is known."""
-        found = jnp.zeros_like(self.target)
-        for pairs in (self.first, self.second):
-            values = pairs.weight * gram[pairs.left, pairs.right]
-            found = found.at[: len(values)].add(values)
-        return found.at[: len(self.general)].add(jnp.tensordot(self.general, matrix, 2))
+        values = jnp.sum(self.weight * gram[self.left, self.right], axis=0)
+        return self._with_general(values, matrix)
 
     def schur(
         self,
@@ -93,28 +82,28 @@ class Generators(NamedTuple):
         B: Float[Array, "m m"],
     ) -> Float[Array, "K K"]:
         """`<G_k, X G_l W>` for symmetric `X` and `W` with Gram matrices `A` and `B`."""
-        H, k = _block(A, B, self.first, self.first), len(self.second.weight)
-        if k:
-            mixed = _block(A, B, self.second, self.first)
-            H = H.at[:k].add(mixed).at[:, :k].add(mixed.T)
-            H = H.at[:k, :k].add(_block(A, B, self.second, self.second))
+        slots, count = self.weight.shape
+        left, right = self.left.ravel(), self.right.ravel()
+        # columns first: what is left to pick are whole rows
+        A_left, A_right, B_left, B_right = A[:, left], A[:, right], B[:, left], B[:, right]
+
+        def row(pairs):
+            values = jnp.zeros(slots * count)
+            for number in range(slots):
+                l, r, weight = (part[number] for part in pairs)
+                crossed = A_left[l] * B_right[r] + A_right[l] * B_left[r]
+                crossed += A_left[r] * B_right[l] + A_right[r] * B_left[l]
+                values += weight / 4 * crossed
+            return jnp.sum(self.weight * values.reshape(slots, count), axis=0)
+
+        # row by row: fused into each of its uses, the whole would be gathered again there
+        H = jax.lax.map(row, (self.left.T, self.right.T, self.weight.T))
         for j in range(len(self.general)):
-            row = self.paired(symmetric(X @ self.general[j] @ W))
+            values = self.paired(symmetric(X @ self.general[j] @ W))
             # one that is empty here has pairs instead
-            row = jnp.where(jnp.any(self.general[j] != 0), row, H[j])
-            H = H.at[j].set(row).at[:, j].set(row)
-        return symmetric(H)
-
-
-def _block(A: Array, B: Array, ours: Pairs, others: Pairs) -> Float[Array, "k l"]:
-    """The formula of this module's docstring for all pairs of two kinds."""
-    # columns first: what is left to gather are whole rows
-    A_left, A_right = A[:, others.left], A[:, others.right]
-    B_left, B_right = B[:, others.left], B[:, others.right]
-    left, right = ours.left, ours.right
-    crossed = A_left[left] * B_right[right] + A_right[left] * B_left[right]
-    crossed += A_left[right] * B_right[left] + A_right[right] * B_left[left]
-    return ours.weight[:, None] * others.weight * crossed / 4
+            values = jnp.where(jnp.any(self.general[j] != 0), values, H[j])
+            H = H.at[j].set(values).at[:, j].set(values)
+        return H
 
 
 def symmetric(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -123,6 +112,12 @@ def symmetric(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def inverse_factor(factor: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The inverse of a lower triangular matrix."""
-    eye = jnp.eye(factor.shape[-1], dtype=factor.dtype)
-    return jax.lax.linalg.triangular_solve(factor, eye, left_side=True, lower=True)
+    """The inverse of a lower triangular matrix, by halves: LAPACK would not see the identity."""
+    size = factor.shape[-1]
+    if size <= LEAF:
+        eye = jnp.eye(size, dtype=factor.dtype)
+        return jax.lax.linalg.triangular_solve(factor, eye, left_side=True, lower=True)
+    half = size // 2
+    first, last = inverse_factor(factor[:half, :half]), inverse_factor(factor[half:, half:])
+    below = -last @ (factor[half:, :half] @ first)
+    return jnp.block([[first, jnp.zeros((half, size - half))], [below, last]])

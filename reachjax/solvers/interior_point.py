@@ -201,7 +201,7 @@ class InteriorPoint(AbstractSolver):
             return super().propose(program)
         given = trimmed(program)
         extra = len(program.products.left) - len(program.products.free)
-        layout = arranged(given, program.products, max(extra, 0), int(extra > 1))
+        layout = arranged(given, program.products, 1 + (extra > 0), int(extra > 1))
 
         def solve(row: Float[Array, " n"]) -> Facet:
             return solve_alone(layout.generators, row, self.tolerance, self.max_iterations)

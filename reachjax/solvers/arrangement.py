@@ -103,7 +103,7 @@ def cut(whole: Arrangement) -> Arrangement:
     columns, slots = np.flatnonzero(old.idle == 0), len(old.weight)
     there = old.weight[:, :count] != 0
     used = np.union1d(old.left[:, :count][there], old.right[:, :count][there]).astype(int)
-    m, K = bucket(len(used) + 1, 32), bucket(count + 1, 64)
+    m, K = bucket(len(used) + 1, 32), bucket(count + 1, 32)
     n = bucket(len(columns), 16 if len(columns) <= 32 else 8)
     here = slice(n - len(columns), n)
     rows, number = np.zeros((m, n)), np.full(len(old.rows), m - 1)

@@ -158,7 +158,7 @@ def step(
         left += jnp.sum(jnp.where(signed, (y + b * move.y) * (z + a * move.z), 0.0))
         left = jnp.clip(left / (mu * (X.shape[0] + jnp.sum(signed))), 0.0, 1.0)
         both = jnp.minimum(a, b)
-        left = left ** jnp.where(mu > 1e-6, jnp.maximum(1.0, 3 * both**2), 1.0)
+        left = left ** jnp.maximum(1.0, 3 * both**2)
         return Plan(
             target=mu * jnp.maximum(left, jnp.where(both < 0.1, 0.5, 1e-4)),
             cross=symmetric(move.X @ move.S @ W),

@@ -11,6 +11,7 @@ from reachjax.rounding import gamma
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import Enclosure, Solution, SolverStatus
 from reachjax.solvers.compact import compact
+from reachjax.solvers.trimming import summed, trimmed
 
 ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
 
@@ -52,16 +53,21 @@ def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
 
     The optimal value is no smaller (weak duality), but for what they miss their constraints by.
     """
-    reduced = compact(program)
-    values = np.full(len(reduced.centers), -np.inf)
+    given, products = trimmed(program), program.products
+    columns, kept = np.flatnonzero(given.columns), given.kept
+    facts, free = given.facts[:, columns], products.free[kept]
+    left, right = facts[products.left], facts[products.right]
+    values = np.full(len(given.centers), -np.inf)
     for i, whole in enumerate(np.asarray(solution.moments)):
-        X = whole[np.ix_(reduced.columns, reduced.columns)]
+        X = whole[np.ix_(columns, columns)]
         if not np.isfinite(X).all() or abs(X[-1, -1] - 1) > SHORTFALL:
             continue
-        products = reduced.generators.T @ X.ravel()
-        missed = np.where(reduced.free, abs(products), -products)
+        pairs = products.sign * np.einsum("pi,pi->p", left @ X, right)
+        sums = summed(pairs, products.multiplier, len(kept))[kept] / given.sizes[kept]
+        missed = np.where(free, abs(sums), -sums)
         if missed.max(initial=0.0) <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL:
-            values[i] = reduced.centers[i] + reduced.units[i] * (reduced.objective[i] @ X[:, -1])
+            attained = given.objective[i, columns] @ X[:, -1]
+            values[i] = given.centers[i] + given.units[i] * attained
     return values
 
 

@@ -1,8 +1,6 @@
-"""The program as a solver should see it: nothing empty, nothing at rounding level, unit sizes.
+"""The program as a conic solver should see it: a trimmed one, its generators as sparse columns.
 
-Rows whose coefficients are rounding noise are dropped (one of size 1e-16 scaled up to 1 made a
-solver report "solved" for an offset below the true support), so are columns that the others use at
-that level or not at all. The generators that remain are scaled to unit norm.
+They are scaled to unit norm.
 """
 
 from __future__ import annotations
@@ -13,11 +11,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from reachjax.lmi import Program
-from reachjax.rounding import Ball
 from reachjax.sets import NormalForm
-
-NOISE = 16.0
-"""Coefficients no larger than this many times the rounding error of their row count as zero."""
+from reachjax.solvers.trimming import trimmed
 
 CHUNK = 256
 """Pairs whose dense outer products are held in memory at once."""
@@ -73,53 +68,21 @@ class CompactProgram(NamedTuple):
 
 def compact(program: Program) -> CompactProgram:
     """Drop what is empty or noise, and bring the generators to unit norm."""
-    facts, solid = np.asarray(program.facts.mid), _solid(program.facts)
-    columns = np.flatnonzero(solid.any(axis=0) | _solid(program.objective).any(axis=0))
-    facts = np.where(solid.any(axis=1, keepdims=True), facts, 0.0)[:, columns]
-    generators, norms = _generators(program, facts)
-    kept = np.flatnonzero((norms > 0) & ~_implied_by_cone(program, facts, generators))
+    given = trimmed(program)
+    columns = np.flatnonzero(given.columns)
+    generators, norms = _generators(program, given.facts[:, columns])
+    kept = np.flatnonzero((norms > 0) & given.kept)
     unit_size = sp.diags_array(1 / norms[kept])
-    # solvers' tolerances are absolute, objectives come in the size of the set of states
-    objective = np.asarray(program.objective.mid)[:, columns].copy()
-    centers = objective[:, -1].copy()
-    objective[:, -1] = 0.0
-    units = abs(objective).sum(axis=1)
     return CompactProgram(
         generators=sp.csc_array(generators[:, kept] @ unit_size),
-        objective=objective / np.where(units > 0, units, 1.0)[:, None],
-        centers=centers,
-        units=units,
+        objective=given.objective[:, columns],
+        centers=given.centers,
+        units=given.units,
         free=np.asarray(program.products.free)[kept],
         columns=columns,
         kept=kept,
         norms=norms[kept],
     )
-
-
-def _solid(rows: Ball) -> np.ndarray:
-    """Which coefficients stand out from the rounding errors of their row."""
-    noise = np.linalg.norm(np.asarray(rows.rad), axis=1)
-    return abs(np.asarray(rows.mid)) > NOISE * noise[:, None]
-
-
-def _implied_by_cone(program: Program, facts: np.ndarray, generators: sp.csc_array) -> np.ndarray:
-    """Multipliers `(K,)` of products that say nothing beyond an ellipsoid's own fact.
-
-    A quadratic function of the state that is not negative on the ellipsoid is a positive multiple
-    of its fact and a positive semidefinite term (the S-lemma loses nothing for one constraint).
-    Products of neurons that are affine on the set are of this kind; kept, hundreds of them made a
-    solver stall at its second digit.
-    """
-    cone = np.asarray(program.products.sign) < 0
-    if not cone.any():
-        return np.zeros(len(program.products.free), dtype=bool)
-    state = (facts[np.asarray(program.products.left)[cone]] != 0).any(axis=0)
-    state[-1] = True
-    outside = ~np.outer(state, state).ravel()
-    beyond = abs(generators[np.flatnonzero(outside)]).sum(axis=0) > 0
-    its_own = np.zeros(len(program.products.free), dtype=bool)
-    its_own[np.asarray(program.products.multiplier)[cone]] = True
-    return ~np.asarray(beyond).ravel() & ~its_own
 
 
 def _generators(program: Program, facts: np.ndarray) -> tuple[sp.csc_array, np.ndarray]:

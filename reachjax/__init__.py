@@ -27,6 +27,7 @@ from reachjax.sizes import log_volume, log_widths, volume
 from reachjax.solvers import (
     SCS,
     AbstractSolver,
+    Auto,
     Clarabel,
     CvxpySolver,
     InteriorPoint,
@@ -62,6 +63,7 @@ __all__ = [
     "AbstractSolver",
     "AbstractTemplate",
     "AffinePlant",
+    "Auto",
     "Box",
     "Certificate",
     "ChangeOfBasis",

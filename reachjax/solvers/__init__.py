@@ -1,6 +1,7 @@
 """The seam to semidefinite-programming codes: arrays in, arrays out."""
 
 from reachjax.solvers.accepted import accepted_enclosure, accepted_offsets
+from reachjax.solvers.auto import Auto
 from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, SolverStatus
 from reachjax.solvers.differentiable import proved_offsets
 from reachjax.solvers.enclosures import proved_ellipsoid, proved_size
@@ -11,6 +12,7 @@ from reachjax.solvers.named import SCS, Clarabel, CvxpySolver
 __all__ = [
     "SCS",
     "AbstractSolver",
+    "Auto",
     "Clarabel",
     "CvxpySolver",
     "Enclosure",

@@ -178,17 +178,20 @@ class InteriorPoint(AbstractSolver):
         layout = cut(arranged(given, program.products))
         generators, count = jax.device_put(layout.generators), len(layout.columns)
         used = np.ix_(layout.columns, layout.columns)
-        for i, row in enumerate(layout.objective):
+        for here in _batches(facets):
             began = time.perf_counter()
-            found = jax.device_get(_run(generators, row, self.tolerance, self.max_iterations))
-            solution.seconds[i] = time.perf_counter() - began
-            solution.statuses[i] = found.status
-            solution.offsets[i] = given.centers[i] + given.units[i] * found.offset
-            factor = 2 * given.units[i] * layout.scale
-            solution.multipliers[i, layout.order] = factor * found.multipliers[: len(factor)]
-            if np.isfinite(found.offset):
-                solution.moments[i] = 0.0
-                solution.moments[i][used] = found.moment[-count:, -count:]
+            rows = layout.objective[here]
+            found = jax.device_get(_run(generators, rows, self.tolerance, self.max_iterations))
+            solution.seconds[here] = (time.perf_counter() - began) / len(rows)
+            solution.statuses[here] = found.status
+            solution.offsets[here] = given.centers[here] + given.units[here] * found.offset
+            factors = 2 * given.units[here, None] * layout.scale
+            multipliers = factors * found.multipliers[:, : len(layout.scale)]
+            solution.multipliers[here, layout.order] = multipliers
+            for i, moment in zip(range(facets)[here], found.moment, strict=True):
+                if np.isfinite(moment).all():
+                    solution.moments[i] = 0.0
+                    solution.moments[i][used] = moment[-count:, -count:]
         return solution
 
     def propose(self, program: Program) -> Solution:
@@ -202,11 +205,9 @@ class InteriorPoint(AbstractSolver):
         given = trimmed(program)
         extra = len(program.products.left) - len(program.products.free)
         layout = arranged(given, program.products, 1 + (extra > 0), int(extra > 1))
-
-        def solve(row: Float[Array, " n"]) -> Facet:
-            return solve_alone(layout.generators, row, self.tolerance, self.max_iterations)
-
-        found: Facet = jax.lax.map(solve, layout.objective)
+        found = solve_facets(
+            layout.generators, layout.objective, self.tolerance, self.max_iterations
+        )
         count = len(layout.order)
         factors = 2 * given.units[:, None] * layout.scale
         ordered = jnp.where(jnp.isfinite(factors), factors, 0.0) * found.multipliers[:, :count]
@@ -220,10 +221,35 @@ class InteriorPoint(AbstractSolver):
         )
 
 
-_run = jax.jit(solve_facet)
-
-
 @jax.custom_batching.sequential_vmap
-def solve_alone(generators: Generators, row: Array, tolerance: Array, limit: Array) -> Facet:
-    """`solve_facet`, one after the other under `jax.vmap`: batches of factorisations hung on a CPU."""
+def _one(generators: Generators, row: Array, tolerance: Array, limit: Array) -> Facet:
+    """`solve_facet`, one after the other also under `jax.vmap`."""
     return solve_facet(generators, row, tolerance, limit)
+
+
+def solve_facets(
+    generators: Generators,
+    rows: Float[Array, "f n"],
+    tolerance: Float[Array, ""] | float,
+    max_iterations: Int[Array, ""] | int,
+) -> Facet:
+    """`solve_facet` for several objectives; every array of the result has an axis for them.
+
+    Batched on an accelerator. On a CPU one after the other: batches of factorisations inside a
+    `while_loop` were seen to hang there (jaxlib 0.10.2 on two cores).
+    """
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(lambda row: _one(generators, row, tolerance, max_iterations), rows)
+    return jax.vmap(solve_facet, (None, 0, None, None))(
+        generators, rows, tolerance, max_iterations
+    )
+
+
+_run = jax.jit(solve_facets)
+
+
+def _batches(facets: int) -> list[slice]:
+    """One facet at a time on a CPU, which compiles once for any number of them; else all."""
+    if jax.default_backend() == "cpu":
+        return [slice(i, i + 1) for i in range(facets)]
+    return [slice(0, facets)]

@@ -1,0 +1,342 @@
+"""The interior-point method: its algebra, its answers, and how it ends when it cannot answer."""
+
+import dataclasses
+import itertools
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import eigvalsh
+
+import reachjax as rj
+from reachjax.lmi import step_program
+from reachjax.recheck import interval_offsets
+from reachjax.relaxation import AbstractRelaxation
+from reachjax.solvers import accepted_offsets, interior_point
+from reachjax.solvers.arrangement import arranged, bucket, cut
+from reachjax.solvers.compact import compact
+from reachjax.solvers.generators import inverse_factor
+from reachjax.solvers.trimming import trimmed
+from tests.loops import closed_loop, random_loop
+from tests.networks import (
+    affine_network,
+    box_region,
+    dead_network,
+    directions,
+    he_network,
+    saturating_network,
+    simplex_region,
+    simulate,
+)
+from tests.solvers.test_differentiable import PROMISED, STEP, along, dot, planar, relative_error
+from tests.solvers.test_differentiable import value as planar_value
+
+SOLVER = rj.InteriorPoint()
+
+
+@dataclasses.dataclass(frozen=True)
+class AllPairs(AbstractRelaxation):
+    """Every product of two facts: far more multipliers than the matrix has entries."""
+
+    remove_stable: bool = True
+
+    def groups(self, facts):
+        free = [[pair] for pair in zip(facts.output, facts.slack, strict=True)]
+        kinds = facts.output, facts.slack, facts.output_cap, facts.slack_cap
+        rows = [0, *facts.set_facets, *itertools.chain(*kinds)]
+        pairs = [[pair] for pair in itertools.combinations(rows, 2)]
+        return free + [pair for pair in pairs if pair not in free], len(free)
+
+
+def program_of(data, X, relaxation, rows):
+    loop = closed_loop(data)
+    return jax.device_get(step_program(loop, X, X.bounding_box(), rows, 0, relaxation))
+
+
+def box_of(n_x, seed):
+    region = box_region(n_x, seed)
+    return rj.Box(region.corners.min(axis=0), region.corners.max(axis=0))
+
+
+def round_of(n_x, seed):
+    box = box_of(n_x, seed)
+    return rj.Ellipsoid(box.center, jnp.diag(((box.upper - box.lower) / 2) ** 2))
+
+
+def flat(n_x, seed):
+    box = box_of(n_x, seed)
+    return rj.Box(box.lower, box.upper.at[0].set(box.lower[0]))
+
+
+def simplex(n_x, seed):
+    region = simplex_region(n_x, seed)
+    return rj.Polytope(region.A, region.b)
+
+
+def program(n_x=3, seed=0, hidden=(5, 3), network=he_network, X=box_of, relaxation=None):
+    data = random_loop(n_x, hidden, seed, network=network)
+    rows = directions(n_x, seed, extra=1)[:: n_x + 1]
+    return program_of(data, X(n_x, seed), relaxation or rj.LocalBounds(), rows)
+
+
+KINDS = {
+    "single pairs": program(relaxation=rj.PaperQC(repeated=False)),
+    "two pairs": program(seed=1, relaxation=rj.PaperQC()),
+    "an ellipsoid's squares": program(seed=2, X=round_of, relaxation=rj.PaperQC()),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_schur_matrix_is_that_of_traces_of_explicit_matrices(kind):
+    given, rng = KINDS[kind], np.random.default_rng(0)
+    layout = cut(arranged(trimmed(given), given.products))
+    generators, n = layout.generators, layout.generators.rows.shape[1]
+    count = len(layout.order)
+    eye = np.eye(len(generators.free))
+    G = np.array([generators.weighted(row) for row in eye])
+    X, W = (A @ A.T for A in rng.normal(size=(2, n, n)))
+    schur = generators.schur(X, W, generators.gram(X), generators.gram(W))
+    traces = np.einsum("kij,jm,lmn,ni->kl", G, X, G, W, optimize=True)
+    np.testing.assert_allclose(schur, traces, atol=1e-12 * abs(traces).max())
+    np.testing.assert_allclose(generators.paired(X), np.einsum("kij,ij->k", G, X), atol=1e-10)
+    known = generators.paired_gram(generators.gram(X), X)
+    np.testing.assert_allclose(known, generators.paired(X), atol=1e-10)
+    # and they are the program's own generators
+    reduced, k = compact(given), len(layout.columns)
+    dense = reduced.generators.T.toarray().reshape(-1, k, k) * reduced.norms[:, None, None]
+    mine = G[:count, -k:, -k:] / layout.scale[:, None, None]
+    assert set(layout.order.tolist()) == set(reduced.kept.tolist())
+    np.testing.assert_allclose(mine[np.argsort(layout.order)], dense, atol=1e-12)
+
+
+def test_triangular_matrices_are_inverted_by_halves():
+    L = np.tril(np.random.default_rng(0).normal(size=(401, 401))) + 40 * np.eye(401)
+    np.testing.assert_allclose(inverse_factor(jnp.asarray(L)) @ L, np.eye(401), atol=1e-12)
+
+
+def test_padded_sizes_are_few_and_never_too_small():
+    sizes = [bucket(size, 8) for size in range(1, 1000)]
+    assert all(padded >= size for size, padded in enumerate(sizes, 1))
+    assert len(set(sizes)) <= 60
+
+
+DEGENERATE = {
+    "generic": {},
+    "dead neurons": {"network": dead_network, "relaxation": rj.PaperQC()},
+    "an affine network": {"network": affine_network, "relaxation": rj.PaperQC(repeated=False)},
+    "saturated inputs": {"network": saturating_network, "relaxation": rj.LocalBounds(True, False)},
+    "a flat set": {"X": flat, "relaxation": rj.PaperQC()},
+    "a simplex": {"X": simplex},
+    "an ellipsoid": {"X": round_of, "network": saturating_network},
+    "one state": {"n_x": 1, "seed": 4},
+    "every product": {"hidden": (4,), "relaxation": AllPairs()},
+    "every product, all of it implied": {
+        "n_x": 2,
+        "hidden": (4, 3),
+        "network": affine_network,
+        "relaxation": AllPairs(),
+    },
+}
+
+
+@pytest.fixture(scope="module", params=DEGENERATE.values(), ids=DEGENERATE.keys())
+def answer(request):
+    """(program, solution, Clarabel's)."""
+    given = program(**request.param)
+    return given, SOLVER.solve(given), rj.Clarabel().solve(given)
+
+
+def test_it_agrees_with_clarabel(answer):
+    given, solution, reference = answer
+    solved = reference.statuses == rj.SolverStatus.SOLVED
+    assert solved.any()
+    size = interval_offsets(given) - given.objective.mid[:, -1]
+    np.testing.assert_allclose(
+        (solution.offsets - reference.offsets)[solved] / np.maximum(size[solved], 1e-9), 0, atol=1e-6
+    )
+    bounds, _ = accepted_offsets(given, solution)
+    others, _ = accepted_offsets(given, reference)
+    assert np.all(abs(bounds - others) <= 1e-5 * size + 1e-12)
+
+
+def test_what_it_proposes_is_well_formed(answer):
+    given, solution, _ = answer
+    products = given.products
+    assert np.isfinite(solution.multipliers).all()
+    assert solution.multipliers[:, ~products.free].min(initial=0.0) >= 0
+    assert np.all(solution.seconds > 0)
+    for X in solution.moments:
+        assert X[-1, -1] == pytest.approx(1.0, abs=1e-12)
+        assert eigvalsh(X)[0] >= -1e-9
+        pairs = np.einsum("pi,ij,pj->p", given.facts.mid[products.left], X, given.facts.mid[products.right])
+        sums = np.bincount(products.multiplier, products.sign * pairs, len(products.free))
+        assert abs(sums[products.free]).max(initial=0.0) <= 1e-4
+        assert sums[~products.free].min(initial=0.0) >= -1e-4
+
+
+def test_facets_are_optimal_and_solved_or_inaccurate(answer):
+    given, solution, _ = answer
+    allowed = {rj.SolverStatus.SOLVED, rj.SolverStatus.INACCURATE}
+    assert set(solution.statuses) <= allowed
+    assert accepted_offsets(given, solution)[1].all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_sampled_successor_is_outside(seed):
+    data, region = random_loop(3, seed=seed), box_region(3, seed)
+    loop, template = closed_loop(data), rj.Template(directions(3, seed, extra=2))
+    following, certificate = rj.reach_step(loop, box_of(3, seed), template, solver=SOLVER)
+    states = np.vstack([region.corners, region.sample(20_000, seed)])
+    assert np.all(following.contains(simulate(data, states, 1)[1]))
+    assert set(certificate.statuses) == {rj.SolverStatus.SOLVED}
+
+
+def test_a_run_that_is_stopped_early_says_so_and_is_sound():
+    given = program()
+    best = SOLVER.solve(given).offsets
+    for limit in (1, 3, 6):
+        solution = rj.InteriorPoint(max_iterations=limit).solve(given)
+        assert set(solution.statuses) == {rj.SolverStatus.LIMIT}
+        assert np.isfinite(solution.multipliers).all()
+        bounds, optimal = accepted_offsets(given, solution)
+        assert np.all(bounds >= best - 1e-9)
+        assert np.all(bounds <= interval_offsets(given))
+        assert not optimal.any()
+
+
+def test_a_tolerance_that_is_out_of_reach_ends_inaccurate():
+    given = program(relaxation=rj.PaperQC(repeated=False))
+    solution = rj.InteriorPoint(tolerance=1e-16).solve(given)
+    assert set(solution.statuses) == {rj.SolverStatus.INACCURATE}
+    np.testing.assert_allclose(solution.offsets, SOLVER.solve(given).offsets, atol=1e-7)
+
+
+GARBAGE = {
+    "huge": lambda rows, rng: 1e200 * rows,
+    "noise": lambda rows, rng: rng.normal(size=rows.shape),
+    "nothing": lambda rows, rng: 0 * rows,
+    "wild": lambda rows, rng: rows * 10.0 ** rng.uniform(-12, 12, size=rows.shape),
+}
+
+
+@pytest.mark.parametrize("kind", GARBAGE)
+@pytest.mark.parametrize("traced", [False, True])
+def test_garbage_ends_with_finite_multipliers_and_a_status(kind, traced):
+    given = program(hidden=(4,))
+    rows = GARBAGE[kind](given.facts.mid, np.random.default_rng(0))
+    given = given.with_midpoints(rows, given.objective.mid)
+    solution = jax.jit(SOLVER.propose)(given) if traced else SOLVER.solve(given)
+    assert np.isfinite(solution.multipliers).all()
+    assert np.all(solution.multipliers[:, ~given.products.free] >= 0)
+    assert {rj.SolverStatus(int(code)).advice for code in solution.statuses}
+    assert np.isfinite(accepted_offsets(given, jax.device_get(solution))[0]).all()
+
+
+@pytest.mark.parametrize("traced", [False, True])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_programs_that_are_not_numbers_get_a_blank_proposal(traced, bad):
+    given = program(hidden=(4,))
+    rows = given.facts.mid.copy()
+    rows[2, 1] = bad
+    given = given.with_midpoints(rows, given.objective.mid)
+    solution = (jax.jit(SOLVER.propose) if traced else SOLVER.propose)(given)
+    assert np.all(solution.multipliers == 0)
+    assert np.isnan(solution.offsets).all()
+    assert np.isnan(solution.moments).all()
+    assert set(np.asarray(solution.statuses)) == {rj.SolverStatus.FAILED}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_traced_and_plain_programs_get_the_same_answer(kind):
+    given = KINDS[kind]
+    plain, traced = SOLVER.solve(given), jax.jit(SOLVER.propose)(given)
+    np.testing.assert_allclose(traced.offsets, plain.offsets, atol=1e-7)
+    np.testing.assert_allclose(traced.moments, plain.moments, atol=1e-2)
+    np.testing.assert_array_equal(traced.statuses, plain.statuses)
+    bounds, optimal = accepted_offsets(given, jax.device_get(traced))
+    np.testing.assert_allclose(bounds, accepted_offsets(given, plain)[0], atol=1e-7)
+    assert optimal.all()
+
+
+value = partial(planar_value, solver=SOLVER)
+
+
+@pytest.fixture(scope="module")
+def planar_gradient():
+    """(compiled value, arguments, the compiled gradient there)."""
+    args = planar(0)
+    return jax.jit(value), args, jax.jit(jax.grad(value, argnums=(0, 1)))(*args)
+
+
+@pytest.mark.parametrize("part", ["weights", "A", "initial set", "input limits"])
+def test_the_gradient_is_the_central_difference(planar_gradient, part):
+    f, args, gradient = planar_gradient
+    assert relative_error(f, args, gradient, along(part, *args, 0), STEP) <= PROMISED
+
+
+def test_compiled_and_plain_gradients_agree(planar_gradient):
+    f, args, gradient = planar_gradient
+    assert float(f(*args)) == pytest.approx(float(value(*args)), abs=1e-7)
+    plain = jax.grad(value, argnums=(0, 1))(*args)
+    off = jax.tree.map(jnp.subtract, gradient, plain)
+    assert np.sqrt(dot(off, off) / dot(plain, plain)) <= 1e-4
+
+
+def test_scan_and_vmap_equal_one_at_a_time(planar_gradient):
+    f, (loop, X0), _ = planar_gradient
+    nets = [jax.tree.map(lambda w, s=s: w * (1 + s), loop.controller) for s in (0.0, 0.1)]
+    stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *nets)
+
+    def of(net):
+        return value(loop.replace(controller=net), X0)
+
+    single = [f(loop.replace(controller=net), X0) for net in nets]
+    np.testing.assert_allclose(jax.vmap(of)(stack), single, atol=1e-7)
+    scanned = jax.lax.scan(lambda carry, net: (carry, of(net)), 0, stack)[1]
+    np.testing.assert_allclose(scanned, single, atol=1e-7)
+
+
+def test_programs_of_like_size_share_a_compilation():
+    for seed in range(4):
+        SOLVER.solve(program(seed=seed, relaxation=rj.PaperQC(repeated=False)))
+        if seed == 0:
+            before = interior_point._run._cache_size()
+    assert interior_point._run._cache_size() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"tolerance": 0}, ValueError),
+        ({"tolerance": "1e-6"}, TypeError),
+        ({"max_iterations": 2.5}, TypeError),
+        ({"max_iterations": -1}, ValueError),
+        ({"tol": 1e-6}, TypeError),
+    ],
+    ids=str,
+)
+def test_wrong_options_are_refused(options, error):
+    with pytest.raises(error):
+        rj.InteriorPoint(**options)
+
+
+def test_it_says_that_it_knows_no_ellipsoids():
+    with pytest.raises(NotImplementedError, match="InteriorPoint"):
+        SOLVER.enclose(program())
+
+
+def test_auto_chooses_by_size_alone_and_leaves_ellipsoids_to_clarabel():
+    small, large = program(), program(hidden=(20, 10), relaxation=rj.PaperQC(repeated=False))
+    auto = rj.Auto()
+    assert auto.choice(small) == rj.Clarabel()
+    assert auto.choice(large) == rj.InteriorPoint()
+    np.testing.assert_array_equal(auto.solve(small).offsets, rj.Clarabel().solve(small).offsets)
+    np.testing.assert_array_equal(auto.solve(large).offsets, SOLVER.solve(large).offsets)
+    loop, box = closed_loop(random_loop(2)), box_of(2, 0)
+    found, _ = rj.reach_step(loop, box, rj.EllipsoidTemplate(), solver=auto)
+    other, _ = rj.reach_step(loop, box, rj.EllipsoidTemplate(), solver=rj.Clarabel())
+    np.testing.assert_array_equal(found.shape, other.shape)
+    with pytest.raises(TypeError, match=r"Auto\.small"):
+        rj.Auto(small="clarabel")

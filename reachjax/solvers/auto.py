@@ -44,7 +44,9 @@ class Auto(AbstractSolver):
     def __post_init__(self):
         for name in ("small", "large"):
             if not isinstance(getattr(self, name), AbstractSolver):
-                raise TypeError(f"Auto.{name} must be a solver, but {getattr(self, name)!r} arrived")
+                raise TypeError(
+                    f"Auto.{name} must be a solver, but {getattr(self, name)!r} arrived"
+                )
         whole_number("Auto.limit", self.limit, 0)
 
     def choice(self, program: Program) -> AbstractSolver:

@@ -48,8 +48,10 @@ class Generators(NamedTuple):
     def weighted(self, y: Float[Array, " K"]) -> Float[Array, "n n"]:
         """`sum_k y_k G_k`."""
         weights = (self.weight * y).ravel()[:, None]
-        half = jnp.zeros_like(self.rows).at[self.left.ravel()].add(
-            weights * self.rows[self.right.ravel()]
+        half = (
+            jnp.zeros_like(self.rows)
+            .at[self.left.ravel()]
+            .add(weights * self.rows[self.right.ravel()])
         )
         general = jnp.tensordot(y[: len(self.general)], self.general, 1)
         return symmetric(self.rows.T @ half) + general

@@ -28,8 +28,8 @@ from reachjax.solvers.generators import Generators
 from reachjax.solvers.primal_dual import Point, start, step
 from reachjax.solvers.trimming import trimmed
 
-FURTHER = 1e-2
-"""Iterates go on to this part of the tolerance, as long as each gains a factor of two."""
+FURTHER = 1e-3
+"""Iterates go on to this part of the tolerance, as long as they gain."""
 
 PATIENCE = 12
 """Iterations without a better iterate after which a run has stalled."""
@@ -102,13 +102,12 @@ def solve_facet(
         following, missed, length = step(generators, row, search.point)
         merit = missed.merit
         better = merit < search.merit
-        gained = merit < search.merit / 2
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), search.point, search.best)
         short = jnp.where(length < SHORT, search.short + 1, 0)
         idle = jnp.where(better, 0, search.idle + 1)
         least = jnp.minimum(jnp.where(jnp.isnan(merit), jnp.inf, merit), search.merit)
         lost = ~jnp.isfinite(merit) | (idle > PATIENCE) | (short > 3)
-        enough = (least <= FURTHER * tolerance) | ((search.merit <= tolerance) & ~gained)
+        enough = (least <= FURTHER * tolerance) | ((least <= tolerance) & (idle > 2))
         return Search(following, best, least, search.count + 1, idle, short, lost | enough)
 
     point, zero = start(generators), jnp.array(0)
@@ -141,8 +140,8 @@ class InteriorPoint(AbstractSolver):
     It compiles once for each of a few padded sizes; on the CPU facets are solved one by one.
 
     Args:
-        tolerance: of residuals and gap, relative. Iterations go on to a hundredth of it as long as
-            they gain.
+        tolerance: of residuals and gap, relative, that counts as solved. Iterations go on to a
+            thousandth of it as long as they gain, which most programs reach.
         max_iterations: a facet that needs more is reported with status `LIMIT`.
 
     Raises:
@@ -158,7 +157,7 @@ class InteriorPoint(AbstractSolver):
         ([1.0, -0.5], ['SOLVED', 'SOLVED'])
     """
 
-    tolerance: float = 1e-7
+    tolerance: float = 1e-6
     max_iterations: int = 200
 
     def __post_init__(self):
@@ -240,9 +239,7 @@ def solve_facets(
     """
     if jax.default_backend() == "cpu":
         return jax.lax.map(lambda row: _one(generators, row, tolerance, max_iterations), rows)
-    return jax.vmap(solve_facet, (None, 0, None, None))(
-        generators, rows, tolerance, max_iterations
-    )
+    return jax.vmap(solve_facet, (None, 0, None, None))(generators, rows, tolerance, max_iterations)
 
 
 _run = jax.jit(solve_facets)

@@ -28,6 +28,9 @@ DAMPING = 1e-4
 """`kappa` of this module's docstring. Measured on degenerate programs: at 1e-3 some stall at the
 start, without it some multipliers grow to 1e7 and six digits are lost."""
 
+LEAST = 0.05
+"""The target is no smaller a part of `mu`: faster falls cost `X` its last digits."""
+
 REGULAR = 1e-14
 """What is added to the unit diagonal of the scaled Schur matrix at first."""
 
@@ -147,7 +150,9 @@ def step(
 
     def lengths(move: Point, share):
         primal = jnp.minimum(_to_boundary(X_inverse, move.X), _to_zero(z, move.z))
-        dual = jnp.minimum(_to_boundary(S_inverse, move.S), _to_zero(y, jnp.where(signed, move.y, 0)))
+        dual = jnp.minimum(
+            _to_boundary(S_inverse, move.S), _to_zero(y, jnp.where(signed, move.y, 0))
+        )
         return jnp.minimum(1.0, share * primal), jnp.minimum(1.0, share * dual)
 
     def attempt(_, plan: Plan) -> Plan:
@@ -160,7 +165,7 @@ def step(
         both = jnp.minimum(a, b)
         left = left ** jnp.maximum(1.0, 3 * both**2)
         return Plan(
-            target=mu * jnp.maximum(left, jnp.where(both < 0.1, 0.5, 1e-4)),
+            target=mu * jnp.maximum(left, jnp.where(both < 0.1, 0.5, LEAST)),
             cross=symmetric(move.X @ move.S @ W),
             cross_z=jnp.where(signed, move.y * move.z, 0.0),
             share=0.9 + 0.09 * both,
@@ -180,7 +185,9 @@ def step(
     return following, missed, jnp.minimum(a, b)
 
 
-def inverse_cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+def inverse_cholesky(
+    matrix: Float[Array, "n n"],
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """The inverse of the Cholesky factor, and the matrix: shifted where rounding made it indefinite."""
     unit = 1e-16 * jnp.trace(matrix) / len(matrix)
     factor, shift = _factor(matrix, unit, 0.0)

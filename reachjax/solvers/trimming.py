@@ -64,11 +64,9 @@ def trimmed(program: Program) -> Trimmed:
     solid, wanted = _solid(program.facts), _solid(program.objective)
     columns = solid.any(axis=0) | wanted.any(axis=0)
     facts = xp.where(solid.any(axis=1)[:, None] & columns, program.facts.mid, 0.0)
-    products, count = program.products, len(program.products.free)
-    squares = (facts**2).sum(axis=1)
-    inner = (facts[products.left] * facts[products.right]).sum(axis=1)
-    of_pairs = (squares[products.left] * squares[products.right] + inner**2) / 2
-    sizes = summed(of_pairs, products.multiplier, count) ** 0.5
+    products = program.products
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is dropped
+        sizes = _sizes(products, facts)
     objective = xp.where(columns, program.objective.mid, 0.0)
     centers = objective[:, -1]
     # solvers' tolerances are absolute, objectives come in the size of the set of states
@@ -80,9 +78,17 @@ def trimmed(program: Program) -> Trimmed:
         centers=centers,
         units=units,
         columns=columns,
-        kept=(sizes > 0) & ~implied_by_cone(products, facts),
+        kept=(sizes > 0) & xp.isfinite(sizes) & ~implied_by_cone(products, facts),
         sizes=sizes,
     )
+
+
+def _sizes(products: Products, facts: Array | np.ndarray) -> Float[Array | np.ndarray, " K"]:
+    """The root of the sum of `|sym(p' q)|^2` over the pairs of each multiplier."""
+    squares = (facts**2).sum(axis=1)
+    inner = (facts[products.left] * facts[products.right]).sum(axis=1)
+    of_pairs = (squares[products.left] * squares[products.right] + inner**2) / 2
+    return summed(of_pairs, products.multiplier, len(products.free)) ** 0.5
 
 
 def _solid(rows: Ball) -> Bool[Array | np.ndarray, "k n"]:

@@ -92,11 +92,10 @@ KINDS = {
 def test_the_schur_matrix_is_that_of_traces_of_explicit_matrices(kind):
     given, rng = KINDS[kind], np.random.default_rng(0)
     layout = cut(arranged(trimmed(given), given.products))
-    generators, n = layout.generators, layout.generators.rows.shape[1]
-    count = len(layout.order)
-    eye = np.eye(len(generators.free))
-    G = np.array([generators.weighted(row) for row in eye])
-    X, W = (A @ A.T for A in rng.normal(size=(2, n, n)))
+    generators, count = jax.device_put(layout.generators), len(layout.order)
+    n = generators.rows.shape[1]
+    G = np.array([generators.weighted(row) for row in jnp.eye(len(generators.free))])
+    X, W = (jnp.asarray(A @ A.T) for A in rng.normal(size=(2, n, n)))
     schur = generators.schur(X, W, generators.gram(X), generators.gram(W))
     traces = np.einsum("kij,jm,lmn,ni->kl", G, X, G, W, optimize=True)
     np.testing.assert_allclose(schur, traces, atol=1e-12 * abs(traces).max())
@@ -154,7 +153,9 @@ def test_it_agrees_with_clarabel(answer):
     assert solved.any()
     size = interval_offsets(given) - given.objective.mid[:, -1]
     np.testing.assert_allclose(
-        (solution.offsets - reference.offsets)[solved] / np.maximum(size[solved], 1e-9), 0, atol=1e-6
+        (solution.offsets - reference.offsets)[solved] / np.maximum(size[solved], 1e-9),
+        0,
+        atol=1e-6,
     )
     bounds, _ = accepted_offsets(given, solution)
     others, _ = accepted_offsets(given, reference)
@@ -170,7 +171,9 @@ def test_what_it_proposes_is_well_formed(answer):
     for X in solution.moments:
         assert X[-1, -1] == pytest.approx(1.0, abs=1e-12)
         assert eigvalsh(X)[0] >= -1e-9
-        pairs = np.einsum("pi,ij,pj->p", given.facts.mid[products.left], X, given.facts.mid[products.right])
+        pairs = np.einsum(
+            "pi,ij,pj->p", given.facts.mid[products.left], X, given.facts.mid[products.right]
+        )
         sums = np.bincount(products.multiplier, products.sign * pairs, len(products.free))
         assert abs(sums[products.free]).max(initial=0.0) <= 1e-4
         assert sums[~products.free].min(initial=0.0) >= -1e-4

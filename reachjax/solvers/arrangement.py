@@ -7,10 +7,10 @@ the program keeps its shape and what is unused is masked.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from reachjax.relaxation import Products
 from reachjax.solvers.generators import Generators
@@ -32,10 +32,10 @@ class Arrangement(NamedTuple):
     """
 
     generators: Generators
-    objective: Float[Array | np.ndarray, "f n"]
-    order: Int[Array | np.ndarray, " K"]
-    scale: Float[Array | np.ndarray, " K"]
-    columns: Int[Array | np.ndarray, " n"]
+    objective: Float[Any, "f n"]
+    order: Int[Any, " K"]
+    scale: Float[Any, " K"]
+    columns: Int[Any, " n"]
 
 
 def arranged(

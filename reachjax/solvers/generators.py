@@ -11,7 +11,7 @@ so that one iteration costs `O(n^3)` for as many multipliers as columns.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,14 +36,14 @@ class Generators(NamedTuple):
         idle: `(n,)`, 1 for columns that no row uses, else 0.
     """
 
-    rows: Float[Array, "m n"]
-    left: Int[Array, "s K"]
-    right: Int[Array, "s K"]
-    weight: Float[Array, "s K"]
-    general: Float[Array, "g n n"]
-    free: Bool[Array, " K"]
-    target: Float[Array, " K"]
-    idle: Float[Array, " n"]
+    rows: Float[Any, "m n"]
+    left: Int[Any, "s K"]
+    right: Int[Any, "s K"]
+    weight: Float[Any, "s K"]
+    general: Float[Any, "g n n"]
+    free: Bool[Any, " K"]
+    target: Float[Any, " K"]
+    idle: Float[Any, " n"]
 
     def weighted(self, y: Float[Array, " K"]) -> Float[Array, "n n"]:
         """`sum_k y_k G_k`."""
@@ -92,9 +92,9 @@ class Generators(NamedTuple):
         def row(pairs):
             values = jnp.zeros(slots * count)
             for number in range(slots):
-                l, r, weight = (part[number] for part in pairs)
-                crossed = A_left[l] * B_right[r] + A_right[l] * B_left[r]
-                crossed += A_left[r] * B_right[l] + A_right[r] * B_left[l]
+                p, q, weight = (part[number] for part in pairs)
+                crossed = A_left[p] * B_right[q] + A_right[p] * B_left[q]
+                crossed += A_left[q] * B_right[p] + A_right[q] * B_left[p]
                 values += weight / 4 * crossed
             return jnp.sum(self.weight * values.reshape(slots, count), axis=0)
 

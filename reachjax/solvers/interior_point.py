@@ -45,7 +45,7 @@ class Search(NamedTuple):
         point: the iterate.
         best: the one with the smallest merit so far.
         merit: of the best.
-        count: iterations done.
+        iterations: how many are done.
         idle: iterations since the best.
         short: consecutive iterations with a short step.
         over: whether nothing more is to be gained.
@@ -54,7 +54,7 @@ class Search(NamedTuple):
     point: Point
     best: Point
     merit: Float[Array, ""]
-    count: Int[Array, ""]
+    iterations: Int[Array, ""]
     idle: Int[Array, ""]
     short: Int[Array, ""]
     over: Bool[Array, ""]
@@ -96,7 +96,7 @@ def solve_facet(
     """
 
     def going(search: Search):
-        return ~search.over & (search.count < max_iterations)
+        return ~search.over & (search.iterations < max_iterations)
 
     def iterate(search: Search) -> Search:
         following, missed, length = step(generators, row, search.point)
@@ -108,7 +108,7 @@ def solve_facet(
         least = jnp.minimum(jnp.where(jnp.isnan(merit), jnp.inf, merit), search.merit)
         lost = ~jnp.isfinite(merit) | (idle > PATIENCE) | (short > 3)
         enough = (least <= FURTHER * tolerance) | ((least <= tolerance) & (idle > 2))
-        return Search(following, best, least, search.count + 1, idle, short, lost | enough)
+        return Search(following, best, least, search.iterations + 1, idle, short, lost | enough)
 
     point, zero = start(generators), jnp.array(0)
     first = Search(point, point, jnp.array(jnp.inf), zero, zero, zero, jnp.array(False))
@@ -129,7 +129,7 @@ def _found(search: Search, tolerance, max_iterations) -> Facet:
         moment=jnp.where(finite, best.X / jnp.where(corner > 0, corner, 1.0), jnp.nan),
         status=jnp.where(finite, status, SolverStatus.FAILED),
         merit=search.merit,
-        iterations=search.count,
+        iterations=search.iterations,
     )
 
 

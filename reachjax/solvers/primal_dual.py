@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from reachjax.solvers.generators import Generators, inverse_factor, symmetric
 
@@ -188,7 +188,7 @@ def step(
 def inverse_cholesky(
     matrix: Float[Array, "n n"],
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
-    """The inverse of the Cholesky factor, and the matrix: shifted where rounding made it indefinite."""
+    """The inverse of the Cholesky factor, and the matrix, shifted if rounding asks for it."""
     unit = 1e-16 * jnp.trace(matrix) / len(matrix)
     factor, shift = _factor(matrix, unit, 0.0)
     return inverse_factor(factor), matrix + shift * jnp.eye(len(matrix))

@@ -8,13 +8,12 @@ arrays on the host and traced arrays inside `jax.jit`.
 
 from __future__ import annotations
 
-from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from reachjax.lmi import Program
 from reachjax.relaxation import Products
@@ -37,21 +36,21 @@ class Trimmed(NamedTuple):
         sizes: `(K,)`, of the generators: the root of the sum of squares over their pairs.
     """
 
-    facts: Float[Array | np.ndarray, "m n"]
-    objective: Float[Array | np.ndarray, "f n"]
-    centers: Float[Array | np.ndarray, " f"]
-    units: Float[Array | np.ndarray, " f"]
-    columns: Bool[Array | np.ndarray, " n"]
-    kept: Bool[Array | np.ndarray, " K"]
-    sizes: Float[Array | np.ndarray, " K"]
+    facts: Float[Any, "m n"]
+    objective: Float[Any, "f n"]
+    centers: Float[Any, " f"]
+    units: Float[Any, " f"]
+    columns: Bool[Any, " n"]
+    kept: Bool[Any, " K"]
+    sizes: Float[Any, " K"]
 
 
-def namespace(array: Array | np.ndarray) -> ModuleType:
+def namespace(array: Any) -> Any:
     """`numpy` for its own arrays, `jax.numpy` for others."""
     return np if isinstance(array, np.ndarray) else jnp
 
 
-def summed(values: Array | np.ndarray, owner: Array | np.ndarray, count: int):
+def summed(values: Any, owner: Any, count: int) -> Any:
     """Sums `(count,)` of the values that belong to each owner."""
     if isinstance(values, np.ndarray):
         return np.bincount(owner, values, count)
@@ -83,7 +82,7 @@ def trimmed(program: Program) -> Trimmed:
     )
 
 
-def _sizes(products: Products, facts: Array | np.ndarray) -> Float[Array | np.ndarray, " K"]:
+def _sizes(products: Products, facts: Any) -> Float[Any, " K"]:
     """The root of the sum of `|sym(p' q)|^2` over the pairs of each multiplier."""
     squares = (facts**2).sum(axis=1)
     inner = (facts[products.left] * facts[products.right]).sum(axis=1)
@@ -91,13 +90,13 @@ def _sizes(products: Products, facts: Array | np.ndarray) -> Float[Array | np.nd
     return summed(of_pairs, products.multiplier, len(products.free)) ** 0.5
 
 
-def _solid(rows: Ball) -> Bool[Array | np.ndarray, "k n"]:
+def _solid(rows: Ball) -> Bool[Any, "k n"]:
     """Which coefficients stand out from the rounding errors of their row."""
     noise = (rows.rad**2).sum(axis=1) ** 0.5
     return abs(rows.mid) > NOISE * noise[:, None]
 
 
-def implied_by_cone(products: Products, facts: Array | np.ndarray) -> Bool[Array, " K"]:
+def implied_by_cone(products: Products, facts: Any) -> Bool[Any, " K"]:
     """Multipliers `(K,)` of products that say nothing beyond an ellipsoid's own fact.
 
     A quadratic function of the state that is not negative on the ellipsoid is a positive multiple

@@ -1,0 +1,226 @@
+"""What the library's interior-point method is worth: speed, agreement, many products.
+
+    python -m experiments.interior_point speed | agreement | products
+
+`speed`: one facet of the paper's program (every neuron kept, no `lambda_ij`) by cvxpy rebuilt with
+Clarabel and by `InteriorPoint`, and how seconds grow with the size of the basis. `agreement`:
+random loops, degenerate ones among them, against Clarabel and simulated successors. `products`:
+programs that grow by the products of facts which the last moment matrix violates most.
+"""
+
+import os
+import time
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read once, when numpy is imported
+
+import jax
+import numpy as np
+import rich
+import tyro
+
+import reachjax as rj
+from experiments.benchmark import RANDOM_BOX, Case, he_network
+from experiments.command import blank_table
+from experiments.double_integrator import INPUT_BOX, A, B
+from experiments.reference import paper_step
+from reachjax.lmi import Program, step_program
+from reachjax.recheck import interval_offsets
+from reachjax.relaxation import Products
+from reachjax.solvers import accepted_offsets
+from reachjax.witnesses import initial_states
+
+RELAXATIONS = (
+    *(rj.PaperQC(*flags) for flags in product((False, True), repeat=2)),
+    *(rj.LocalBounds(*flags) for flags in product((False, True), repeat=2)),
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Measure the interior-point method."""
+
+    study: tyro.conf.Positional[Literal["speed", "agreement", "products"]]
+    """What is measured."""
+    widths: tuple[int, ...] = (10, 20, 32, 64, 100)
+    """Neurons in each of two hidden layers: `speed`, and `products` (which wants 20 to 32)."""
+    reference: int = 32
+    """cvxpy is timed up to this width."""
+    facets: int = 2
+    """Of each program."""
+    programs: int = 200
+    """How many random programs `agreement` solves."""
+    rounds: int = 8
+    """How often products are added."""
+    batch: int = 60
+    """How many are added at a time."""
+    seeds: int = 3
+    """Networks of each width in `products`."""
+    radius: float = 2.0
+    """Of their set of states."""
+
+
+def program_of(loop: rj.ClosedLoop, box: rj.Box, relaxation, directions) -> Program:
+    """The program of one step, on the host."""
+    return jax.device_get(step_program(loop, box, box, directions, 0, relaxation))
+
+
+def speed(settings: Settings) -> None:
+    """Processor seconds per facet; wall time where jobs do not share the machine is no less."""
+    shown = blank_table("PaperQC(repeated=False), processor seconds per facet")
+    for heading in ("hidden", "n", "cvxpy", "first call", "ours", "faster", "difference", "status"):
+        shown.add_column(heading, justify="right")
+    sizes, seconds = [], []
+    for width in settings.widths:
+        case = Case("", he_network((2, width, width, 1), 0), RANDOM_BOX)
+        directions = np.asarray(case.template.directions)[: settings.facets]
+        relaxation = rj.PaperQC(repeated=False)
+        program = program_of(case.loop, rj.Box(*case.initial), relaxation, directions)
+        solver = rj.InteriorPoint()
+        first, _ = _timed(solver.solve, program)
+        ours, solution = min((_timed(solver.solve, program) for _ in range(3)), key=_first)
+        sizes.append(int((program.scale > 0).sum()))
+        seconds.append(ours / len(directions))
+        reference, difference = np.nan, np.nan
+        if width <= settings.reference:
+            (lower, upper), limits = case.initial, INPUT_BOX
+            facts = np.vstack([np.eye(2), -np.eye(2)]), np.r_[upper, -lower]
+            data = (case.layers, A, B, np.zeros(2), *limits, *facts)
+            reference, (bounds, _) = _timed(paper_step, *data, directions)
+            difference = abs(bounds - accepted_offsets(program, solution)[0]).max()
+        numbers = (reference / len(directions), first, seconds[-1], reference / ours, difference)
+        statuses = {rj.SolverStatus(int(code)).name for code in solution.statuses}
+        shown.add_row(f"2x{width}", str(sizes[-1]), *map("{:.3g}".format, numbers), str(statuses))
+    rich.print(shown)
+    slope = np.polyfit(np.log(sizes), np.log(seconds), 1)[0]
+    rich.print(f"seconds grow like n^{slope:.2f} from n = {sizes[0]} to {sizes[-1]}")
+
+
+def _timed(function, *arguments):
+    began = time.process_time()
+    result = function(*arguments)
+    return time.process_time() - began, result
+
+
+def _first(pair):
+    return pair[0]
+
+
+def random_case(seed: int) -> tuple[rj.ClosedLoop, rj.Box, np.ndarray, rj.AbstractRelaxation]:
+    """A small loop, its box (a third of them flat or thin in one direction), facets, relaxation."""
+    rng = np.random.default_rng(seed)
+    n_x, hidden = int(rng.integers(1, 4)), [(6, 4), (5,), (8, 6)][rng.integers(3)]
+    layers = he_network((n_x, *hidden, 1), seed)
+    for _, bias in layers[:-1]:
+        bias += rng.choice([0.0, 0.0, 20.0, -20.0], p=[0.4, 0.2, 0.2, 0.2]) * (
+            np.arange(len(bias)) < rng.integers(len(bias) + 1)
+        )
+    plant = rj.AffinePlant(0.6 * rng.normal(size=(n_x, n_x)), rng.normal(size=(n_x, 1)))
+    limits = rj.Box([-0.5], [0.7]) if rng.integers(2) else None
+    lower, width = rng.uniform(-1, 1, n_x), rng.uniform(0.2, 1.0, n_x)
+    width[0] *= rng.choice([1.0, 1.0, 0.0, 1e-6])
+    loop = rj.ClosedLoop(plant, rj.MLP.from_layers(layers), input_box=limits)
+    directions = np.vstack([np.eye(n_x), -np.eye(n_x), rng.normal(size=(1, n_x))])[-3:]
+    return loop, rj.Box(lower, lower + width), directions, RELAXATIONS[seed % len(RELAXATIONS)]
+
+
+def agreement(settings: Settings) -> None:
+    """Statuses, differences to Clarabel's solved facets, and bounds less simulated supports."""
+    ours, theirs = rj.InteriorPoint(), rj.Clarabel()
+    rows = []
+    for seed in range(settings.programs):
+        loop, box, directions, relaxation = random_case(seed)
+        program = program_of(loop, box, relaxation, directions)
+        solution, reference = ours.solve(program), theirs.solve(program)
+        bounds, optimal = accepted_offsets(program, solution)
+        states = initial_states(box, 2000, seed)
+        attained = np.asarray(loop.simulate(states, 1)[:, 1] @ directions.T).max(axis=0)
+        size = np.maximum(interval_offsets(program) - program.objective.mid[:, -1], 1e-9)
+        other = accepted_offsets(program, reference)[0]
+        solved = reference.statuses == rj.SolverStatus.SOLVED
+        away = np.where(solved, abs(bounds - other), 0.0)
+        over = bounds - np.fmin(other, bounds)
+        parts = solution.statuses, away, away / size, bounds - attained, optimal, over
+        rows += list(zip(*parts, strict=True))
+    statuses, away, relative, slack, optimal, over = map(np.array, zip(*rows, strict=True))
+    names = {status.name: int((statuses == status).sum()) for status in rj.SolverStatus}
+    rich.print(f"{settings.programs} programs, {len(rows)} facets: {names}")
+    rich.print(f"optimum borne out: {int(optimal.sum())}")
+    rich.print(f"largest difference where Clarabel solved: {away.max():.1e}")
+    rich.print(
+        f"of the interval's radius: {relative.max():.1e}; looser by at most {over.max():.1e}"
+    )
+    rich.print(f"least bound less simulated support: {slack.min():.1e}")
+
+
+def with_violated(program: Program, moment: np.ndarray, batch: int) -> Program | None:
+    """The program and the products of facts that a moment matrix violates most."""
+    facts, old = program.facts.mid, program.products
+    norms = np.linalg.norm(facts, axis=1)
+    facts = facts / np.where(norms > 0, norms, 1.0)[:, None]
+    i, j = np.triu_indices(len(facts), 1)
+    values = (facts @ moment @ facts.T)[i, j]
+    known = set(zip(old.left.tolist(), old.right.tolist(), strict=True))
+    order = [k for k in np.argsort(values)[: 8 * batch] if values[k] < -1e-6]
+    new = [k for k in order if (i[k], j[k]) not in known][:batch]
+    products = Products(
+        left=np.r_[old.left, i[new]],
+        right=np.r_[old.right, j[new]],
+        sign=np.r_[old.sign, np.ones(len(new))],
+        multiplier=np.r_[old.multiplier, len(old.free) + np.arange(len(new))],
+        free=np.r_[old.free, np.zeros(len(new), dtype=bool)],
+    )
+    return program.replace(products=products) if new else None
+
+
+def grown(program: Program, solver: rj.AbstractSolver, settings: Settings, name: str) -> list:
+    """Gap, whether the optimum is borne out, and status, round after round."""
+    found, seconds = [], 0.0
+    for _ in range(settings.rounds):
+        solution = solver.solve(program)
+        moment = np.asarray(solution.moments[0])
+        bounds, optimal = accepted_offsets(program, solution)
+        attained = float(program.objective.mid[0] @ moment[:, -1])
+        gap = abs(float(bounds[0]) - attained) / (1 + abs(attained))
+        found.append((gap, bool(optimal[0]), int(solution.statuses[0])))
+        seconds += float(solution.seconds[0])
+        following = with_violated(program, moment, settings.batch)
+        if following is None:
+            break
+        program = following
+    size, count = int((program.scale > 0).sum()), len(program.products.free)
+    gaps = " ".join(f"{gap:.0e}" for gap, *_ in found)
+    rich.print(f"{name} n {size} products {count}: {seconds:.1f} s, gaps {gaps}")
+    return found
+
+
+def products(settings: Settings) -> None:
+    """Rounds of violated products on wide sets: low-rank optimal faces, ever more multipliers."""
+    solver, merits = rj.InteriorPoint(), []
+    for width, seed in product(settings.widths, range(settings.seeds)):
+        rng = np.random.default_rng(seed)
+        net = rj.MLP.from_layers(he_network((2, width, width, 1), seed))
+        plant = rj.AffinePlant(0.6 * rng.normal(size=(2, 2)), rng.normal(size=(2, 1)))
+        loop = rj.ClosedLoop(plant, net)
+        box = rj.Box(-settings.radius * np.ones(2), settings.radius * np.ones(2))
+        for facet in np.eye(2)[: settings.facets]:
+            program = program_of(loop, box, rj.LocalBounds(repeated=False), facet[None])
+            merits += grown(program, solver, settings, f"2x{width}")
+    gaps, optimal, statuses = map(np.array, zip(*merits, strict=True))
+    solved = int((statuses == rj.SolverStatus.SOLVED).sum())
+    rich.print(
+        f"{len(gaps)} programs: solved {solved}, gap up to 1e-6: {int((gaps <= 1e-6).sum())}"
+    )
+    rich.print(f"largest gap {gaps.max():.1e}; optimum borne out {int(optimal.sum())}")
+
+
+def main(settings: Settings) -> None:
+    """Run one study and print what it found."""
+    jax.config.update("jax_enable_x64", True)
+    {"speed": speed, "agreement": agreement, "products": products}[settings.study](settings)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings))

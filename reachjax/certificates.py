@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from reachjax.lmi import Program, scaling
+from reachjax.lmi import Program
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.recheck import sound_level
 from reachjax.sets import Ellipsoid, NormalForm
@@ -76,7 +76,7 @@ class Certificate(AbstractCertificate):
     ) -> Certificate:
         """What was proved with what a solver proposed; witnesses are not known yet (NaN)."""
         facets = len(solution.offsets)
-        T = scaling(program.shift, program.scale)
+        T = program.transform
         return cls(
             program=program,
             multipliers=solution.multipliers,
@@ -135,7 +135,7 @@ class EllipsoidCertificate(AbstractCertificate):
         cls, program: Program, region: Ellipsoid, enclosure: Enclosure
     ) -> EllipsoidCertificate:
         """What was proved with what a solver proposed; witnesses are not known yet (NaN)."""
-        T, n = scaling(program.shift, program.scale), program.scale.shape[0]
+        T, n = program.transform, len(program.transform)
         moments = enclosure.moments[:n, :n] / enclosure.moments[n - 1, n - 1]
         return cls(
             program=program,

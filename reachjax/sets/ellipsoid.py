@@ -37,6 +37,16 @@ class NormalForm(NamedTuple):
     A: Float[Array | np.ndarray, "n n"]
     b: Float[Array | np.ndarray, " n"]
 
+    def of(self, inner: NormalForm) -> NormalForm:
+        """This form in `x`, given in `y = inner.A x + inner.b`."""
+        return NormalForm(self.A @ inner.A, self.A @ inner.b + self.b)
+
+    @property
+    def inverse(self) -> NormalForm:
+        """`x = A^-1 y - A^-1 b`."""
+        inverse = np.linalg.inv(self.A)
+        return NormalForm(inverse, -inverse @ self.b)
+
 
 @pytree
 class Ellipsoid(AbstractSet):
@@ -129,6 +139,19 @@ class Ellipsoid(AbstractSet):
         largest = jnp.max(jnp.sum(abs(A @ Q @ A.T) + rounding, axis=1)) * (1 + gamma(n))
         offset = jnp.linalg.norm(gamma(n) * (abs(A) @ abs(self.center))) * (1 + gamma(n))
         return jax.lax.stop_gradient((jnp.sqrt(largest) + offset) * (1 + gamma(4)))
+
+    def from_ball(self) -> Float[Array, "n n"]:
+        """A matrix `M` with `x = center + M w`, `|w| <= 1`, for every `x` of the exact set.
+
+        It is the Cholesky factor `L`, larger by rounding: with `A` nearly its inverse and
+        `r >= |A L - I|`, `|L^-1 (x - q)| <= |A (x - q)| / (1 - r)`.
+        """
+        L, n = jnp.linalg.cholesky(self.shape), self.dimension
+        A, _ = self.normal_form
+        rounding = 2 * gamma(n + 2) * (abs(A) @ abs(L))
+        off = jnp.linalg.norm(abs(A @ L - jnp.eye(n)) + rounding) * (1 + gamma(n * n))
+        larger = self._level() / (1 - off) * (1 + gamma(4))
+        return L * jax.lax.stop_gradient(jnp.where(off < 1, larger, jnp.inf))
 
     def facts(self) -> Float[Array, "0 n+1"]:
         """None: an ellipsoid has a cone fact instead."""

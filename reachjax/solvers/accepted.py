@@ -91,15 +91,16 @@ def accepted_enclosure(
     else:
         other = _interval_form(program) if given is None else given
         proved = sound_level(program, multipliers, other)
-        if not _log_volume(form, level) <= _log_volume(other, proved):
+        if not log_volume(form, level) <= log_volume(other, proved):
             form, level = other, proved
     return form, np.array(level), np.array(optimal)
 
 
-def _log_volume(form: NormalForm, level: float) -> float:
+def log_volume(form: NormalForm, level: float | np.ndarray) -> float:
+    """The logarithm of the volume of `|A x + b| <= level`, but for that of the unit ball."""
     if not np.isfinite(level):
         return np.inf
-    return len(form.b) * np.log(max(level, 1e-300)) - np.linalg.slogdet(form.A)[1]
+    return float(len(form.b) * np.log(max(level, 1e-300)) - np.linalg.slogdet(form.A)[1])
 
 
 def _interval_form(program: Program) -> NormalForm:

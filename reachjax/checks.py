@@ -37,6 +37,8 @@ class Numbers:
         """
         expected = f"{name} must be an array of shape {self.expected}"
         try:
+            if np.iscomplexobj(value):
+                raise TypeError("its entries are complex")
             array = jnp.asarray(value, dtype=float)
         except (TypeError, ValueError, RuntimeError) as error:
             kind = type(value).__name__

@@ -68,16 +68,14 @@ class Program(Replaceable):
         )
 
 
-def scaling(
-    bounds: LoopBounds, prune: bool, from_ball: Float[Array, "n_x n_x"] | None
-) -> Float[Array, "n n"]:
+def scaling(bounds: LoopBounds, prune: bool, X: Ellipsoid | None) -> Float[Array, "n n"]:
     """`T` with `xi = T eta`, the entries of `eta` being in `[-1, 1]`, the last one 1."""
     mid, rad = basis_box(bounds, prune)
     T = jnp.diag(rad).at[:-1, -1].set(mid[:-1])
-    if from_ball is None:
+    if X is None:
         return T
-    n = len(from_ball)
-    return T.at[:n, :n].set(from_ball)
+    n = X.dimension
+    return T.at[:n, :n].set(X.from_ball()).at[:n, -1].set(X.center)
 
 
 def basis_box(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
@@ -187,7 +185,7 @@ def _step_program(
     facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts, cone)
     # The optimal value does not depend on the scaling, but its derivative at inexact multipliers
     # does: with the scaling's share, facts of thin sets keep their size and errors cancel.
-    T = scaling(bounds, relaxation.remove_stable, None if X is None else X.from_ball())
+    T = scaling(bounds, relaxation.remove_stable, X)
     # one rounding of it for all rows, whatever the compiler fuses
     T = jax.lax.optimization_barrier(T)
     return Program(

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from reachjax.lmi import Program
+from reachjax.lmi import Program, form_rows
 from reachjax.recheck import interval_offsets, sound_level, sound_offsets
 from reachjax.rounding import gamma
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import Enclosure, Solution, SolverStatus
-from reachjax.solvers.compact import compact
+from reachjax.solvers.compact import TINY, compact
 
 ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
 
@@ -74,8 +74,9 @@ def accepted_enclosure(
     """The ellipsoid `|A x+ + b| <= level` to report, its level being what is proved.
 
     It counts as the relaxation's optimum if it is on the central path, or if the solver answers and
-    what is proved is as large as what it proposes; the level is then 1 at least. Where the solver
-    proposes nothing of use, the ellipsoid is `given`, or that around the box of successors.
+    what is proved is as large as what it proposes, or less where the moments of a given shape show
+    that the relaxation allows no less; the level is then 1 at least. Where the solver proposes
+    nothing of use, the ellipsoid is `given`, or that around the box of successors.
 
     Returns:
         The form, the level, and whether it is the relaxation's optimum.
@@ -84,16 +85,38 @@ def accepted_enclosure(
     form, level = enclosure.form, np.inf
     if _invertible(form):
         level = sound_level(program, multipliers, form)
-    borne_out = int(enclosure.status) in ANSWERS and 1 - SHORTFALL <= level <= 1 + SHORTFALL
-    optimal = borne_out or (centred and level <= 1 + SHORTFALL)
+    optimal = False
+    if level <= 1 + SHORTFALL:
+        answered = int(enclosure.status) in ANSWERS
+        dual = given is not None and _largest_factor(program, enclosure) <= 1 + SHORTFALL
+        optimal = centred or (answered and (level >= 1 - SHORTFALL or dual))
     if optimal:
         level = max(1.0, level)
     else:
         other = _interval_form(program) if given is None else given
-        proved = sound_level(program, multipliers, other)
+        least = TINY * float(np.linalg.norm(other.A, 2))
+        proved = max(sound_level(program, multipliers, other), least)
         if not log_volume(form, level) <= log_volume(other, proved):
             form, level = other, proved
     return form, np.array(level), np.array(optimal)
+
+
+def _largest_factor(program: Program, enclosure: Enclosure) -> float:
+    """What no factor on the proposed `A` and `b` exceeds; infinite if nothing is shown.
+
+    With `X` positive semidefinite and `<X, G_k>` of the right signs, `[e e' - G, f V'; f V, I]` is
+    semidefinite for no `f` beyond `(X_nn + trace X_22) / (-2 <X_21, V>)` (weak duality).
+    """
+    n, X = len(program.transform), np.asarray(enclosure.moments)
+    if not np.isfinite(X).all() or X[n - 1, n - 1] <= 0:
+        return np.inf
+    X, reduced = X / X[n - 1, n - 1], compact(program)
+    products = reduced.generators.T @ X[np.ix_(reduced.columns, reduced.columns)].ravel()
+    missed = np.where(reduced.free, abs(products), -products).max(initial=0.0)
+    if max(missed, -np.linalg.eigvalsh((X + X.T) / 2)[0]) > SHORTFALL:
+        return np.inf
+    slope = -2 * np.sum(X[n:, :n] * form_rows(program, enclosure.form).mid)
+    return (1 + np.trace(X[n:, n:])) / slope if slope > 0 else np.inf
 
 
 def log_volume(form: NormalForm, level: float | np.ndarray) -> float:
@@ -122,4 +145,4 @@ def _invertible(form: NormalForm) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
         rounding = gamma(len(b)) * (abs(A) @ abs(inverse @ inverse.T) @ abs(A).T).sum(axis=1)
         rounding += gamma(len(b)) * (abs(A) @ abs(inverse @ b))
-    return bool(np.all(rounding < 1e-6))
+    return bool(np.all(rounding < SHORTFALL))

@@ -13,8 +13,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
 from reachjax.sets import NormalForm
-from reachjax.solvers.compact import CompactProgram
-from reachjax.solvers.models import FLAT
+from reachjax.solvers.compact import THINNEST, CompactProgram
 
 STEPS = 60
 """Newton steps after which the centre counts as not found."""
@@ -126,7 +125,7 @@ class Barrier:
         """Each matrix under a logarithm of a determinant: its weight, itself, its variables."""
         R = self.form(y).A
         yield 1.0, R, (self.R, self.symmetric)
-        yield weight, np.eye(self.q) / FLAT - R, (self.R, -self.symmetric)
+        yield weight, np.eye(self.q) / THINNEST - R, (self.R, -self.symmetric)
         yield weight, self.schur(y), (slice(None), self.terms)
 
     def value(self, y: np.ndarray, weight: float) -> float:

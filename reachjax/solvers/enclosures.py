@@ -25,11 +25,12 @@ from reachjax.sets import Ellipsoid, NormalForm
 from reachjax.solvers.accepted import ANSWERS, accepted_enclosure, log_volume
 from reachjax.solvers.base import AbstractSolver, Enclosure, SolverStatus
 from reachjax.solvers.centring import Sensitivity, centred, sensitivity
+from reachjax.solvers.compact import compact
 from reachjax.solvers.differentiable import asked_for
 from reachjax.solvers.host import all_finite, on_host, shapes_of
 
 ATTEMPTS = 3
-"""How often a stalled program is solved, each time in better coordinates."""
+"""How often a program is solved, each time in better coordinates."""
 
 
 def proved_ellipsoid(program: Program, solver: AbstractSolver) -> tuple[Ellipsoid, Enclosure]:
@@ -59,8 +60,8 @@ def _enclose(
 ) -> tuple[NormalForm, np.ndarray, np.ndarray, Enclosure, NormalForm]:
     """The ellipsoid, its level, whether it is optimal, the proposal, and its coordinates.
 
-    While the solver stalls, the next attempt is in coordinates in which the ellipsoid proved so far
-    is the unit ball.
+    While the solver stalls, or the ellipsoid is as thin as it may be in these coordinates, the next
+    attempt is in those in which the ellipsoid proved so far is the unit ball.
     """
     q = len(program.objective.mid)
     frame, attempts = NormalForm(np.eye(q), np.zeros(q)), []
@@ -69,14 +70,16 @@ def _enclose(
         return blank.form, np.array(np.nan), np.array(False), blank, frame
     for attempt in range(ATTEMPTS):
         framed = with_successor(program, frame) if attempt else program
-        enclosure, on_path = _proposed(solver, framed)
-        enclosure = enclosure._replace(form=enclosure.form.of(frame))
+        if attempt and compact(framed).is_flat:
+            break
+        proposed, on_path = _proposed(solver, framed)
+        enclosure = proposed._replace(form=proposed.form.of(frame))
         form, level, optimal = accepted_enclosure(program, enclosure, centred=on_path)
         optimal &= enclosure.status == SolverStatus.SOLVED
         attempts.append((form, level, optimal, enclosure, frame))
-        if optimal:
+        if optimal and not compact(framed).is_thinnest(proposed.form):
             return attempts[-1]
-        frame = NormalForm(form.A / level, form.b / level)
+        frame = NormalForm(form.A / level, form.b / level)  # finite: accepted forms are invertible
     return min(attempts, key=lambda attempt: log_volume(*attempt[:2]))
 
 
@@ -94,28 +97,32 @@ def _proposed(solver: AbstractSolver, program: Program) -> tuple[Enclosure, bool
 
 def _fit(
     solver: AbstractSolver, argument: tuple[Program, NormalForm]
-) -> tuple[NormalForm, np.ndarray, np.ndarray, Enclosure]:
-    """The ellipsoid of a given shape, its level, whether it is optimal, and the proposal."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Enclosure]:
+    """The factor on a given form, the level, whether they are optimal, and the proposal."""
     program, given = argument
     if not all_finite(argument):
-        blank = Enclosure.blank(program)
-        return blank.form, np.array(np.nan), np.array(False), blank
+        unknown = np.array(np.nan)
+        return unknown, unknown, np.array(False), Enclosure.blank(program)
     enclosure = solver.enclose(program, given)
+    factor = np.sum(enclosure.form.A * given.A) / np.sum(given.A**2)
+    proposed = NormalForm(factor * given.A, factor * given.b)
+    enclosure = enclosure._replace(form=proposed)
     form, level, optimal = accepted_enclosure(program, enclosure, given)
-    return form, level, optimal & (enclosure.status == SolverStatus.SOLVED), enclosure
+    optimal &= enclosure.status == SolverStatus.SOLVED
+    return np.where(form is proposed, factor, 1.0), level, optimal, enclosure
 
 
-def _shapes(program: Program) -> tuple[NormalForm, Any, Any, Enclosure]:
-    """Of what `_fit` returns."""
-    blank = shapes_of(Enclosure.blank(program))
+def _shapes(program: Program) -> tuple[Any, Any, Enclosure]:
+    """Of a level, whether it is optimal, and the proposal."""
     number, truth = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), bool)
-    return blank.form, number, truth, blank
+    return number, truth, shapes_of(Enclosure.blank(program))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _ellipsoid(solver, facts, objective, program):
     shapes = _shapes(program)
-    return on_host(partial(_enclose, solver), (*shapes, shapes[0]), program)
+    form = shapes[-1].form
+    return on_host(partial(_enclose, solver), (form, *shapes, form), program)
 
 
 def _ellipsoid_forward(solver, facts, objective, program):
@@ -166,9 +173,8 @@ def proved_size(
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _size(solver, facts, objective, given, program):
-    found: Any = on_host(partial(_fit, solver), _shapes(program), (program, given))
-    form, *rest = found
-    return jnp.sum(form.A * given.A) / jnp.sum(given.A**2), *rest
+    shapes = _shapes(program)
+    return on_host(partial(_fit, solver), (shapes[0], *shapes), (program, given))
 
 
 def _size_forward(solver, facts, objective, given, program):

@@ -95,11 +95,11 @@ def test_a_wrong_shape_of_multipliers_is_named(solved):
         sound_level(held, np.nan * enclosure.multipliers, enclosure.form)
 
 
-def final(template, horizon, solver=rj.Clarabel()):  # noqa: B008
+def final(template, horizon, solver=rj.Clarabel(), relaxation=rj.LocalBounds()):  # noqa: B008
     """A number that depends on centre and shape of the last set, and on all volumes."""
 
     def f(loop, X0):
-        tube = rj.reach(loop, X0, horizon, template, solver=solver)
+        tube = rj.reach(loop, X0, horizon, template, relaxation, solver=solver)
         n, last = loop.states, tube.sets[-1]
         weights = jnp.asarray(np.random.default_rng(n).normal(size=(n, n)))
         linear = last.center @ jnp.arange(1.0, n + 1) + jnp.sum(weights * last.shape)

@@ -16,7 +16,7 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from reachjax.checks import Numbers, is_concrete, real_number, same_size, whole_number
+from reachjax.checks import Numbers, is_concrete, same_size, whole_number
 from reachjax.pytrees import converted, pytree
 from reachjax.rounding import gamma
 from reachjax.sets import outward
@@ -102,7 +102,9 @@ class Ellipsoid(AbstractSet):
         return NormalForm(A, -A @ self.center)
 
     @classmethod
-    def enclosing(cls, form: NormalForm, level: Float[ArrayLike, ""] = 1.0) -> Ellipsoid:
+    def enclosing(
+        cls, form: NormalForm, level: Float[Array | np.ndarray, ""] | float = 1.0
+    ) -> Ellipsoid:
         """An ellipsoid that surely contains `|A x + b| <= level`; larger by rounding only.
 
         Args:
@@ -118,8 +120,8 @@ class Ellipsoid(AbstractSet):
             [[16.0, 0.0], [0.0, 4.0]]
         """
         A, b = form
-        if is_concrete(level) and real_number("level", level, 0.0) == 0:
-            raise ValueError("level must be above 0, but 0 arrived")
+        if is_concrete(level) and level <= 0:
+            raise ValueError(f"level must be above 0, but {level} arrived")
         if is_concrete(A) and np.linalg.slogdet(np.asarray(A)).sign == 0:
             raise ValueError(f"form.A must be invertible, but it is\n{np.asarray(A)}")
         inverse = jnp.linalg.inv(A)

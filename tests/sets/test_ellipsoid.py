@@ -162,7 +162,7 @@ def test_bad_ellipsoids_are_named(arguments, message):
         (
             lambda E: E.enclosing(E.normal_form, -1.0),
             ValueError,
-            "level must be finite and at least",
+            "level must be above 0, but -1",
         ),
         (
             lambda E: E.enclosing(E.normal_form._replace(A=np.ones((2, 2)))),

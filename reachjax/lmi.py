@@ -26,11 +26,11 @@ from jaxtyping import Array, Float
 
 from reachjax.basis import Rows, columns, loop_rows
 from reachjax.bounds import LoopBounds, loop_bounds
-from reachjax.preactivations import bounds_over
+from reachjax.preactivations import bounds_over, rounded
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.relaxation import AbstractRelaxation, FactLayout, Products
 from reachjax.rounding import Ball, gamma
-from reachjax.sets import AbstractSet, Box, Ellipsoid, NormalForm
+from reachjax.sets import AbstractSet, Box, NormalForm
 from reachjax.systems import ClosedLoop
 
 CONSTANT = 1e-9
@@ -56,6 +56,10 @@ class Program(Replaceable):
     products: Products
     shift: Float[Array, " n"]
     scale: Float[Array, " n"]
+
+    def seeking(self, rows: slice) -> Program:
+        """The same program with some of the objective's rows."""
+        return self.replace(objective=self.objective[rows])
 
     def with_midpoints(self, facts: Float[Array, "m n"], objective: Float[Array, "f n"]) -> Program:
         """The same program with other coefficients and the rounding errors of these."""
@@ -142,9 +146,9 @@ def step_program(
         t: the time.
         relaxation: which products of facts are used.
     """
-    X_round = X if isinstance(X, Ellipsoid) and relaxation.remove_stable else None
+    around = rounded(X, box) if relaxation.remove_stable else None
     set_facts = X.facts(), X.cone_facts()
-    return _step_program(loop, *set_facts, X_round, box, directions, t, relaxation)
+    return _step_program(loop, *set_facts, around, box, directions, t, relaxation)
 
 
 @partial(jax.jit, static_argnames="relaxation")
@@ -152,7 +156,7 @@ def _step_program(
     loop: ClosedLoop,
     set_facts: Float[Array, "m n_x+1"],
     cone_facts: Float[Array, "r n_x+1"],
-    X: Ellipsoid | None,
+    around: AbstractSet | None,
     box: Box,
     directions: Float[Array, "f n_x"],
     t: int,
@@ -160,7 +164,7 @@ def _step_program(
 ) -> Program:
     n, k = loop.states, loop.units
     size = n + k + 1
-    bounds = loop_bounds(loop, box, t) if X is None else bounds_over(loop, X, box, t)
+    bounds = loop_bounds(loop, box, t) if around is None else bounds_over(loop, around, box, t)
     rows = loop_rows(loop, columns(0, n, size), n, t, bounds, relaxation.remove_stable)
     one = columns(size - 1, 1, size)
     of_the_set, cone = (

@@ -26,11 +26,11 @@ from jaxtyping import Array, Bool, Float
 
 from reachjax.basis import Rows, columns, loop_rows
 from reachjax.bounds import LoopBounds, loop_bounds
-from reachjax.preactivations import bounds_over
+from reachjax.preactivations import bounds_over, rounded
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.relaxation import AbstractRelaxation, FactLayout, Products
 from reachjax.rounding import Ball, gamma
-from reachjax.sets import AbstractSet, Box, Ellipsoid, NormalForm
+from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, NormalForm
 from reachjax.systems import ClosedLoop
 
 CONSTANT = 1e-9
@@ -60,6 +60,10 @@ class Program(Replaceable):
     def used(self) -> Bool[Array, " n"]:
         """Which entries of the scaled basis vary, and the constant."""
         return self.transform.diagonal() > 0
+
+    def seeking(self, rows: slice) -> Program:
+        """The same program with some of the objective's rows."""
+        return self.replace(objective=self.objective[rows])
 
     def with_midpoints(self, facts: Float[Array, "m n"], objective: Float[Array, "f n"]) -> Program:
         """The same program with other coefficients and the rounding errors of these."""
@@ -155,9 +159,9 @@ def step_program(
         t: the time.
         relaxation: which products of facts are used.
     """
-    X_round = X if isinstance(X, Ellipsoid) else None
+    around = rounded(X, box)
     set_facts = X.facts(), X.cone_facts()
-    return _step_program(loop, *set_facts, X_round, box, directions, t, relaxation)
+    return _step_program(loop, *set_facts, around, box, directions, t, relaxation)
 
 
 @partial(jax.jit, static_argnames="relaxation")
@@ -165,7 +169,7 @@ def _step_program(
     loop: ClosedLoop,
     set_facts: Float[Array, "m n_x+1"],
     cone_facts: Float[Array, "r n_x+1"],
-    X: Ellipsoid | None,
+    around: Ellipsoid | Intersection | None,
     box: Box,
     directions: Float[Array, "f n_x"],
     t: int,
@@ -173,10 +177,10 @@ def _step_program(
 ) -> Program:
     n, k = loop.states, loop.units
     size = n + k + 1
-    if X is None or not relaxation.remove_stable:
+    if around is None or not relaxation.remove_stable:
         bounds = loop_bounds(loop, box, t)
     else:
-        bounds = bounds_over(loop, X, box, t)
+        bounds = bounds_over(loop, around, box, t)
     rows = loop_rows(loop, columns(0, n, size), n, t, bounds, relaxation.remove_stable)
     one = columns(size - 1, 1, size)
     of_the_set, cone = (
@@ -185,7 +189,8 @@ def _step_program(
     facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts, cone)
     # The optimal value does not depend on the scaling, but its derivative at inexact multipliers
     # does: with the scaling's share, facts of thin sets keep their size and errors cancel.
-    T = scaling(bounds, relaxation.remove_stable, X)
+    ball = around.ellipsoid if isinstance(around, Intersection) else around
+    T = scaling(bounds, relaxation.remove_stable, ball)
     # one rounding of it for all rows, whatever the compiler fuses
     T = jax.lax.optimization_barrier(T)
     return Program(

@@ -22,7 +22,7 @@ from reachjax.checks import (
 )
 from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, LocalBounds
-from reachjax.sets import AbstractSet, AbstractTemplate, Template
+from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Clarabel
 from reachjax.successors import Step
 from reachjax.systems import ClosedLoop
@@ -48,7 +48,7 @@ class ReachTube(Replaceable):
 
     Attributes:
         loop: the loop they were computed for.
-        template: what the sets look like: facet directions, or ellipsoids.
+        template: what the sets look like: facet directions, ellipsoids, or both.
         sets: `sets[t]` for `t = 0 .. horizon`; `sets[0]` is the initial set.
         certificates: `certificates[t]` for `t = 1 .. horizon`; the first entry is `None`.
         start: the time of the initial set, for time-varying loops.
@@ -61,8 +61,7 @@ class ReachTube(Replaceable):
     start: int = static(default=0)
 
     def __repr__(self) -> str:
-        template = self.template
-        sets = f"facets={len(template)}" if isinstance(template, Template) else "ellipsoids"
+        sets = self.template.summary
         return f"ReachTube(horizon={self.horizon}, {sets}, states={self.loop.states})"
 
     @property
@@ -103,7 +102,7 @@ def reach_step(
     Args:
         loop: the closed loop.
         X: the set of states at time `t`.
-        template: what the sets look like: facet directions, or ellipsoids.
+        template: what the sets look like: facet directions, ellipsoids, or both.
         t: the time, for time-varying loops.
         relaxation: which products of facts are used.
         solver: what solves the semidefinite programs.
@@ -119,7 +118,7 @@ def reach_step(
     (CDC 2020).
 
     Example:
-        >>> from reachjax import MLP, AffinePlant, Box
+        >>> from reachjax import MLP, AffinePlant, Box, Template
         >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
         >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
         >>> following, certificate = reach_step(loop, Box([1.0], [2.0]), Template.box(1))
@@ -150,7 +149,7 @@ def reach(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number `N` of steps.
-        template: what every set looks like: facet directions, or ellipsoids.
+        template: what every set looks like: facet directions, ellipsoids, or both.
         relaxation: which products of facts are used.
         window: over how many steps each program reaches back; 1 is the paper's recursion.
         solver: what solves the semidefinite programs.
@@ -176,7 +175,7 @@ def reach(
     Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 
     Example:
-        >>> from reachjax import MLP, AffinePlant, Box
+        >>> from reachjax import MLP, AffinePlant, Box, Template
         >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
         >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
         >>> tube = reach(loop, Box([1.0], [2.0]), 3, Template.box(1))

@@ -158,18 +158,22 @@ class Barrier:
     def minimiser(self, y: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Newton's method from a point inside: the minimiser and the Hessian there."""
         value = self.value(y, weight)
-        for _ in range(STEPS):
+        for _ in range(STEPS if np.isfinite(value) else 0):
             gradient, hessian = self.derivatives(y, weight)
             step = -solved(hessian, gradient)
             decrement = -float(gradient @ step)
             if decrement <= CENTRED * weight:
-                return y, hessian
+                better = y + step  # by the square of the decrement; the Hessian is to match
+                y = better if np.isfinite(self.value(better, weight)) else y
+                return y, self.derivatives(y, weight)[1]
             if not np.isfinite(decrement):
                 return None
-            length, wanted = 1.0, decrement / 4
-            if decrement <= QUADRATIC * weight:
-                wanted = -np.inf  # too close for differences of values to be seen
-            while not (after := self.value(y + length * step, weight)) <= value - length * wanted:
+            length, near = 1.0, decrement <= QUADRATIC * weight
+            # near the centre, differences of values are not seen: any point inside will do
+            while not (
+                (after := self.value(y + length * step, weight)) <= value - length * decrement / 4
+                or (near and np.isfinite(after))
+            ):
                 length /= 2
                 if length < 1e-10:
                     return None

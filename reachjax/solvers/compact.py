@@ -26,6 +26,9 @@ interval radius: that keeps ellipsoids of least volume around flat sets from deg
 TINY = 1e-100
 """The least width of anything that is enclosed, in the units of the state."""
 
+TOUCHING = 1e-6
+"""A fact negative on an ellipsoid by no more than this part of its size counts as implied by it."""
+
 CHUNK = 256
 """Pairs whose dense outer products are held in memory at once."""
 
@@ -93,7 +96,7 @@ def compact(program: Program) -> CompactProgram:
     columns = np.flatnonzero(solid.any(axis=0) | _solid(program.objective).any(axis=0))
     facts = np.where(solid.any(axis=1, keepdims=True), facts, 0.0)[:, columns]
     generators, norms = _generators(program, facts)
-    kept = np.flatnonzero((norms > 0) & ~_implied_by_cone(program, facts, generators))
+    kept = np.flatnonzero((norms > 0) & ~_implied_by_cone(program, facts))
     unit_size = sp.diags_array(1 / norms[kept])
     # solvers' tolerances are absolute, objectives come in the size of the set of states
     objective = np.asarray(program.objective.mid)[:, columns].copy()
@@ -118,24 +121,42 @@ def _solid(rows: Ball) -> np.ndarray:
     return abs(np.asarray(rows.mid)) > NOISE * noise[:, None]
 
 
-def _implied_by_cone(program: Program, facts: np.ndarray, generators: sp.csc_array) -> np.ndarray:
+def _implied_by_cone(program: Program, facts: np.ndarray) -> np.ndarray:
     """Multipliers `(K,)` of products that say nothing beyond an ellipsoid's own fact.
 
     A quadratic function of the state that is not negative on the ellipsoid is a positive multiple
     of its fact and a positive semidefinite term (the S-lemma loses nothing for one constraint).
     Products of neurons that are affine on the set are of this kind; kept, hundreds of them made a
-    solver stall at its second digit.
+    solver stall at its second digit. So are those of facets that do not cut the ellipsoid.
     """
-    cone = np.asarray(program.products.sign) < 0
-    if not cone.any():
-        return np.zeros(len(program.products.free), dtype=bool)
-    state = (facts[np.asarray(program.products.left)[cone]] != 0).any(axis=0)
-    state[-1] = True
-    outside = ~np.outer(state, state).ravel()
-    beyond = abs(generators[np.flatnonzero(outside)]).sum(axis=0) > 0
-    its_own = np.zeros(len(program.products.free), dtype=bool)
-    its_own[np.asarray(program.products.multiplier)[cone]] = True
-    return ~np.asarray(beyond).ravel() & ~its_own
+    p = program.products
+    left, right, owner = (np.asarray(part) for part in (p.left, p.right, p.multiplier))
+    cone = np.flatnonzero(np.asarray(p.sign) < 0)
+    if not len(cone):
+        return np.zeros(len(p.free), dtype=bool)
+    holds: np.ndarray = _least_on_ellipsoid(facts, left[cone]) >= 0
+    zero = np.logical_not(facts.any(axis=1))
+    beyond = ~(holds[left] & holds[right]) & ~zero[left] & ~zero[right]
+    implied = np.ones(len(p.free), dtype=bool)
+    implied[owner[beyond]] = implied[owner[cone]] = False
+    return implied
+
+
+def _least_on_ellipsoid(facts: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """A lower bound `(m,)` of each fact on the ellipsoid; `-inf` if it is not one of the state.
+
+    Args:
+        facts: `(m, n)`, the level `s` standing just before `rows`.
+        rows: numbers of the rows `R` with `|R x| <= s`.
+    """
+    R, level = facts[rows], facts[rows[0] - 1, -1]
+    state = (R != 0).any(axis=0)
+    state[-1] = False
+    weights = np.linalg.lstsq(R[:, state].T, facts[:, state].T, rcond=None)[0].T
+    middle, reach = facts[:, -1] - weights @ R[:, -1], level * np.linalg.norm(weights, axis=1)
+    elsewhere = facts[:, :-1][:, ~state[:-1]].any(axis=1)
+    least = middle - reach + TOUCHING * (abs(middle) + reach)
+    return np.where(elsewhere, -np.inf, least)
 
 
 def _generators(program: Program, facts: np.ndarray) -> tuple[sp.csc_array, np.ndarray]:

@@ -369,7 +369,7 @@ def test_the_loop_is_made_from_the_settings(tmp_path, learned):
         ({"training_steps": 0}, "--training-steps must be at least 1, got 0"),
         ({"simulations": 0}, "--simulations must be at least 1, got 0"),
         ({"hidden": (32, 0)}, "--hidden must be numbers of neurons"),
-        ({"penalty": -1.0}, "--penalty must be at least 0"),
+        ({"penalty": -1.0}, "--penalty must be finite and at least 0"),
         ({"seed": -1}, "--seed must be at least 0"),
     ],
 )

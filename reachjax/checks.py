@@ -37,7 +37,7 @@ class Numbers:
         """
         expected = f"{name} must be an array of shape {self.expected}"
         try:
-            if np.iscomplexobj(value):
+            if any(_is_complex(leaf) for leaf in jax.tree.leaves(value)):
                 raise TypeError("its entries are complex")
             array = jnp.asarray(value, dtype=float)
         except (TypeError, ValueError, RuntimeError) as error:
@@ -49,6 +49,11 @@ class Numbers:
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(np.asarray(array)))[0])
             raise ValueError(f"{name} must be finite, but entry {where} is {array[where]}")
         return array
+
+
+def _is_complex(leaf: Any) -> bool:
+    """A number or an array of complex numbers, which a conversion would cut to their real parts."""
+    return isinstance(leaf, complex) or getattr(getattr(leaf, "dtype", None), "kind", "") == "c"
 
 
 def whole_number(name: str, value: Any, least: int) -> int:

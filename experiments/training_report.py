@@ -31,7 +31,7 @@ def tables(outcomes: Outcomes, goals: tuple[float, ...], cost: StepCost) -> list
 
 def verdict_table(outcomes: Outcomes) -> Table:
     """How many controllers are proved, and at what imitation error."""
-    table = blank_table("proved / refuted / unknown, and errors (rms) on samples not trained on")
+    table = blank_table("verdicts (proved / refuted / unknown), and errors on held-out samples")
     table.add_column("trained", no_wrap=True)
     initials = " / ".join(status[0] for status in COLOURS)
     for heading in (initials, "least", "median", "largest", "/ plain", "skipped"):

@@ -89,6 +89,12 @@ def real_number(name: str, value: Any, least: float) -> float:
     return float(array)
 
 
+def require_kind(name: str, value: Any, kind: type, expected: str) -> None:
+    """Raise a `TypeError` that says what was expected if `value` is of another kind."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be {expected}, but {described(value)} arrived")
+
+
 def described(value: Any) -> str:
     """A short word for what arrived: classes and plain values as they are, objects by kind."""
     if isinstance(value, type | str | int | float | list | None):

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 
 from reachjax.certificates import AbstractCertificate
 from reachjax.checks import (
-    described,
     is_concrete,
     require_double_precision,
+    require_kind,
     same_size,
     whole_number,
 )
@@ -224,8 +224,7 @@ def _check(
         ("relaxation", relaxation, AbstractRelaxation),
         ("solver", solver, AbstractSolver),
     ):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name} must be {EXAMPLES[kind]}, but {described(value)} arrived")
+        require_kind(name, value, kind, EXAMPLES[kind])
     require_double_precision(loop=loop, X0=X0, template=template)
     same_size(
         "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)

@@ -188,9 +188,9 @@ def test_parts_and_mismatches_are_named():
     with pytest.raises(ValueError, match=r"multipliers must have shape \(5, \d+\)"):
         proof.recheck(proof.multipliers[:4])
     with pytest.raises(TypeError, match=r"MixedTemplate\.facets must be a template such as"):
-        rj.MixedTemplate(rj.EllipsoidTemplate())  # type: ignore[arg-type]
+        rj.MixedTemplate(rj.EllipsoidTemplate())  # type: ignore[arg-type]  # the mistake
     with pytest.raises(TypeError, match=r"MixedTemplate\.ellipsoid must be a template such as"):
-        rj.MixedTemplate(rj.Template.box(2), rj.Template.box(2))  # type: ignore[arg-type]
+        rj.MixedTemplate(rj.Template.box(2), rj.Template.box(2))  # type: ignore[arg-type]  # the mistake
     with pytest.raises(ValueError, match=r"MixedTemplate\.ellipsoid has dimension 3"):
         rj.MixedTemplate(rj.Template.box(2), rj.EllipsoidTemplate(np.eye(3)))
     with pytest.raises(ValueError, match="template is 3, but the loop's number of states is 2"):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from reachjax.checks import described, is_concrete, same_size
+from reachjax.checks import is_concrete, require_kind, same_size
 from reachjax.pytrees import pytree
 from reachjax.sets.base import AbstractSet, PolyhedralSet
 from reachjax.sets.box import Box
@@ -46,14 +46,8 @@ class Intersection(AbstractSet):
     ellipsoid: Ellipsoid
 
     def __post_init__(self):
-        for name, part, kind, expected in (
-            ("polytope", self.polytope, PolyhedralSet, "a Box or a Polytope"),
-            ("ellipsoid", self.ellipsoid, Ellipsoid, "an Ellipsoid"),
-        ):
-            if not isinstance(part, kind):
-                raise TypeError(
-                    f"Intersection.{name} must be {expected}, but {described(part)} arrived"
-                )
+        require_kind("Intersection.polytope", self.polytope, PolyhedralSet, "a Box or a Polytope")
+        require_kind("Intersection.ellipsoid", self.ellipsoid, Ellipsoid, "an Ellipsoid")
         if isinstance(self.polytope, Box) and self.polytope.steps is not None:
             raise ValueError(
                 "Intersection.polytope must be one box, but a time-varying one arrived"

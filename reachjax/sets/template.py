@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.checks import Numbers, described, is_concrete, same_size, whole_number
+from reachjax.checks import Numbers, is_concrete, require_kind, same_size, whole_number
 from reachjax.pytrees import Replaceable, converted, pytree
 from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polytope import Polytope
@@ -165,15 +165,10 @@ class MixedTemplate(AbstractTemplate):
     ellipsoid: EllipsoidTemplate = EllipsoidTemplate()
 
     def __post_init__(self):
-        for name, part, kind, example in (
-            ("facets", self.facets, Template, "Template.box(n)"),
-            ("ellipsoid", self.ellipsoid, EllipsoidTemplate, "EllipsoidTemplate()"),
-        ):
-            if not isinstance(part, kind):
-                raise TypeError(
-                    f"MixedTemplate.{name} must be a template such as {example}, "
-                    f"but {described(part)} arrived"
-                )
+        facets = "a template such as Template.box(n)"
+        require_kind("MixedTemplate.facets", self.facets, Template, facets)
+        ellipsoid = "a template such as EllipsoidTemplate()"
+        require_kind("MixedTemplate.ellipsoid", self.ellipsoid, EllipsoidTemplate, ellipsoid)
         same_size(
             "MixedTemplate.facets has dimension",
             "MixedTemplate.ellipsoid has dimension",

@@ -10,7 +10,7 @@ from reachjax.recheck import interval_offsets, sound_level, sound_offsets
 from reachjax.rounding import gamma
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import Enclosure, Solution, SolverStatus
-from reachjax.solvers.compact import TINY, compact
+from reachjax.solvers.compact import TINY, CompactProgram, compact
 
 ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
 
@@ -58,11 +58,15 @@ def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
         X = whole[np.ix_(reduced.columns, reduced.columns)]
         if not np.isfinite(X).all() or abs(X[-1, -1] - 1) > SHORTFALL:
             continue
-        products = reduced.generators.T @ X.ravel()
-        missed = np.where(reduced.free, abs(products), -products)
-        if missed.max(initial=0.0) <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL:
+        if _missed(reduced, X) <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL:
             values[i] = reduced.centers[i] + reduced.units[i] * (reduced.objective[i] @ X[:, -1])
     return values
+
+
+def _missed(reduced: CompactProgram, moments: np.ndarray) -> float:
+    """By how much moments over the columns kept miss the sign of a product."""
+    products = reduced.generators.T @ moments.ravel()
+    return float(np.where(reduced.free, abs(products), -products).max(initial=0.0))
 
 
 def accepted_enclosure(
@@ -111,8 +115,7 @@ def _largest_factor(program: Program, enclosure: Enclosure) -> float:
     if not np.isfinite(X).all() or X[n - 1, n - 1] <= 0:
         return np.inf
     X, reduced = X / X[n - 1, n - 1], compact(program)
-    products = reduced.generators.T @ X[np.ix_(reduced.columns, reduced.columns)].ravel()
-    missed = np.where(reduced.free, abs(products), -products).max(initial=0.0)
+    missed = _missed(reduced, X[np.ix_(reduced.columns, reduced.columns)])
     if max(missed, -np.linalg.eigvalsh((X + X.T) / 2)[0]) > SHORTFALL:
         return np.inf
     slope = -2 * np.sum(X[n:, :n] * form_rows(program, enclosure.form).mid)

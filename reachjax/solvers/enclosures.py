@@ -70,14 +70,15 @@ def _enclose(
         return blank.form, np.array(np.nan), np.array(False), blank, frame
     for attempt in range(ATTEMPTS):
         framed = with_successor(program, frame) if attempt else program
-        if attempt and compact(framed).is_flat:
+        reduced = compact(framed)
+        if attempt and reduced.is_flat:
             break
         proposed, on_path = _proposed(solver, framed)
         enclosure = proposed._replace(form=proposed.form.of(frame))
         form, level, optimal = accepted_enclosure(program, enclosure, centred=on_path)
         optimal &= enclosure.status == SolverStatus.SOLVED
         attempts.append((form, level, optimal, enclosure, frame))
-        if optimal and not compact(framed).is_thinnest(proposed.form):
+        if optimal and not reduced.is_thinnest(proposed.form):
             return attempts[-1]
         frame = NormalForm(form.A / level, form.b / level)  # finite: accepted forms are invertible
     return min(attempts, key=lambda attempt: log_volume(*attempt[:2]))

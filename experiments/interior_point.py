@@ -81,7 +81,7 @@ def speed(settings: Settings) -> None:
         solver = rj.InteriorPoint()
         first, _ = _timed(solver.solve, program)
         ours, solution = min((_timed(solver.solve, program) for _ in range(3)), key=_first)
-        sizes.append(int((program.scale > 0).sum()))
+        sizes.append(int(program.used.sum()))
         seconds.append(ours / len(directions))
         reference, difference = np.nan, np.nan
         if width <= settings.reference:
@@ -190,7 +190,7 @@ def grown(program: Program, solver: rj.AbstractSolver, settings: Settings, name:
         if following is None:
             break
         program = following
-    size, count = int((program.scale > 0).sum()), len(program.products.free)
+    size, count = int(program.used.sum()), len(program.products.free)
     gaps = " ".join(f"{gap:.0e}" for gap, *_ in found)
     rich.print(f"{name} n {size} products {count}: {seconds:.1f} s, gaps {gaps}")
     return found

@@ -9,6 +9,7 @@ task, and where they differ from the paper's print, are in `experiments.quadroto
     python -m experiments.quadrotor --help
 """
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,8 +75,8 @@ class Settings:
             raise ValueError(f"--samples must be at least 2, but {self.samples} arrived")
         if self.seed < 0:
             raise ValueError(f"--seed must be at least 0, but {self.seed} arrived")
-        if not self.penalty >= 0:
-            raise ValueError(f"--penalty must be at least 0, but {self.penalty} arrived")
+        if not 0 <= self.penalty < math.inf:
+            raise ValueError(f"--penalty must be finite and at least 0, but {self.penalty} arrived")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"--hidden must be numbers of neurons, but {self.hidden} arrived")
 

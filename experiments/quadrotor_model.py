@@ -36,6 +36,8 @@ INPUT_LIMITS = np.array(
 )
 """Of `tan(theta)`, `tan(phi)` and `tau`."""
 INPUT_NAMES = ("tan(theta)", "tan(phi)", "tau")
+AXES = ("p_x", "p_y", "p_z")
+"""Names of the positions."""
 
 
 def continuous_plant() -> tuple[Float[ndarray, "6 6"], Float[ndarray, "6 3"], Float[ndarray, " 6"]]:

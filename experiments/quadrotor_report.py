@@ -11,11 +11,10 @@ from rich.table import Table
 
 import reachjax as rj
 from experiments.command import blank_table
-from experiments.quadrotor_model import GOAL, POSITION_LIMITS, VELOCITY_LIMITS
+from experiments.quadrotor_model import AXES, GOAL, POSITION_LIMITS, VELOCITY_LIMITS
 from experiments.quadrotor_simulation import extremes, margin
 from experiments.report import COLOURS
 
-AXES = ("p_x", "p_y", "p_z")
 PLANES = ((0, 1), (0, 2))
 """Of the paper's two figures."""
 NOTE = """\

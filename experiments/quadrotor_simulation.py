@@ -10,6 +10,7 @@ from rich.table import Table
 import reachjax as rj
 from experiments.command import at_least_one, bar, blank_table
 from experiments.quadrotor_model import (
+    AXES,
     GOAL,
     INPUT_LIMITS,
     INPUT_NAMES,
@@ -19,7 +20,6 @@ from experiments.quadrotor_model import (
 
 BATCH = 10_000
 """Trajectories simulated at once."""
-AXES = ("p_x", "p_y", "p_z")
 
 
 def simulate(

@@ -31,11 +31,10 @@ def tables(outcomes: Outcomes, goals: tuple[float, ...], cost: StepCost) -> list
 
 def verdict_table(outcomes: Outcomes) -> Table:
     """How many controllers are proved, and at what imitation error."""
-    table = blank_table("verdicts, and root mean square errors on samples not trained on")
+    table = blank_table("verdicts (proved / refuted / unknown), and errors on held-out samples")
     table.add_column("trained", no_wrap=True)
-    for status in COLOURS:
-        table.add_column(status.lower(), justify="right", no_wrap=True)
-    for heading in ("least", "median", "largest", "/ plain", "skipped"):
+    initials = " / ".join(status[0] for status in COLOURS)
+    for heading in (initials, "least", "median", "largest", "/ plain", "skipped"):
         table.add_column(heading, justify="right", no_wrap=True)
     plain = [outcome.validation_error for outcome in next(iter(outcomes.values()))]
     for way, group in outcomes.items():
@@ -45,7 +44,7 @@ def verdict_table(outcomes: Outcomes) -> Table:
         ratios = np.array(errors) / plain
         skipped = sum(outcome.skipped for outcome in group)
         times = f"{ratios.min():.2f}-{ratios.max():.2f}"
-        table.add_row(way, *map(str, counts), *spread, times, str(skipped))
+        table.add_row(way, " / ".join(map(str, counts)), *spread, times, str(skipped))
     return table
 
 

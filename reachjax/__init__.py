@@ -9,7 +9,12 @@ Turn on 64-bit floats before building networks and sets::
 """
 
 from reachjax.basis import ChangeOfBasis, change_of_basis
-from reachjax.certificates import AbstractCertificate, Certificate, EllipsoidCertificate
+from reachjax.certificates import (
+    AbstractCertificate,
+    Certificate,
+    EllipsoidCertificate,
+    MixedCertificate,
+)
 from reachjax.reach import ReachTube, reach, reach_step
 from reachjax.relaxation import AbstractRelaxation, LocalBounds, PaperQC
 from reachjax.requirements import shortfall
@@ -19,6 +24,8 @@ from reachjax.sets import (
     Box,
     Ellipsoid,
     EllipsoidTemplate,
+    Intersection,
+    MixedTemplate,
     PolyhedralSet,
     Polytope,
     Template,
@@ -75,7 +82,10 @@ __all__ = [
     "EllipsoidCertificate",
     "EllipsoidTemplate",
     "InteriorPoint",
+    "Intersection",
     "LocalBounds",
+    "MixedCertificate",
+    "MixedTemplate",
     "PaperQC",
     "PenaltySchedule",
     "PolyhedralSet",

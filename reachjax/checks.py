@@ -37,6 +37,8 @@ class Numbers:
         """
         expected = f"{name} must be an array of shape {self.expected}"
         try:
+            if any(_is_complex(leaf) for leaf in jax.tree.leaves(value)):
+                raise TypeError("its entries are complex")
             array = jnp.asarray(value, dtype=float)
         except (TypeError, ValueError, RuntimeError) as error:
             kind = type(value).__name__
@@ -47,6 +49,11 @@ class Numbers:
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(np.asarray(array)))[0])
             raise ValueError(f"{name} must be finite, but entry {where} is {array[where]}")
         return array
+
+
+def _is_complex(leaf: Any) -> bool:
+    """A number or an array of complex numbers, which a conversion would cut to their real parts."""
+    return isinstance(leaf, complex) or getattr(getattr(leaf, "dtype", None), "kind", "") == "c"
 
 
 def whole_number(name: str, value: Any, least: int) -> int:
@@ -80,6 +87,12 @@ def real_number(name: str, value: Any, least: float) -> float:
     if not (np.isfinite(array) and array >= least):
         raise ValueError(f"{name} must be finite and at least {least:g}, but {array} arrived")
     return float(array)
+
+
+def require_kind(name: str, value: Any, kind: type, expected: str) -> None:
+    """Raise a `TypeError` that says what was expected if `value` is of another kind."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be {expected}, but {described(value)} arrived")
 
 
 def described(value: Any) -> str:

@@ -22,15 +22,15 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from reachjax.basis import Rows, columns, loop_rows
 from reachjax.bounds import LoopBounds, loop_bounds
-from reachjax.preactivations import bounds_over
+from reachjax.preactivations import bounds_over, rounded
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.relaxation import AbstractRelaxation, FactLayout, Products
 from reachjax.rounding import Ball, gamma
-from reachjax.sets import AbstractSet, Box, Ellipsoid, NormalForm
+from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, NormalForm
 from reachjax.systems import ClosedLoop
 
 CONSTANT = 1e-9
@@ -46,16 +46,24 @@ class Program(Replaceable):
             cone fact.
         objective: `(f, n)` rows over the scaled basis: `a . x+` for each facet.
         products: which pairs of facts are multiplied.
-        shift: `(n,)`, the midpoint of each entry of the basis (zero for the constant).
-        scale: `(n,)`, the radius of each entry: `xi_i = shift_i + scale_i eta_i`; zero where the
-            entry is unused or has one value; 1 for the constant.
+        transform: `(n, n)`, `T` with `xi = T eta`: midpoints in the last column, on the diagonal
+            radii, zero where the entry is unused or has one value. The states of an ellipsoid are
+            those of the unit ball, and the block is its factor.
     """
 
     facts: Rows
     objective: Rows
     products: Products
-    shift: Float[Array, " n"]
-    scale: Float[Array, " n"]
+    transform: Float[Array, "n n"]
+
+    @property
+    def used(self) -> Bool[Array, " n"]:
+        """Which entries of the scaled basis vary, and the constant."""
+        return self.transform.diagonal() > 0
+
+    def seeking(self, rows: slice) -> Program:
+        """The same program with some of the objective's rows."""
+        return self.replace(objective=self.objective[rows])
 
     def with_midpoints(self, facts: Float[Array, "m n"], objective: Float[Array, "f n"]) -> Program:
         """The same program with other coefficients and the rounding errors of these."""
@@ -64,10 +72,14 @@ class Program(Replaceable):
         )
 
 
-def scaling(shift: Float[Array, " n"], scale: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """`T` with `T eta = shift + scale * eta`, the constant entry staying 1."""
-    last = jnp.arange(scale.shape[0]) == scale.shape[0] - 1
-    return jnp.diag(scale) + jnp.outer(jnp.where(last, 0.0, shift), last)
+def scaling(bounds: LoopBounds, prune: bool, X: Ellipsoid | None) -> Float[Array, "n n"]:
+    """`T` with `xi = T eta`, the entries of `eta` being in `[-1, 1]`, the last one 1."""
+    mid, rad = basis_box(bounds, prune)
+    T = jnp.diag(rad).at[:-1, -1].set(mid[:-1])
+    if X is None:
+        return T
+    n = X.dimension
+    return T.at[:n, :n].set(X.from_ball()).at[:n, -1].set(X.center)
 
 
 def basis_box(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
@@ -116,9 +128,14 @@ def form_rows(program: Program, form: NormalForm) -> Ball:
 
     Works on JAX arrays and on numpy arrays alike.
     """
-    last = np.arange(program.scale.shape[0]) == program.scale.shape[0] - 1
+    last = np.arange(len(program.transform)) == len(program.transform) - 1
     constant = form.b[:, None] * last
     return form.A @ program.objective + Ball(constant, 0 * constant)
+
+
+def with_successor(program: Program, form: NormalForm) -> Program:
+    """The same program with `A x+ + b` in the place of the successor `x+`."""
+    return program.replace(objective=form_rows(program, form))
 
 
 def step_program(
@@ -142,9 +159,9 @@ def step_program(
         t: the time.
         relaxation: which products of facts are used.
     """
-    X_round = X if isinstance(X, Ellipsoid) and relaxation.remove_stable else None
+    around = rounded(X, box)
     set_facts = X.facts(), X.cone_facts()
-    return _step_program(loop, *set_facts, X_round, box, directions, t, relaxation)
+    return _step_program(loop, *set_facts, around, box, directions, t, relaxation)
 
 
 @partial(jax.jit, static_argnames="relaxation")
@@ -152,7 +169,7 @@ def _step_program(
     loop: ClosedLoop,
     set_facts: Float[Array, "m n_x+1"],
     cone_facts: Float[Array, "r n_x+1"],
-    X: Ellipsoid | None,
+    around: Ellipsoid | Intersection | None,
     box: Box,
     directions: Float[Array, "f n_x"],
     t: int,
@@ -160,7 +177,10 @@ def _step_program(
 ) -> Program:
     n, k = loop.states, loop.units
     size = n + k + 1
-    bounds = loop_bounds(loop, box, t) if X is None else bounds_over(loop, X, box, t)
+    if around is None or not relaxation.remove_stable:
+        bounds = loop_bounds(loop, box, t)
+    else:
+        bounds = bounds_over(loop, around, box, t)
     rows = loop_rows(loop, columns(0, n, size), n, t, bounds, relaxation.remove_stable)
     one = columns(size - 1, 1, size)
     of_the_set, cone = (
@@ -169,16 +189,15 @@ def _step_program(
     facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts, cone)
     # The optimal value does not depend on the scaling, but its derivative at inexact multipliers
     # does: with the scaling's share, facts of thin sets keep their size and errors cancel.
-    scaling_of_basis = basis_box(bounds, relaxation.remove_stable)
-    # one rounding of the scaling for all rows, whatever the compiler fuses
-    shift, scale = jax.lax.optimization_barrier(scaling_of_basis)
-    T = scaling(shift, scale)
+    ball = around.ellipsoid if isinstance(around, Intersection) else around
+    T = scaling(bounds, relaxation.remove_stable, ball)
+    # one rounding of it for all rows, whatever the compiler fuses
+    T = jax.lax.optimization_barrier(T)
     return Program(
         facts=facts @ T,
         objective=(directions @ rows.successor) @ T,
         products=relaxation.products(FactLayout(len(set_facts), k, len(cone_facts))),
-        shift=shift,
-        scale=scale,
+        transform=T,
     )
 
 
@@ -209,7 +228,7 @@ def schur_lagrangian(
     That matrix is positive semidefinite where `V' V - e e' + F' Gamma F <= 0`, which is theorem 1
     for the ellipsoid `|A x + b| <= 1`; it is affine in the multipliers, `A` and `b`.
     """
-    F, products, n = program.facts.mid, program.products, program.scale.shape[0]
+    F, products, n = program.facts.mid, program.products, len(program.transform)
     pairs = (F @ moments[:n, :n] @ F.T)[products.left, products.right]
     weights = products.sign * multipliers[products.multiplier]
     V = form_rows(program, form).mid

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from reachjax.reach import ReachTube
-from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
+from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +27,8 @@ def plot_set(
     **style: Any,
 ) -> Axes:
     """Draw the outline of a bounded set, or of its shadow on two coordinates.
+
+    Of an intersection, it is what the shadows of its two parts have in common.
 
     Args:
         region: a set of two or more dimensions.
@@ -75,11 +77,11 @@ def _two_of(dimension: int, coordinates: Any) -> tuple[int, int]:
 
 def _outline(region: AbstractSet, i: int, j: int) -> np.ndarray:
     """Points around a set's shadow on two coordinates, in order."""
+    if isinstance(region, Intersection):
+        return _cut(_outline(region.polytope, i, j), region.ellipsoid.projection(i, j))
     if isinstance(region, Ellipsoid):
         shadow = region.projection(i, j)
-        angles = np.linspace(0, 2 * np.pi, OUTLINE, endpoint=False)
-        circle = np.column_stack([np.cos(angles), np.sin(angles)])
-        return np.asarray(shadow.center) + circle @ np.linalg.cholesky(shadow.shape).T
+        return np.asarray(shadow.center) + _circle() @ np.linalg.cholesky(shadow.shape).T
     if isinstance(region, Box):
         box = region.bounding_box()  # a box of many dimensions has too many corners to list
         region = Box(box.lower[np.array([i, j])], box.upper[np.array([i, j])])
@@ -90,6 +92,25 @@ def _outline(region: AbstractSet, i: int, j: int) -> np.ndarray:
         return corners[ConvexHull(corners).vertices]
     except QhullError:  # on a line: its two ends
         return corners[np.lexsort(corners.T)[[0, -1]]]
+
+
+def _circle() -> np.ndarray:
+    angles = np.linspace(0, 2 * np.pi, OUTLINE, endpoint=False)
+    return np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def _cut(corners: np.ndarray, ellipse: Ellipsoid) -> np.ndarray:
+    """What the tangents of an ellipse leave of a convex polygon, corners in order."""
+    A, b = (np.asarray(part) for part in ellipse.normal_form)
+    for tangent in _circle():
+        room = 1 - corners @ (tangent @ A) - tangent @ b
+        after, left = np.roll(corners, -1, axis=0), np.roll(room, -1)
+        crossing = room * left < 0
+        share = np.where(crossing, room / np.where(crossing, room - left, 1.0), 0.0)
+        between = corners + share[:, None] * (after - corners)
+        either = np.stack([corners, between], axis=1).reshape(-1, 2)
+        corners = either[np.stack([room >= 0, crossing], axis=1).ravel()]
+    return corners
 
 
 def plot_tube(

@@ -14,16 +14,26 @@ import jax.numpy as jnp
 from reachjax.basis import Rows, columns, loop_rows
 from reachjax.bounds import LoopBounds, loop_bounds
 from reachjax.rounding import Ball, gamma
-from reachjax.sets import Box, Ellipsoid
+from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection
 from reachjax.systems import ClosedLoop
 
 
-def bounds_over(loop: ClosedLoop, X: Ellipsoid, box: Box, t: int | jax.Array) -> LoopBounds:
-    """Bounds of one step of the loop from an ellipsoid of states.
+def rounded(X: AbstractSet, box: Box) -> Ellipsoid | Intersection | None:
+    """A set around `X` with a round part, whose supports can be compiled; None without such a part.
+
+    Supports of polytopes are linear programs on the host: here a box around it stands for one.
+    """
+    if isinstance(X, Intersection):
+        return X.replace(polytope=box)
+    return X if isinstance(X, Ellipsoid) else None
+
+
+def bounds_over(loop: ClosedLoop, X: AbstractSet, box: Box, t: int | jax.Array) -> LoopBounds:
+    """Bounds of one step of the loop from a set of states with a round part.
 
     Args:
         loop: the closed loop.
-        X: the set of states at time `t`.
+        X: the set of states at time `t`, as `rounded` gives it.
         box: a box around it.
         t: the time.
     """
@@ -39,7 +49,7 @@ def bounds_over(loop: ClosedLoop, X: Ellipsoid, box: Box, t: int | jax.Array) ->
     return jax.lax.fori_loop(0, layers, once, loop_bounds(loop, box, t))
 
 
-def _ranges(rows: Rows, X: Ellipsoid, bounds: LoopBounds) -> Ball:
+def _ranges(rows: Rows, X: AbstractSet, bounds: LoopBounds) -> Ball:
     """Intervals of rows over the basis `[x, z, 1]`."""
     n = X.dimension
     A, B, c = rows.mid[:, :n], rows.mid[:, n:-1], rows.mid[:, -1]

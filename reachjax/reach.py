@@ -14,15 +14,15 @@ from jaxtyping import Array, Float
 
 from reachjax.certificates import AbstractCertificate
 from reachjax.checks import (
-    described,
     is_concrete,
     require_double_precision,
+    require_kind,
     same_size,
     whole_number,
 )
 from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, LocalBounds
-from reachjax.sets import AbstractSet, AbstractTemplate, Template
+from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Clarabel
 from reachjax.successors import Step
 from reachjax.systems import ClosedLoop
@@ -48,7 +48,7 @@ class ReachTube(Replaceable):
 
     Attributes:
         loop: the loop they were computed for.
-        template: what the sets look like: facet directions, or ellipsoids.
+        template: what the sets look like: facet directions, ellipsoids, or both.
         sets: `sets[t]` for `t = 0 .. horizon`; `sets[0]` is the initial set.
         certificates: `certificates[t]` for `t = 1 .. horizon`; the first entry is `None`.
         start: the time of the initial set, for time-varying loops.
@@ -61,8 +61,7 @@ class ReachTube(Replaceable):
     start: int = static(default=0)
 
     def __repr__(self) -> str:
-        template = self.template
-        sets = f"facets={len(template)}" if isinstance(template, Template) else "ellipsoids"
+        sets = self.template.summary
         return f"ReachTube(horizon={self.horizon}, {sets}, states={self.loop.states})"
 
     @property
@@ -103,7 +102,7 @@ def reach_step(
     Args:
         loop: the closed loop.
         X: the set of states at time `t`.
-        template: what the sets look like: facet directions, or ellipsoids.
+        template: what the sets look like: facet directions, ellipsoids, or both.
         t: the time, for time-varying loops.
         relaxation: which products of facts are used.
         solver: what solves the semidefinite programs.
@@ -119,7 +118,7 @@ def reach_step(
     (CDC 2020).
 
     Example:
-        >>> from reachjax import MLP, AffinePlant, Box
+        >>> from reachjax import MLP, AffinePlant, Box, Template
         >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
         >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
         >>> following, certificate = reach_step(loop, Box([1.0], [2.0]), Template.box(1))
@@ -150,7 +149,7 @@ def reach(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number `N` of steps.
-        template: what every set looks like: facet directions, or ellipsoids.
+        template: what every set looks like: facet directions, ellipsoids, or both.
         relaxation: which products of facts are used.
         window: over how many steps each program reaches back; 1 is the paper's recursion.
         solver: what solves the semidefinite programs.
@@ -170,12 +169,13 @@ def reach(
     The offsets of the sets have first derivatives in everything but facet normals (reverse mode):
     in the loop's weights, plant and input box, and in a box's ends or a polytope's offsets. In the
     normals of `X0` and of the template the derivative is NaN where a bound of a coordinate is
-    attained on a whole face.
+    attained on a whole face. Centre and shape of ellipsoids have them too, in all of the above and
+    in the centre and shape of an ellipsoid `X0`. They are NaN where a program was not solved.
 
     Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 
     Example:
-        >>> from reachjax import MLP, AffinePlant, Box
+        >>> from reachjax import MLP, AffinePlant, Box, Template
         >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
         >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
         >>> tube = reach(loop, Box([1.0], [2.0]), 3, Template.box(1))
@@ -224,8 +224,7 @@ def _check(
         ("relaxation", relaxation, AbstractRelaxation),
         ("solver", solver, AbstractSolver),
     ):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name} must be {EXAMPLES[kind]}, but {described(value)} arrived")
+        require_kind(name, value, kind, EXAMPLES[kind])
     require_double_precision(loop=loop, X0=X0, template=template)
     same_size(
         "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)

@@ -96,7 +96,7 @@ def sound_level(program: Program, multipliers: np.ndarray, form: NormalForm) -> 
 def _proved(program: Program, multipliers: np.ndarray, goal: Ball, by_intervals: float) -> float:
     """The smallest `b` shown for `F' Gamma F + goal - 2 b e e'`: see this module's docstring."""
     signed = np.where(program.products.free, multipliers, np.maximum(multipliers, 0.0))
-    used = np.ix_(program.scale > 0, program.scale > 0)
+    used = np.ix_(program.used, program.used)
     products = weighted_products(program, signed)
     mid = (products.mid + goal.mid)[used]
     rad = ((products.rad + goal.rad)[used] + gamma(4) * abs(mid)) * (1 + gamma(4))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.checks import described, is_concrete, real_number
+from reachjax.checks import described, is_concrete, real_number, require_kind
 from reachjax.reach import ReachTube
 from reachjax.sets import Box, PolyhedralSet
 from reachjax.solvers import separation, support
@@ -68,10 +68,7 @@ def of_tube(
         TypeError: there is no tube, or a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
     """
-    if not isinstance(tube, ReachTube):
-        raise TypeError(
-            f"tube must be a ReachTube, as reach(...) returns it, but {described(tube)} arrived"
-        )
+    require_kind("tube", tube, ReachTube, "a ReachTube, as reach(...) returns it")
     return requirements(tube.loop.states, tube.horizon, goal, avoid, safe)
 
 
@@ -106,10 +103,7 @@ def requirements(
     if not found:
         raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")
     for item in found:
-        if not isinstance(item.region, PolyhedralSet):
-            raise TypeError(
-                f"{item.name} must be a Box or a Polytope, but {described(item.region)} arrived"
-            )
+        require_kind(item.name, item.region, PolyhedralSet, "a Box or a Polytope")
         if isinstance(item.region, Box) and item.region.steps is not None:
             raise ValueError(f"{item.name} must be one box, but a time-varying one arrived")
         if item.region.dimension != states:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from reachjax.checks import described
 from reachjax.reach import ReachTube
-from reachjax.sets import AbstractSet, Polytope
+from reachjax.sets import AbstractSet, Intersection, Polytope
 from reachjax.solvers import bounding_box, polytope_volume
 
 EXACT_DIMENSIONS = 4
@@ -22,6 +22,8 @@ EXACT_DIMENSIONS = 4
 
 def volume(X: AbstractSet) -> Float[Array, ""]:
     """The `n`-dimensional volume; of a polytope beyond four dimensions, that of its bounding box.
+
+    Of an intersection it is an upper bound, the smaller volume of its two parts.
 
     Differentiable, also inside `jax.jit`, `jax.vmap` and `jax.lax.scan`.
 
@@ -38,6 +40,8 @@ def volume(X: AbstractSet) -> Float[Array, ""]:
         Array([3., 3., 2., 2.], dtype=float64)
     """
     _require_set(X)
+    if isinstance(X, Intersection):
+        return jnp.minimum(*(volume(part) for part in X.parts))
     if not isinstance(X, Polytope):
         return jnp.asarray(X.volume())
     if X.dimension <= EXACT_DIMENSIONS:

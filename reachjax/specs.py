@@ -94,7 +94,7 @@ class Verdict:
             )
         if self.unsolved:
             lines.append(
-                f"  {self.unsolved} facets were not solved to tolerance: their bounds hold, but "
+                f"  {self.unsolved} programs were not solved to tolerance: their bounds hold, but "
                 "may be loose (see certificate.statuses)"
             )
         return "\n".join(lines)

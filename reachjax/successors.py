@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from reachjax.certificates import AbstractCertificate, Certificate, EllipsoidCertificate
+from reachjax.certificates import (
+    AbstractCertificate,
+    Certificate,
+    EllipsoidCertificate,
+    MixedCertificate,
+)
 from reachjax.checks import is_concrete
-from reachjax.lmi import step_program
+from reachjax.lmi import Program, step_program
 from reachjax.relaxation import AbstractRelaxation
 from reachjax.sets import (
     AbstractSet,
@@ -17,6 +24,8 @@ from reachjax.sets import (
     Box,
     Ellipsoid,
     EllipsoidTemplate,
+    Intersection,
+    MixedTemplate,
     Polytope,
     Template,
 )
@@ -57,12 +66,17 @@ class Step:
             TypeError: the template is of an unknown kind.
             ValueError: the set of states is empty or unbounded, or states overflow.
         """
+        successor = jnp.eye(self.loop.states)
         if isinstance(template, Template):
-            return self._polytope(template)
+            return self._polytope(template, self._program(template.directions))
         if isinstance(template, EllipsoidTemplate):
-            return self._ellipsoid(template)
+            return self._ellipsoid(template, self._program(successor))
+        if isinstance(template, MixedTemplate):
+            directions = jnp.concatenate([template.facets.directions, successor])
+            return self._intersection(template, self._program(directions))
         raise TypeError(f"there is no step for templates of kind {type(template).__name__}")
 
+    @functools.cached_property
     def _box(self) -> Box:
         """A box around the states; what is too large for numbers may seem empty or unbounded."""
         try:
@@ -77,24 +91,36 @@ class Step:
                 "weights of loop.controller and the entries of loop.plant"
             )
 
-    def _polytope(self, template: Template) -> tuple[Polytope, Certificate]:
+    def _program(self, directions: Float[Array, "f n_x"]) -> Program:
+        """Theorem 1 with these directions of the successor for an objective."""
+        return step_program(self.loop, self.X, self._box, directions, self.t, self.relaxation)
+
+    def _polytope(self, template: Template, program: Program) -> tuple[Polytope, Certificate]:
         """Problem (sdp::poly): the smallest offset for each facet."""
-        directions = template.directions
-        program = step_program(self.loop, self.X, self._box(), directions, self.t, self.relaxation)
         offsets, solution = proved_offsets(program, self.solver)
         self._require_finite(offsets)
         certificate = Certificate.from_solution(program, offsets, solution)
         return template.polytope(offsets), certificate
 
-    def _ellipsoid(self, template: EllipsoidTemplate) -> tuple[Ellipsoid, EllipsoidCertificate]:
+    def _ellipsoid(
+        self, template: EllipsoidTemplate, program: Program
+    ) -> tuple[Ellipsoid, EllipsoidCertificate]:
         """Problem (sdp::ellips): the minimum volume, or the smallest size of a given shape."""
-        box, rows = self._box(), jnp.eye(self.loop.states)
-        program = step_program(self.loop, self.X, box, rows, self.t, self.relaxation)
         if template.shape is None:
             region, enclosure = proved_ellipsoid(program, self.solver)
         else:
-            middle = self.X.center if isinstance(self.X, Ellipsoid) else box.center
+            middle = self.X.center if isinstance(self.X, Ellipsoid) else self._box.center
             given = Ellipsoid(self.loop.step(middle, self.t), template.shape).normal_form
             region, enclosure = proved_size(program, given, self.solver)
         self._require_finite(region.shape)
         return region, EllipsoidCertificate.from_enclosure(program, region, enclosure)
+
+    def _intersection(
+        self, template: MixedTemplate, program: Program
+    ) -> tuple[Intersection, MixedCertificate]:
+        """Both problems, over the same facts."""
+        m = len(template.facets)
+        polytope, first = self._polytope(template.facets, program.seeking(slice(m)))
+        ellipsoid, second = self._ellipsoid(template.ellipsoid, program.seeking(slice(m, None)))
+        region = Intersection(polytope, ellipsoid)
+        return region, MixedCertificate.joining(program, first, second)

@@ -7,7 +7,6 @@ the dual of a semidefinite program proposes.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 
 import jax
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
+from reachjax.sets import AbstractSet, Ellipsoid, Intersection, PolyhedralSet
 from reachjax.systems import ClosedLoop
 
 MOST_DIMENSIONS = 12
@@ -29,23 +28,35 @@ SOLVER_PULL = 1 - 1e-7
 
 
 def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[Array, "c n_x"]:
-    """Corners of a polyhedral set of few dimensions, and `count` points drawn from the set.
+    """Corners of the set, in few dimensions, and `count` points drawn from it.
 
-    Of an ellipsoid, half of the points are on the surface, just inside.
+    Where the set has a round part, half of the points are on the surface, just inside.
     """
     key = jax.random.key(seed)
     states = X0.sample(key, count)
-    if isinstance(X0, Ellipsoid):
-        surface = X0.center + PULL * (X0.sample_boundary(key, count) - X0.center)
+    if isinstance(X0, Ellipsoid | Intersection):
+        middle = X0.center if isinstance(X0, Ellipsoid) else states.mean(axis=0)
+        surface = middle + PULL * (X0.sample_boundary(key, count) - middle)
         states = states.at[::2].set(surface[::2])
-    if isinstance(X0, PolyhedralSet) and X0.dimension <= MOST_DIMENSIONS:
-        with contextlib.suppress(RuntimeError):  # too thin to have corners: do without
-            states = jnp.concatenate([X0.vertices(), states])
+    states = jnp.concatenate([_corners(X0), states])
     # corners and points of triangulations are rounded: bring them inside, or a witness could lie
     center = states.mean(axis=0)
     inside = jnp.where(X0.contains(states)[:, None], states, center + PULL * (states - center))
     kept = np.asarray(X0.contains(inside))
     return inside[kept] if kept.any() else states  # a set without interior contains none exactly
+
+
+def _corners(X0: AbstractSet) -> Float[Array, "v n_x"]:
+    """Corners of the set's facets; none of an ellipsoid, or where there are too many to list."""
+    none = jnp.zeros((0, X0.dimension))
+    polytope = X0.polytope if isinstance(X0, Intersection) else X0
+    if not isinstance(polytope, PolyhedralSet) or X0.dimension > MOST_DIMENSIONS:
+        return none
+    try:
+        corners = polytope.vertices()
+    except RuntimeError:  # too thin to have corners: do without
+        return none
+    return corners[X0.ellipsoid.contains(corners)] if isinstance(X0, Intersection) else corners
 
 
 def proposed_states(X0: AbstractSet, moments: np.ndarray) -> Float[Array, "f n_x"]:

@@ -98,16 +98,64 @@ def test_tighter_relaxations_give_smaller_ellipsoids():
     assert volumes[1] <= volumes[2] * (1 + 1e-6)
 
 
+ZERO_NET = [([[1.0, 0.0]], [0.0]), ([[1.0]], [0.0])]
+
+
+def affine(A, c=None):
+    """A loop whose network has no say."""
+    return rj.ClosedLoop(rj.AffinePlant(A, [[0.0], [0.0]], c), rj.MLP.from_layers(ZERO_NET))
+
+
 def test_a_flat_image_has_an_ellipsoid_that_is_nearly_flat():
-    plant = rj.AffinePlant([[1.0, 1.0], [2.0, 2.0]], [[0.0], [0.0]])
-    loop = rj.ClosedLoop(plant, rj.MLP.from_layers([([[0.0, 0.0]], [0.0])]))
-    tube = rj.reach(loop, rj.Ellipsoid([0.0, 0.0], np.eye(2)), 2, rj.EllipsoidTemplate())
+    tube = rj.reach(
+        affine([[1.0, 1.0], [2.0, 2.0]]),
+        rj.Ellipsoid([0.0, 0.0], np.eye(2)),
+        2,
+        rj.EllipsoidTemplate(),
+    )
     assert all(holds(tube))
     assert tube.sets[1].volume() < 1e-2
-    constant = loop.replace(plant=rj.AffinePlant(np.zeros((2, 2)), np.zeros((2, 1)), [1.0, 2.0]))
-    tube = rj.reach(constant, rj.Ellipsoid([0.0, 0.0], np.eye(2)), 2, rj.EllipsoidTemplate())
+
+
+@pytest.mark.parametrize("shape", [None, np.eye(2)], ids=["free", "given"])
+@pytest.mark.parametrize("point", [[0.0, 0.0], [1.0, 2.0], [1e-9, 1e9]])
+def test_the_image_of_a_constant_loop_is_nearly_a_point(point, shape):
+    loop = affine(np.zeros((2, 2)), point)
+    tube = rj.reach(loop, rj.Box([1.0, 1.0], [3.0, 2.0]), 2, rj.EllipsoidTemplate(shape))
     assert all(holds(tube))
-    assert tube.sets[1].volume() < 1e-6
+    assert tube.sets[2].volume() <= 1e-12 * np.dot(point, point) + 1e-150  # rounding
+
+
+def test_a_nilpotent_loop_comes_to_rest():
+    loop = affine([[0.0, 1.0], [0.0, 0.0]])
+    tube = rj.reach(loop, rj.Box([1.0, 1.0], [3.0, 2.0]), 4, rj.EllipsoidTemplate())
+    assert all(holds(tube))
+    assert tube.sets[2].volume() < 1e-12
+
+
+@pytest.mark.parametrize("shape", [None, [[1.0]]], ids=["free", "given"])
+def test_a_deadbeat_loop_comes_to_rest(shape):
+    net = rj.MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-1.0, 1.0]], [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net)  # x+ = 0
+    tube = rj.reach(loop, rj.Box([1.0], [3.0]), 2, rj.EllipsoidTemplate(shape))
+    assert all(holds(tube))
+    assert tube.sets[1].volume() < 1e-12
+
+
+@pytest.mark.parametrize("thinness", [1e-2, 1e-4])
+def test_thin_images_keep_their_volume(thinness):
+    loop = affine([[1.0, 1.0], [1.0, 1.0 + thinness]])
+    region, _ = rj.reach_step(loop, rj.Ellipsoid([0.0, 0.0], np.eye(2)), rj.EllipsoidTemplate())
+    np.testing.assert_allclose(region.volume(), np.pi * thinness, rtol=1e-4)
+
+
+def test_volumes_do_not_depend_on_units():
+    """Half-axes of 1e8 and 1e-8: the coordinates are those of the ellipsoids themselves."""
+    units = np.diag([1e8, 1e-8])
+    loop = affine(units @ [[0.9, 0.3], [-0.2, 0.8]] @ np.linalg.inv(units))
+    tube = rj.reach(loop, rj.Ellipsoid([0.0, 0.0], units @ units), 2, rj.EllipsoidTemplate())
+    volumes = np.array([region.volume() for region in tube.sets]) / np.pi
+    np.testing.assert_allclose(volumes, [1.0, 0.78, 0.78**2], rtol=1e-4)
 
 
 def test_specifications_are_decided_from_ellipsoids():

@@ -14,7 +14,7 @@ from experiments.reference import (
     polytope_qc,
     relu_qc,
 )
-from reachjax.lmi import scaling, step_program, weighted_products
+from reachjax.lmi import step_program, weighted_products
 from tests.loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, directions, simplex_region
 
@@ -32,7 +32,7 @@ def over_the_paper_basis(program, matrix, E_in, E_mid):
     """`matrix` over the scaled basis as one over `[x^0, x^1, ..., x^{l+2}, 1]`."""
     units = (len(E_mid) - 1) // 2
     from_paper = np.vstack([E_in[:-1], E_mid[units:]])  # [x, z, 1] = from_paper @ paper's basis
-    unscaled = np.linalg.inv(np.asarray(scaling(program.shift, program.scale))) @ from_paper
+    unscaled = np.linalg.inv(program.transform) @ from_paper
     return unscaled.T @ matrix @ unscaled
 
 
@@ -104,8 +104,8 @@ def test_paper_qc_is_propositions_one_to_five_and_lemma_one_entry_by_entry(n_x, 
 def test_paper_qc_keeps_every_neuron_even_dead_ones():
     data = random_loop(2, network=dead_network)
     X = rj.Box([-0.1, -0.1], [0.1, 0.1])
-    assert np.all(program_of(data, X, rj.PaperQC()).scale > 0)
-    assert np.sum(program_of(data, X, rj.LocalBounds()).scale > 0) < 2 + 10 + 4 + 1
+    assert np.all(program_of(data, X, rj.PaperQC()).used)
+    assert np.sum(program_of(data, X, rj.LocalBounds()).used) < 2 + 10 + 4 + 1
 
 
 RELAXATIONS = [
@@ -125,10 +125,9 @@ def test_facts_products_and_objectives_hold_on_simulated_trajectories(n_x, relax
     program = program_of(data, X, relaxation, t=1)
     states = region.sample(500, seed=3)
     basis, successors = trajectory_basis(loop, states, 1)
-    used = program.scale > 0
-    eta = (basis - program.shift) / np.where(used, program.scale, 1.0)
-    eta = np.where(used, eta, 0.0)
-    eta[:, -1] = 1.0
+    T, used = program.transform, program.used
+    eta = np.zeros_like(basis)
+    eta[:, used] = np.linalg.solve(T[np.ix_(used, used)], basis[:, used].T).T
 
     assert abs(eta).max() <= 1 + 1e-9
     facts = eta @ program.facts.mid.T

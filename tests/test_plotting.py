@@ -90,12 +90,32 @@ def test_the_coordinates_of_a_planar_set_may_be_swapped():
     assert {tuple(p) for p in outline(rj.Box([0, 1], [0, 3]), 1, 0)} == {(1, 0), (3, 0)}
 
 
+def test_the_outline_of_an_intersection_is_what_the_outlines_of_its_parts_have_in_common():
+    ball, box = rj.Ellipsoid([0, 0, 0], np.eye(3)), rj.Box([-2, -0.5, -2], [0.25, 2, 2])
+    points = outline(rj.Intersection(box, ball), 0, 1)
+    assert points[:, 0].max() == pytest.approx(0.25)
+    assert points[:, 1].min() == pytest.approx(-0.5)
+    np.testing.assert_allclose([points[:, 0].min(), points[:, 1].max()], [-1, 1], atol=1e-3)
+    assert np.linalg.norm(points, axis=1).max() < 1.001
+    (x, y), (following_x, following_y) = points.T, np.roll(points, -1, axis=0).T
+    area = abs(np.sum(x * following_y - y * following_x)) / 2
+    inside = np.random.default_rng(0).uniform([-1, -0.5], [0.25, 1], size=(100_000, 2))
+    expected = 1.25 * 1.5 * np.mean(np.linalg.norm(inside, axis=1) <= 1)
+    assert area == pytest.approx(expected, rel=0.01)
+    line = outline(rj.Intersection(rj.Box([0.6, -2, 0], [0.6, 2, 0]), ball), 0, 1)
+    np.testing.assert_allclose(line[:, 0], 0.6)
+    np.testing.assert_allclose([line[:, 1].min(), line[:, 1].max()], [-0.8, 0.8], atol=1e-3)
+
+
 def loop_of(states):
     net = rj.MLP.from_layers([(np.zeros((1, states)), [0.0])])
     return rj.ClosedLoop(rj.AffinePlant(np.eye(states) / 2, np.zeros((states, 1))), net)
 
 
-@pytest.mark.parametrize("template", [rj.Template.box(3), rj.EllipsoidTemplate()])
+@pytest.mark.parametrize(
+    "template",
+    [rj.Template.box(3), rj.EllipsoidTemplate(), rj.MixedTemplate(rj.Template.box(3))],
+)
 def test_a_tube_of_three_states_is_drawn_on_the_coordinates_given(template):
     import matplotlib.pyplot as plt
 

@@ -116,7 +116,7 @@ def test_an_offset_that_falls_short_is_raised_by_at_least_what_is_missing(case):
     """The matrix inequality really is what is checked: the quadratic form bounds the offset."""
     program, solution, _ = case
     rng = np.random.default_rng(1)
-    n = len(program.scale)
+    n = len(program.transform)
     for i, multipliers in enumerate(np.maximum(solution.multipliers * 0.9, 0)):
         raised = sound_offsets(program, np.tile(multipliers, (len(solution.offsets), 1)))[i]
         M = weighted_products(program, multipliers).mid

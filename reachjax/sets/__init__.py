@@ -3,8 +3,9 @@
 from reachjax.sets.base import AbstractSet, PolyhedralSet
 from reachjax.sets.box import Box
 from reachjax.sets.ellipsoid import Ellipsoid, NormalForm
+from reachjax.sets.intersection import Intersection
 from reachjax.sets.polytope import Polytope
-from reachjax.sets.template import AbstractTemplate, EllipsoidTemplate, Template
+from reachjax.sets.template import AbstractTemplate, EllipsoidTemplate, MixedTemplate, Template
 
 __all__ = [
     "AbstractSet",
@@ -12,6 +13,8 @@ __all__ = [
     "Box",
     "Ellipsoid",
     "EllipsoidTemplate",
+    "Intersection",
+    "MixedTemplate",
     "NormalForm",
     "PolyhedralSet",
     "Polytope",

@@ -16,13 +16,14 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from reachjax.checks import Numbers, is_concrete, same_size
+from reachjax.checks import Numbers, is_concrete, same_size, whole_number
 from reachjax.pytrees import converted, pytree
 from reachjax.rounding import gamma
+from reachjax.sets import outward
 from reachjax.sets.base import AbstractSet
 from reachjax.sets.box import Box
 
-FLAT = 1e-14
+SINGULAR = 1e-14
 """A shape matrix counts as singular if scaling its diagonal to 1 leaves no larger eigenvalue."""
 
 
@@ -36,6 +37,16 @@ class NormalForm(NamedTuple):
 
     A: Float[Array | np.ndarray, "n n"]
     b: Float[Array | np.ndarray, " n"]
+
+    def of(self, inner: NormalForm) -> NormalForm:
+        """This form in `x`, given in `y = inner.A x + inner.b`."""
+        return NormalForm(self.A @ inner.A, self.A @ inner.b + self.b)
+
+    @property
+    def inverse(self) -> NormalForm:
+        """`x = A^-1 y - A^-1 b`."""
+        inverse = np.linalg.inv(self.A)
+        return NormalForm(inverse, -inverse @ self.b)
 
 
 @pytree
@@ -75,15 +86,8 @@ class Ellipsoid(AbstractSet):
             (shape.shape[0], shape.shape[1]),
         )
         if is_concrete(shape):
-            matrix = np.asarray(shape)
-            if not np.allclose(matrix, matrix.T, rtol=1e-12, atol=1e-12 * abs(matrix).max()):
-                raise ValueError(f"Ellipsoid.shape must be symmetric, but it is\n{matrix}")
-            widths = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-            if not widths.all() or np.linalg.eigvalsh(matrix / np.outer(widths, widths))[0] <= FLAT:
-                raise ValueError(
-                    "Ellipsoid.shape must be positive definite, but its eigenvalues are "
-                    f"{np.linalg.eigvalsh(matrix).tolist()}"
-                )
+            _require_positive_definite(np.asarray(shape))
+        object.__setattr__(self, "shape", (shape + shape.T) / 2)
 
     @property
     def dimension(self) -> int:
@@ -98,12 +102,17 @@ class Ellipsoid(AbstractSet):
         return NormalForm(A, -A @ self.center)
 
     @classmethod
-    def enclosing(cls, form: NormalForm, level: Float[ArrayLike, ""] = 1.0) -> Ellipsoid:
+    def enclosing(
+        cls, form: NormalForm, level: Float[Array | np.ndarray, ""] | float = 1.0
+    ) -> Ellipsoid:
         """An ellipsoid that surely contains `|A x + b| <= level`; larger by rounding only.
 
-        With `|A q + b| <= e` and `A Q A' >= (level + e)^2 I`, a point with `|A x + b| <= level` has
-        `|A (x - q)| <= level + e`, so `(x - q)' Q^-1 (x - q) <= 1`. The smallest eigenvalue of
-        `A Q A'` is at least its diagonal less the row sums of the rest.
+        Args:
+            form: `A`, which is invertible, and `b`.
+            level: above 0.
+
+        Raises:
+            ValueError: `A` is singular, or the level is not above 0.
 
         Example:
             >>> form = Ellipsoid([1.0, 0.0], [[4.0, 0.0], [0.0, 1.0]]).normal_form
@@ -111,24 +120,22 @@ class Ellipsoid(AbstractSet):
             [[16.0, 0.0], [0.0, 4.0]]
         """
         A, b = form
+        if is_concrete(level) and level <= 0:
+            raise ValueError(f"level must be above 0, but {level} arrived")
+        if is_concrete(A) and np.linalg.slogdet(np.asarray(A)).sign == 0:
+            raise ValueError(f"form.A must be invertible, but it is\n{np.asarray(A)}")
         inverse = jnp.linalg.inv(A)
         q, Q = -inverse @ b, inverse @ inverse.T
-        Q = (Q + Q.T) / 2
-        held = jax.lax.stop_gradient((A, b, q, Q, jnp.asarray(level)))
-        return cls(q, Q * _inflation(*jax.lax.optimization_barrier(held)))
+        # one rounding of both, whatever the compiler fuses: it is these that are proved
+        q, Q = jax.lax.optimization_barrier((q, (Q + Q.T) / 2))
+        return cls(q, Q * outward.inflation(A, b, q, Q, jnp.asarray(level)))
 
-    def _level(self) -> Float[Array, ""]:
-        """A bound `s >= |A x + b|` on the exact set, for `A` and `b` as they are rounded.
+    def from_ball(self) -> Float[Array, "n n"]:
+        """A matrix `M` with `x = center + M w`, `|w| <= 1`, for every `x` of the exact set.
 
-        On the set `|A (x - q)|^2` is at most the largest eigenvalue of `A Q A'`, which is at most
-        the largest row sum of its absolute values.
+        It is the Cholesky factor, larger by rounding only.
         """
-        A, _ = self.normal_form
-        n, Q = self.dimension, self.shape
-        rounding = gamma(2 * n) * (abs(A) @ abs(Q) @ abs(A).T)
-        largest = jnp.max(jnp.sum(abs(A @ Q @ A.T) + rounding, axis=1)) * (1 + gamma(n))
-        offset = jnp.linalg.norm(gamma(n) * (abs(A) @ abs(self.center))) * (1 + gamma(n))
-        return jax.lax.stop_gradient((jnp.sqrt(largest) + offset) * (1 + gamma(4)))
+        return outward.ball_map(self.normal_form.A, self.center, self.shape)
 
     def facts(self) -> Float[Array, "0 n+1"]:
         """None: an ellipsoid has a cone fact instead."""
@@ -137,7 +144,8 @@ class Ellipsoid(AbstractSet):
     def cone_facts(self) -> Float[Array, "n+1 n+1"]:
         """The rows `[s; A, b]` with `|A x + b| <= s` on the set, `s` being 1 up to rounding."""
         A, b = self.normal_form
-        level = jnp.zeros(self.dimension + 1).at[-1].set(self._level())
+        s = outward.level(A, self.center, self.shape)
+        level = jnp.zeros(self.dimension + 1).at[-1].set(s)
         return jnp.vstack([level, jnp.hstack([A, b[:, None]])])
 
     def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
@@ -164,27 +172,22 @@ class Ellipsoid(AbstractSet):
         return self.bounded_values(points)[..., 0] <= 1 + tolerance
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
-        """Whether a point lies in the set in exact arithmetic; False where rounding may decide.
-
-        As `A Q A'` has no eigenvalue below `1 - e`, with `e` the largest row sum of
-        `|A Q A' - I|`, a point with `|A (x - q)|^2 <= 1 - e` is inside.
-        """
-        A, _ = self.normal_form
-        n, Q, x = self.dimension, self.shape, self._points(point)
-        rounding = gamma(2 * n) * (abs(A) @ abs(Q) @ abs(A).T)
-        off = jnp.max(jnp.sum(abs(A @ Q @ A.T - jnp.eye(n)) + rounding, axis=1))
-        sizes = abs(A) @ (abs(x) + abs(self.center))
-        distance = abs(A @ (x - self.center)) + gamma(n + 2) * sizes
-        return bool(jnp.sum(distance**2) * (1 + gamma(n)) <= 1 - off * (1 + gamma(n)))
+        """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
+        x = self._points(point)
+        if x.ndim != 1:
+            raise ValueError(f"point must be one of shape (n,), but {x.shape} arrived")
+        return bool(outward.surely_inside(self.normal_form.A, self.center, self.shape, x))
 
     def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
         """Points drawn uniformly: directions on the sphere, radii `u^(1/n)`."""
+        count = whole_number("count", count, 1)
         along, radial = jax.random.split(key)
         radii = jax.random.uniform(radial, (count, 1), dtype=self.center.dtype)
         return self._mapped(_directions(along, count, self.center) * radii ** (1 / self.dimension))
 
     def sample_boundary(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
         """Points of the surface, up to rounding."""
+        count = whole_number("count", count, 1)
         return self._mapped(_directions(key, count, self.center))
 
     def _mapped(self, points: Float[Array, "count n"]) -> Float[Array, "count n"]:
@@ -206,29 +209,34 @@ class Ellipsoid(AbstractSet):
         """The shadow on some coordinates, an ellipsoid again.
 
         Raises:
-            ValueError: there is no such coordinate.
+            TypeError: a coordinate is no whole number.
+            ValueError: there is no such coordinate, or one is named twice.
 
         Example:
             >>> Ellipsoid([1.0, 2.0, 3.0], jnp.eye(3)).projection(2, 0).center.tolist()
             [3.0, 1.0]
         """
-        wrong = [i for i in coordinates if not 0 <= i < self.dimension]
-        if wrong or not coordinates:
+        distinct = {whole_number("a coordinate", i, 0) for i in coordinates}
+        if not coordinates or len(distinct) < len(coordinates) or max(distinct) >= self.dimension:
             raise ValueError(
-                f"coordinates must be among 0 .. {self.dimension - 1}, but {coordinates} arrived"
+                f"coordinates must be distinct and among 0 .. {self.dimension - 1}, "
+                f"but {coordinates} arrived"
             )
         index = np.array(coordinates)
         return Ellipsoid(self.center[index], self.shape[np.ix_(index, index)])
 
 
-def _inflation(A: Array, b: Array, q: Array, Q: Array, level: Array) -> Float[Array, ""]:
-    """A factor `f` for which `A (f Q) A' >= (level + |A q + b|)^2 I`, rounding included."""
-    n = len(b)
-    residual = abs(A @ q + b) + gamma(n + 2) * (abs(A) @ abs(q) + abs(b))
-    needed = ((level + jnp.linalg.norm(residual)) * (1 + gamma(n + 8))) ** 2
-    formed = abs(A @ Q @ A.T - jnp.eye(n)) + gamma(2 * n + 4) * (abs(A) @ abs(Q) @ abs(A).T)
-    least = 1 - jnp.max(jnp.sum(formed, axis=1)) * (1 + gamma(n))
-    return needed / least * (1 + gamma(8))
+def _require_positive_definite(matrix: np.ndarray) -> None:
+    widths = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = matrix / np.outer(widths, widths)
+    if widths.all() and not np.allclose(scaled, scaled.T, rtol=0, atol=1e-12):
+        raise ValueError(f"Ellipsoid.shape must be symmetric, but it is\n{matrix}")
+    if not widths.all() or np.linalg.eigvalsh((scaled + scaled.T) / 2)[0] <= SINGULAR:
+        raise ValueError(
+            "Ellipsoid.shape must be positive definite, but its eigenvalues are "
+            f"{np.linalg.eigvalsh((matrix + matrix.T) / 2).tolist()}"
+        )
 
 
 def _directions(key: PRNGKeyArray, count: int, like: Array) -> Float[Array, "count n"]:

@@ -1,4 +1,4 @@
-"""Templates: what the sets that reachability computes look like, polytopes or ellipsoids."""
+"""Templates: what the sets that reachability computes look like: polytopes, ellipsoids, or both."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.checks import Numbers, is_concrete, whole_number
+from reachjax.checks import Numbers, is_concrete, require_kind, same_size, whole_number
 from reachjax.pytrees import Replaceable, converted, pytree
 from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polytope import Polytope
@@ -22,6 +22,11 @@ class AbstractTemplate(Replaceable, abc.ABC):
     @abc.abstractmethod
     def dimension(self) -> int | None:
         """The number of coordinates; None if it is that of the loop."""
+
+    @property
+    @abc.abstractmethod
+    def summary(self) -> str:
+        """A few words for what the sets look like."""
 
 
 @pytree
@@ -52,6 +57,11 @@ class Template(AbstractTemplate):
     def dimension(self) -> int:
         """The number of coordinates."""
         return self.directions.shape[1]
+
+    @property
+    def summary(self) -> str:
+        """The number of facets."""
+        return f"facets={len(self)}"
 
     def __len__(self) -> int:
         """The number of facets."""
@@ -99,7 +109,8 @@ class EllipsoidTemplate(AbstractTemplate):
         shape: `(n, n)`, symmetric and positive definite, up to a factor. Only the size is then
             sought, around the successor of the centre; the sets are larger, and their derivatives
             exact. None for the ellipsoid of minimum volume, whose derivative is that of a point
-            close to it (see `reachjax.solvers.enclosures`).
+            close to it (see `reachjax.solvers.enclosures`), and whose thinnest half-axis is at
+            least some 1e-8 of the others: around a flat set there is no least one.
 
     Raises:
         ValueError: `shape` is not square, symmetric and positive definite.
@@ -123,6 +134,56 @@ class EllipsoidTemplate(AbstractTemplate):
     def dimension(self) -> int | None:
         """The number of coordinates; None if any shape will do."""
         return None if self.shape is None else len(self.shape)
+
+    @property
+    def summary(self) -> str:
+        """What they are."""
+        return "ellipsoids"
+
+
+@pytree
+class MixedTemplate(AbstractTemplate):
+    """Polytopes cut by ellipsoids: both are sought at each step, and their intersection is kept.
+
+    A step solves the programs of both templates, each over the facts of both parts of the set
+    before, so that each part is the smaller for the other.
+
+    Args:
+        facets: the directions of the polytope.
+        ellipsoid: of minimum volume by default.
+
+    Raises:
+        TypeError: a part is of another kind.
+        ValueError: the dimensions differ.
+
+    Example:
+        >>> MixedTemplate(Template.box(2)).summary
+        'facets=4, ellipsoids'
+    """
+
+    facets: Template
+    ellipsoid: EllipsoidTemplate = EllipsoidTemplate()
+
+    def __post_init__(self):
+        facets = "a template such as Template.box(n)"
+        require_kind("MixedTemplate.facets", self.facets, Template, facets)
+        ellipsoid = "a template such as EllipsoidTemplate()"
+        require_kind("MixedTemplate.ellipsoid", self.ellipsoid, EllipsoidTemplate, ellipsoid)
+        same_size(
+            "MixedTemplate.facets has dimension",
+            "MixedTemplate.ellipsoid has dimension",
+            (self.dimension, self.ellipsoid.dimension or self.dimension),
+        )
+
+    @property
+    def dimension(self) -> int:
+        """The number of coordinates."""
+        return self.facets.dimension
+
+    @property
+    def summary(self) -> str:
+        """What both parts say."""
+        return f"{self.facets.summary}, {self.ellipsoid.summary}"
 
 
 def _signed(rows: np.ndarray) -> np.ndarray:

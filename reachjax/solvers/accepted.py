@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from reachjax.lmi import Program
+from reachjax.lmi import Program, form_rows
 from reachjax.recheck import interval_offsets, sound_level, sound_offsets
 from reachjax.rounding import gamma
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import Enclosure, Solution, SolverStatus
-from reachjax.solvers.compact import compact
-from reachjax.solvers.trimming import summed, trimmed
+from reachjax.solvers.compact import TINY, compact
+from reachjax.solvers.trimming import Trimmed, summed, trimmed
 
 ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
 
@@ -53,22 +53,25 @@ def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
 
     The optimal value is no smaller (weak duality), but for what they miss their constraints by.
     """
-    given, products = trimmed(program), program.products
-    columns, kept = np.flatnonzero(given.columns), given.kept
-    facts, free = given.facts[:, columns], products.free[kept]
-    left, right = facts[products.left], facts[products.right]
+    given = trimmed(program)
+    columns = np.flatnonzero(given.columns)
     values = np.full(len(given.centers), -np.inf)
     for i, whole in enumerate(np.asarray(solution.moments)):
         X = whole[np.ix_(columns, columns)]
         if not np.isfinite(X).all() or abs(X[-1, -1] - 1) > SHORTFALL:
             continue
-        pairs = products.sign * np.einsum("pi,pi->p", left @ X, right)
-        sums = summed(pairs, products.multiplier, len(kept))[kept] / given.sizes[kept]
-        missed = np.where(free, abs(sums), -sums)
-        if missed.max(initial=0.0) <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL:
-            attained = given.objective[i, columns] @ X[:, -1]
-            values[i] = given.centers[i] + given.units[i] * attained
+        if _missed(given, program, whole) <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL:
+            values[i] = given.centers[i] + given.units[i] * (given.objective[i, columns] @ X[:, -1])
     return values
+
+
+def _missed(given: Trimmed, program: Program, moments: np.ndarray) -> float:
+    """By how much moments miss the sign of a product that is kept, over its generator's size."""
+    products, kept = program.products, given.kept
+    pairs = (given.facts @ moments)[products.left] * given.facts[products.right]
+    sums = summed(products.sign * pairs.sum(axis=1), products.multiplier, len(kept))
+    values = sums[kept] / given.sizes[kept]
+    return float(np.where(products.free[kept], abs(values), -values).max(initial=0.0))
 
 
 def accepted_enclosure(
@@ -80,8 +83,9 @@ def accepted_enclosure(
     """The ellipsoid `|A x+ + b| <= level` to report, its level being what is proved.
 
     It counts as the relaxation's optimum if it is on the central path, or if the solver answers and
-    what is proved is as large as what it proposes; the level is then 1 at least. Where the solver
-    proposes nothing of use, the ellipsoid is `given`, or that around the box of successors.
+    what is proved is as large as what it proposes, or less where the moments of a given shape show
+    that the relaxation allows no less; the level is then 1 at least. Where the solver proposes
+    nothing of use, the ellipsoid is `given`, or that around the box of successors.
 
     Returns:
         The form, the level, and whether it is the relaxation's optimum.
@@ -90,22 +94,44 @@ def accepted_enclosure(
     form, level = enclosure.form, np.inf
     if _invertible(form):
         level = sound_level(program, multipliers, form)
-    borne_out = int(enclosure.status) in ANSWERS and 1 - SHORTFALL <= level <= 1 + SHORTFALL
-    optimal = borne_out or (centred and level <= 1 + SHORTFALL)
+    optimal = False
+    if level <= 1 + SHORTFALL:
+        answered = int(enclosure.status) in ANSWERS
+        dual = given is not None and _largest_factor(program, enclosure) <= 1 + SHORTFALL
+        optimal = centred or (answered and (level >= 1 - SHORTFALL or dual))
     if optimal:
         level = max(1.0, level)
     else:
         other = _interval_form(program) if given is None else given
-        proved = sound_level(program, multipliers, other)
-        if not _log_volume(form, level) <= _log_volume(other, proved):
+        least = TINY * float(np.linalg.norm(other.A, 2))
+        proved = max(sound_level(program, multipliers, other), least)
+        if not log_volume(form, level) <= log_volume(other, proved):
             form, level = other, proved
     return form, np.array(level), np.array(optimal)
 
 
-def _log_volume(form: NormalForm, level: float) -> float:
+def _largest_factor(program: Program, enclosure: Enclosure) -> float:
+    """What no factor on the proposed `A` and `b` exceeds; infinite if nothing is shown.
+
+    With `X` positive semidefinite and `<X, G_k>` of the right signs, `[e e' - G, f V'; f V, I]` is
+    semidefinite for no `f` beyond `(X_nn + trace X_22) / (-2 <X_21, V>)` (weak duality).
+    """
+    n, X = len(program.transform), np.asarray(enclosure.moments)
+    if not np.isfinite(X).all() or X[n - 1, n - 1] <= 0:
+        return np.inf
+    X = X / X[n - 1, n - 1]
+    missed = _missed(trimmed(program), program, X[:n, :n])
+    if max(missed, -np.linalg.eigvalsh((X + X.T) / 2)[0]) > SHORTFALL:
+        return np.inf
+    slope = -2 * np.sum(X[n:, :n] * form_rows(program, enclosure.form).mid)
+    return (1 + np.trace(X[n:, n:])) / slope if slope > 0 else np.inf
+
+
+def log_volume(form: NormalForm, level: float | np.ndarray) -> float:
+    """The logarithm of the volume of `|A x + b| <= level`, but for that of the unit ball."""
     if not np.isfinite(level):
         return np.inf
-    return len(form.b) * np.log(max(level, 1e-300)) - np.linalg.slogdet(form.A)[1]
+    return float(len(form.b) * np.log(max(level, 1e-300)) - np.linalg.slogdet(form.A)[1])
 
 
 def _interval_form(program: Program) -> NormalForm:
@@ -127,4 +153,4 @@ def _invertible(form: NormalForm) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
         rounding = gamma(len(b)) * (abs(A) @ abs(inverse @ inverse.T) @ abs(A).T).sum(axis=1)
         rounding += gamma(len(b)) * (abs(A) @ abs(inverse @ b))
-    return bool(np.all(rounding < 1e-6))
+    return bool(np.all(rounding < SHORTFALL))

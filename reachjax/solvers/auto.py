@@ -51,7 +51,7 @@ class Auto(AbstractSolver):
 
     def choice(self, program: Program) -> AbstractSolver:
         """What solves the facets of this program."""
-        return self.large if program.scale.shape[-1] > self.limit else self.small
+        return self.large if len(program.transform) > self.limit else self.small
 
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet."""

@@ -13,8 +13,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
 from reachjax.sets import NormalForm
-from reachjax.solvers.compact import CompactProgram
-from reachjax.solvers.models import FLAT
+from reachjax.solvers.compact import THINNEST, CompactProgram
 
 STEPS = 60
 """Newton steps after which the centre counts as not found."""
@@ -126,7 +125,7 @@ class Barrier:
         """Each matrix under a logarithm of a determinant: its weight, itself, its variables."""
         R = self.form(y).A
         yield 1.0, R, (self.R, self.symmetric)
-        yield weight, np.eye(self.q) / FLAT - R, (self.R, -self.symmetric)
+        yield weight, np.eye(self.q) / THINNEST - R, (self.R, -self.symmetric)
         yield weight, self.schur(y), (slice(None), self.terms)
 
     def value(self, y: np.ndarray, weight: float) -> float:
@@ -159,18 +158,22 @@ class Barrier:
     def minimiser(self, y: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Newton's method from a point inside: the minimiser and the Hessian there."""
         value = self.value(y, weight)
-        for _ in range(STEPS):
+        for _ in range(STEPS if np.isfinite(value) else 0):
             gradient, hessian = self.derivatives(y, weight)
             step = -solved(hessian, gradient)
             decrement = -float(gradient @ step)
             if decrement <= CENTRED * weight:
-                return y, hessian
+                better = y + step  # by the square of the decrement; the Hessian is to match
+                y = better if np.isfinite(self.value(better, weight)) else y
+                return y, self.derivatives(y, weight)[1]
             if not np.isfinite(decrement):
                 return None
-            length, wanted = 1.0, decrement / 4
-            if decrement <= QUADRATIC * weight:
-                wanted = -np.inf  # too close for differences of values to be seen
-            while not (after := self.value(y + length * step, weight)) <= value - length * wanted:
+            length, near = 1.0, decrement <= QUADRATIC * weight
+            # near the centre, differences of values are not seen: any point inside will do
+            while not (
+                (after := self.value(y + length * step, weight)) <= value - length * decrement / 4
+                or (near and np.isfinite(after))
+            ):
                 length /= 2
                 if length < 1e-10:
                     return None

@@ -42,8 +42,8 @@ _ADVICE = {
     "ask for a looser tolerance or try another solver",
     SolverStatus.INFEASIBLE: "reported infeasible, which a bounded set rules out: the data are "
     "badly scaled for this solver; the interval bound was used",
-    SolverStatus.UNBOUNDED: "reported unbounded, which a non-empty set rules out: check that the "
-    "set is not empty; the interval bound was used",
+    SolverStatus.UNBOUNDED: "reported unbounded: the set of states is empty, or a shape was given "
+    "and all successors are one point; the interval bound was used",
     SolverStatus.LIMIT: "stopped at the limit of iterations or time: the bound is sound, perhaps "
     "loose; raise the limit",
     SolverStatus.FAILED: "broke down without an answer: the interval bound was used; "

@@ -13,15 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from reachjax.lmi import Program
+from reachjax.lmi import Program, with_successor
 from reachjax.sets import NormalForm
 from reachjax.solvers.barrier import Barrier, solved
 from reachjax.solvers.compact import compact
 from reachjax.solvers.host import all_finite
 
-WEIGHTS = (1e-6, 1e-7, 1e-8, 1e-9)
+WEIGHTS = (1e-6, 1e-7, 1e-8)
 """Barrier weights `mu`, followed downwards. At the last one the logarithm of the volume is off by
-that times the number of multipliers, at most."""
+that times the number of multipliers, at most. Derivatives lose digits below it, as the matrices
+become singular: ten times smaller, one of a thin ellipsoid was off by 7e-4, not by 1e-5."""
 
 FROM_AFAR = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
 """Weights to begin with where a solver stalled far from the path."""
@@ -73,7 +74,8 @@ def centred(
     None where the path is not reached, or the program is so large that it would take long.
     """
     reduced = compact(program)
-    if len(reduced.kept) * (len(reduced.columns) + len(form.b)) ** 2 > LARGEST:
+    size = len(reduced.kept) * (len(reduced.columns) + len(form.b)) ** 2
+    if size > LARGEST or not all_finite((multipliers, form)):
         return None
     barrier = Barrier(reduced)
     found = _centre(barrier, multipliers, form)
@@ -81,7 +83,11 @@ def centred(
 
 
 def sensitivity(
-    program: Program, multipliers: np.ndarray, form: NormalForm, cotangent: NormalForm
+    program: Program,
+    multipliers: np.ndarray,
+    form: NormalForm,
+    cotangent: NormalForm,
+    frame: NormalForm,
 ) -> Sensitivity:
     """The derivative of `<cotangent, (A, b)>`, NaN where the centre is not found.
 
@@ -90,23 +96,29 @@ def sensitivity(
         multipliers: `(K,)`, of the solution.
         form: the solution.
         cotangent: weights of `A` and `b`.
+        frame: of the successor, in which the solution was centred.
     """
-    barrier = Barrier(compact(program))
-    found = _centre(barrier, multipliers, form) if all_finite(cotangent) else None
+    barrier = Barrier(compact(with_successor(program, frame)))
+    found = None
+    if all_finite((multipliers, form, cotangent)):
+        found = _centre(barrier, multipliers, form.of(frame.inverse))
     if found is None:
         return Sensitivity.unknown(program)
     y, hessian = found
     weight = WEIGHTS[-1]
-    w = solved(hessian, barrier.vector(cotangent))
+    # the transpose of `.of(frame)`
+    framed = NormalForm(cotangent.A @ frame.A.T + np.outer(cotangent.b, frame.b), cotangent.b)
+    w = solved(hessian, barrier.vector(framed))
     inverse = np.linalg.inv(barrier.schur(y))
     moving = np.tensordot(w, barrier.terms, 1)
-    size, q = len(program.scale), len(form.b)
+    size, q = len(program.transform), len(form.b)
     used = np.ix_(*2 * [np.r_[barrier.program.columns, size + np.arange(q)]])
     halves = []
     for vector, moments in ((y, -weight * inverse @ moving @ inverse), (w, -weight * inverse)):
         whole = np.zeros((size + q, size + q))
         whole[used] = moments
-        halves += [*barrier.unscaled(vector, len(multipliers)), whole]
+        weights, part = barrier.unscaled(vector, len(multipliers))
+        halves += [weights, part.of(frame), whole]
     return Sensitivity(*halves)
 
 
@@ -114,8 +126,6 @@ def _centre(
     barrier: Barrier, multipliers: np.ndarray, form: NormalForm
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The minimiser at the last weight, from a point near it or not, and the Hessian there."""
-    if not all_finite((multipliers, form)):
-        return None
     near = barrier.near(multipliers, form, WEIGHTS[0])
     found = None if near is None else barrier.follow(near, WEIGHTS)
     return found or barrier.follow(barrier.inside(), FROM_AFAR + WEIGHTS)

@@ -14,6 +14,13 @@ from reachjax.lmi import Program
 from reachjax.sets import NormalForm
 from reachjax.solvers.trimming import trimmed
 
+THINNEST = 1e-4
+"""In the coordinates in which it is sought, an ellipsoid has no half-axis below this part of the
+interval radius: that keeps ellipsoids of least volume around flat sets from degenerating."""
+
+TINY = 1e-100
+"""The least width of anything that is enclosed, in the units of the state."""
+
 CHUNK = 256
 """Pairs whose dense outer products are held in memory at once."""
 
@@ -44,12 +51,21 @@ class CompactProgram(NamedTuple):
 
     @property
     def widths(self) -> np.ndarray:
-        """The units, none of them at rounding level."""
-        return np.maximum(self.units, 1e-9 * (abs(self.centers) + self.units.max()) + 1e-300)
+        """The units, none of them at rounding level, nor so small that squares underflow."""
+        return np.maximum(self.units, 1e-9 * (abs(self.centers) + self.units.max()) + TINY)
 
     def with_units(self, units: np.ndarray) -> CompactProgram:
         """The same program with other units of the objective."""
         return self._replace(objective=self.objective * (self.units / units)[:, None], units=units)
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the objective hardly varies in some coordinate."""
+        return bool(np.any(self.units < self.widths))
+
+    def is_thinnest(self, form: NormalForm) -> bool:
+        """Whether an ellipsoid is about as thin as it may be in these coordinates."""
+        return bool(np.linalg.norm(form.A * self.widths, 2) > 0.5 / THINNEST)
 
     def to_unit_box(self, form: NormalForm) -> NormalForm:
         """`|A x + b| <= 1` over the coordinates in which the objective rows are stated."""

@@ -105,7 +105,7 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
         proposal.multipliers[reduced.kept] = multipliers / reduced.norms
         moments = np.asarray(model.lmi.dual_value, dtype=float)
         if moments.ndim == 2:
-            size, extra = len(program.scale), len(found.b)
+            size, extra = len(program.transform), len(found.b)
             used = np.r_[reduced.columns, size + np.arange(extra)]
             proposal.moments[:] = 0.0
             proposal.moments[np.ix_(used, used)] = moments

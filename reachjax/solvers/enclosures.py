@@ -18,15 +18,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
-from reachjax.lmi import Program, form_rows, schur_lagrangian
+from reachjax.lmi import Program, form_rows, schur_lagrangian, with_successor
 from reachjax.sets import Ellipsoid, NormalForm
-from reachjax.solvers.accepted import ANSWERS, accepted_enclosure
+from reachjax.solvers.accepted import ANSWERS, accepted_enclosure, log_volume
 from reachjax.solvers.base import AbstractSolver, Enclosure, SolverStatus
 from reachjax.solvers.centring import Sensitivity, centred, sensitivity
+from reachjax.solvers.compact import compact
 from reachjax.solvers.differentiable import asked_for
 from reachjax.solvers.host import all_finite, on_host, shapes_of
+
+ATTEMPTS = 3
+"""How often a program is solved, each time in better coordinates."""
 
 
 def proved_ellipsoid(program: Program, solver: AbstractSolver) -> tuple[Ellipsoid, Enclosure]:
@@ -40,7 +44,7 @@ def proved_ellipsoid(program: Program, solver: AbstractSolver) -> tuple[Ellipsoi
         The ellipsoid, and what the solver proposed (which has no derivative).
     """
     result: Any = _ellipsoid(solver, program.facts.mid, program.objective.mid, program)
-    form, level, _, enclosure = result
+    form, level, _, enclosure, _ = result
     return _reported(form, level, enclosure)
 
 
@@ -51,49 +55,88 @@ def _reported(form: NormalForm, level: Array, enclosure: Enclosure) -> tuple[Ell
     return Ellipsoid.enclosing(form, level), proof
 
 
-def _solve(
-    solver: AbstractSolver, argument: tuple[Program, NormalForm | None]
-) -> tuple[NormalForm, np.ndarray, np.ndarray, Enclosure]:
+def _enclose(
+    solver: AbstractSolver, program: Program
+) -> tuple[NormalForm, np.ndarray, np.ndarray, Enclosure, NormalForm]:
+    """The ellipsoid, its level, whether it is optimal, the proposal, and its coordinates.
+
+    While the solver stalls, or the ellipsoid is as thin as it may be in these coordinates, the next
+    attempt is in those in which the ellipsoid proved so far is the unit ball.
+    """
+    q = len(program.objective.mid)
+    frame, attempts = NormalForm(np.eye(q), np.zeros(q)), []
+    if not all_finite(program):
+        blank = Enclosure.blank(program)
+        return blank.form, np.array(np.nan), np.array(False), blank, frame
+    for attempt in range(ATTEMPTS):
+        framed = with_successor(program, frame) if attempt else program
+        reduced = compact(framed)
+        if attempt and reduced.is_flat:
+            break
+        proposed, on_path = _proposed(solver, framed)
+        enclosure = proposed._replace(form=proposed.form.of(frame))
+        form, level, optimal = accepted_enclosure(program, enclosure, centred=on_path)
+        optimal &= enclosure.status == SolverStatus.SOLVED
+        attempts.append((form, level, optimal, enclosure, frame))
+        if optimal and not reduced.is_thinnest(proposed.form):
+            return attempts[-1]
+        frame = NormalForm(form.A / level, form.b / level)  # finite: accepted forms are invertible
+    return min(attempts, key=lambda attempt: log_volume(*attempt[:2]))
+
+
+def _proposed(solver: AbstractSolver, program: Program) -> tuple[Enclosure, bool]:
+    """The solver's ellipsoid, moved to the central path, and whether that was reached."""
+    enclosure = solver.enclose(program)
+    if int(enclosure.status) not in ANSWERS:
+        return enclosure, False
+    found = centred(program, np.asarray(enclosure.multipliers), enclosure.form)
+    if found is None:
+        return enclosure, False
+    solved = np.array(int(SolverStatus.SOLVED))
+    return enclosure._replace(multipliers=found[0], form=found[1], status=solved), True
+
+
+def _fit(
+    solver: AbstractSolver, argument: tuple[Program, NormalForm]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Enclosure]:
+    """The factor on a given form, the level, whether they are optimal, and the proposal."""
     program, given = argument
     if not all_finite(argument):
-        blank = Enclosure.blank(program)
-        return blank.form, np.array(np.nan), np.array(False), blank
+        unknown = np.array(np.nan)
+        return unknown, unknown, np.array(False), Enclosure.blank(program)
     enclosure = solver.enclose(program, given)
-    found = None
-    if given is None and int(enclosure.status) in ANSWERS:
-        found = centred(program, np.asarray(enclosure.multipliers), enclosure.form)
-    if found is not None:
-        solved = np.array(int(SolverStatus.SOLVED))
-        enclosure = enclosure._replace(multipliers=found[0], form=found[1], status=solved)
-    return *accepted_enclosure(program, enclosure, given, found is not None), enclosure
+    factor = np.sum(enclosure.form.A * given.A) / np.sum(given.A**2)
+    proposed = NormalForm(factor * given.A, factor * given.b)
+    enclosure = enclosure._replace(form=proposed)
+    form, level, optimal = accepted_enclosure(program, enclosure, given)
+    optimal &= enclosure.status == SolverStatus.SOLVED
+    return np.where(form is proposed, factor, 1.0), level, optimal, enclosure
 
 
-def _shapes(program: Program) -> tuple[NormalForm, Any, Any, Enclosure]:
-    blank = shapes_of(Enclosure.blank(program))
+def _shapes(program: Program) -> tuple[Any, Any, Enclosure]:
+    """Of a level, whether it is optimal, and the proposal."""
     number, truth = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), bool)
-    return blank.form, number, truth, blank
-
-
-def _trusted(optimal: Array, enclosure: Enclosure) -> Bool[Array, ""]:
-    return optimal & (enclosure.status == SolverStatus.SOLVED)
+    return number, truth, shapes_of(Enclosure.blank(program))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _ellipsoid(solver, facts, objective, program):
-    return on_host(partial(_solve, solver), _shapes(program), (program, None))
+    shapes = _shapes(program)
+    form = shapes[-1].form
+    return on_host(partial(_enclose, solver), (form, *shapes, form), program)
 
 
 def _ellipsoid_forward(solver, facts, objective, program):
     result: Any = _ellipsoid(solver, facts, objective, program)
-    form, _, optimal, enclosure = result
-    return result, (program, form, _trusted(optimal, enclosure), enclosure.multipliers)
+    form, _, optimal, enclosure, frame = result
+    return result, (program, form, optimal, enclosure.multipliers, frame)
 
 
 def _ellipsoid_backward(solver, residual, cotangents):
-    program, form, trusted, multipliers = residual
-    trusted = trusted & ~asked_for(cotangents[3])
+    program, form, optimal, multipliers, frame = residual
+    trusted = optimal & ~asked_for(cotangents[3])
     shapes = shapes_of(Sensitivity.unknown(program))
-    arguments = (program, multipliers, form, cotangents[0])
+    arguments = (program, multipliers, form, cotangents[0], frame)
     held: Any = on_host(lambda given: sensitivity(*given), shapes, arguments)
 
     def value(facts, objective):
@@ -131,21 +174,20 @@ def proved_size(
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _size(solver, facts, objective, given, program):
-    found: Any = on_host(partial(_solve, solver), _shapes(program), (program, given))
-    form, *rest = found
-    return jnp.sum(form.A * given.A) / jnp.sum(given.A**2), *rest
+    shapes = _shapes(program)
+    return on_host(partial(_fit, solver), (shapes[0], *shapes), (program, given))
 
 
 def _size_forward(solver, facts, objective, given, program):
     result: Any = _size(solver, facts, objective, given, program)
     factor, _, optimal, enclosure = result
-    return result, (program, given, factor, _trusted(optimal, enclosure), enclosure)
+    return result, (program, given, factor, optimal, enclosure)
 
 
 def _size_backward(solver, residual, cotangents):
-    program, given, factor, trusted, enclosure = residual
-    trusted = trusted & ~asked_for(cotangents[3])
-    n = program.scale.shape[0]
+    program, given, factor, optimal, enclosure = residual
+    trusted = optimal & ~asked_for(cotangents[3])
+    n = len(program.transform)
     moments = enclosure.moments
     # stationarity in the factor gives the dual its scale, whatever the solver's objective was
     unit = -2 * jnp.sum(moments[n:, :n] * form_rows(program, given).mid)

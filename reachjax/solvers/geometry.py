@@ -23,7 +23,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.checks import is_concrete, require_double_precision
-from reachjax.sets import AbstractSet, Box, PolyhedralSet, Polytope, hulls, polyhedra
+from reachjax.sets import (
+    AbstractSet,
+    Box,
+    Intersection,
+    PolyhedralSet,
+    Polytope,
+    hulls,
+    polyhedra,
+)
 from reachjax.solvers.host import all_finite, on_host
 
 Slopes = tuple[np.ndarray, ...]
@@ -32,7 +40,9 @@ Values = Callable[..., tuple[np.ndarray, Slopes]]
 
 
 def bounding_box(X: AbstractSet) -> Box:
-    """The smallest box around a set; differentiable, also inside `jax.jit`."""
+    """The set's bounding box; differentiable, also inside `jax.jit`."""
+    if isinstance(X, Intersection):
+        return X.boxed(bounding_box(X.polytope))
     if not isinstance(X, Polytope):
         return X.bounding_box()
     ends = _values(_box, 2 * X.dimension, X.A, X.b)
@@ -40,7 +50,9 @@ def bounding_box(X: AbstractSet) -> Box:
 
 
 def support(X: AbstractSet, directions: Float[Array, "m n"]) -> Float[Array, " m"]:
-    """The largest value of each direction on a set, rounded up; differentiable, also in `jit`."""
+    """The set's support function, rounded up; differentiable, also inside `jax.jit`."""
+    if isinstance(X, Intersection):
+        return jnp.minimum(*(support(part, directions) for part in X.parts))
     if not isinstance(X, Polytope):
         return X.support(directions)
     return _values(_support, len(directions), X.A, X.b, directions)
@@ -50,8 +62,11 @@ def separation(X: AbstractSet, Y: PolyhedralSet) -> Float[Array, ""]:
     """How far the facets of `Y` may move outward before it meets `X`; negative if they overlap.
 
     A lower bound, rounding included; differentiable, also inside `jax.jit`. `X` is bounded. If it
-    is round, the bound is the best that one facet of `Y` gives, or the bounding box of `X`.
+    is round, the bound is the best that one facet of `Y` gives, or the bounding box of `X`; of an
+    intersection, the better one of its two parts'.
     """
+    if isinstance(X, Intersection):
+        return jnp.maximum(*(separation(part, Y) for part in X.parts))
     if not isinstance(X, PolyhedralSet):
         C, d = Y.facets
         facet = jnp.max((-X.support(-C) - d) / jnp.linalg.norm(C, axis=1))

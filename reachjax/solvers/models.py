@@ -10,11 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from reachjax.sets import NormalForm
-from reachjax.solvers.compact import CompactProgram
-
-FLAT = 1e-4
-"""An ellipsoid has no half-axis below this part of the successors' interval radius (which keeps
-minimum-volume ellipsoids of flat sets from degenerating; the sets grow by no more)."""
+from reachjax.solvers.compact import THINNEST, CompactProgram
 
 
 class Multipliers:
@@ -87,7 +83,7 @@ class EllipsoidModel:
         if given is None:
             self.R, self.r = cp.Variable((q, q), PSD=True), cp.Variable((q, 1))
             size = cp.log_det(self.R)
-            constraints.append(self.R << np.eye(q) / FLAT)
+            constraints.append(self.R << np.eye(q) / THINNEST)
         else:
             size = cp.Variable(nonneg=True)
             unit = np.linalg.norm(given.A)

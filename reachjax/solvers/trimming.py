@@ -22,6 +22,9 @@ from reachjax.rounding import Ball
 NOISE = 16.0
 """Coefficients no larger than this many times the rounding error of their row count as zero."""
 
+TOUCHING = 1e-6
+"""A fact negative on an ellipsoid by no more than this part of its size counts as implied by it."""
+
 
 class Trimmed(NamedTuple):
     """A program's numbers, zero where they say nothing.
@@ -102,15 +105,38 @@ def implied_by_cone(products: Products, facts: Any) -> Bool[Any, " K"]:
     A quadratic function of the state that is not negative on the ellipsoid is a positive multiple
     of its fact and a positive semidefinite term (the S-lemma loses nothing for one constraint).
     Products of neurons that are affine on the set are of this kind; kept, hundreds of them made a
-    solver stall at its second digit.
+    solver stall at its second digit. So are those of facets that do not cut the ellipsoid.
     """
     xp = namespace(facts)
     cone, count = products.sign < 0, len(products.free)
-    state = (cone[:, None] & (facts[products.left] != 0)).any(axis=0)
-    state = state | (xp.arange(facts.shape[1]) == facts.shape[1] - 1)
+    if xp is np and not cone.any():
+        return np.zeros(count, dtype=bool)
+    own = summed(1.0 * cone, products.multiplier, count) > 0
+    holds = _least_on_ellipsoid(products, facts, own) >= 0
     present = (facts != 0).any(axis=1)
-    outside = ((facts != 0) & ~state).any(axis=1)
     left, right = products.left, products.right
-    beyond = (outside[left] & present[right]) | (outside[right] & present[left])
-    says_more = summed((beyond | cone) * 1.0, products.multiplier, count) > 0
-    return cone.any() & ~says_more
+    beyond = ~(holds[left] & holds[right]) & present[left] & present[right]
+    says_more = summed(1.0 * beyond, products.multiplier, count) > 0
+    return cone.any() & ~says_more & ~own
+
+
+def _least_on_ellipsoid(products: Products, facts: Any, own: Any) -> Float[Any, " m"]:
+    """A lower bound `(m,)` of each fact on the ellipsoid; `-inf` if it is not one of the state.
+
+    Args:
+        products: whose negative pairs are those of the rows `R` with `|R x| <= s`.
+        facts: `(m, n)`.
+        own: `(K,)`, the multiplier of the ellipsoid's own fact.
+    """
+    xp = namespace(facts)
+    cone, (left, right) = products.sign < 0, (facts[products.left], facts[products.right])
+    of_level = own[products.multiplier] & ~cone
+    level = xp.where(of_level, left[:, -1] * right[:, -1], 0.0).sum() ** 0.5
+    R, linear = xp.where(cone[:, None], left, 0.0), facts[:, :-1]
+    inverse = xp.linalg.pinv(R[:, :-1].T @ R[:, :-1], hermitian=True)
+    middle = facts[:, -1] - linear @ (inverse @ (R[:, :-1].T @ R[:, -1]))
+    squares = ((linear @ inverse) * linear).sum(axis=1)
+    reach = level * xp.where(squares > 0, squares, 0.0) ** 0.5
+    elsewhere = ((linear != 0) & ~(R[:, :-1] != 0).any(axis=0)).any(axis=1)
+    least = middle - reach + TOUCHING * (abs(middle) + reach)
+    return xp.where(elsewhere, -xp.inf, least)

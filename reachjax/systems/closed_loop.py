@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from reachjax.checks import Numbers, described, same_size, whole_number
+from reachjax.checks import Numbers, require_kind, same_size, whole_number
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.sets import Box
 from reachjax.systems.activations import ReLU, evaluate
@@ -51,11 +51,8 @@ class ClosedLoop(Replaceable):
     def __post_init__(self):
         for name, kind in (("plant", AffinePlant), ("controller", MLP), ("input_box", Box)):
             value = getattr(self, name)
-            if not isinstance(value, kind) and not (name == "input_box" and value is None):
-                raise TypeError(
-                    f"ClosedLoop.{name} must be of type {kind.__name__}, "
-                    f"but {described(value)} arrived"
-                )
+            if name != "input_box" or value is not None:
+                require_kind(f"ClosedLoop.{name}", value, kind, f"of type {kind.__name__}")
         plant, net = self.plant, self.controller
         same_size(
             "the plant's number of states is",

@@ -7,14 +7,13 @@ degree four.
 
 from __future__ import annotations
 
-import math
-import numbers
 from typing import Any
 
 import jax.numpy as jnp
 from jax.scipy.linalg import expm
 from jaxtyping import Array, ArrayLike, Float
 
+from reachjax.checks import is_concrete, real_number
 from reachjax.systems.plants import AffinePlant
 
 RUNGE_KUTTA_DEGREE = 4
@@ -27,7 +26,7 @@ def zero_order_hold(
     *,
     period: float,
 ) -> AffinePlant:
-    """The sampled plant, exactly (the matrix exponential); differentiable.
+    """The sampled plant, exactly (the matrix exponential); differentiable in A, B and c.
 
     Args:
         A: `(n_x, n_x)`, per unit of time.
@@ -36,7 +35,9 @@ def zero_order_hold(
         period: the sampling period, in units of time.
 
     Raises:
-        ValueError: shapes disagree, an entry is not finite, or the period is not positive.
+        TypeError: an argument is not numeric.
+        ValueError: shapes disagree, an entry is not finite, the period is not above 0, or the
+            sampled plant overflows.
 
     Example:
         >>> plant = zero_order_hold([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], period=0.5)
@@ -54,7 +55,7 @@ def runge_kutta(
     *,
     period: float,
 ) -> AffinePlant:
-    """The plant sampled by one step of the classical Runge-Kutta method; differentiable.
+    """The plant sampled by one classical Runge-Kutta step; differentiable in A, B and c.
 
     Args:
         A: `(n_x, n_x)`, per unit of time.
@@ -63,7 +64,9 @@ def runge_kutta(
         period: the sampling period, in units of time.
 
     Raises:
-        ValueError: shapes disagree, an entry is not finite, or the period is not positive.
+        TypeError: an argument is not numeric.
+        ValueError: shapes disagree, an entry is not finite, the period is not above 0, or the
+            sampled plant overflows.
 
     Example:
         >>> plant = runge_kutta([[-1.0]], [[1.0]], period=1.0)
@@ -84,8 +87,8 @@ def _continuous(A: Any, B: Any, c: Any, period: float) -> AffinePlant:
     plant = AffinePlant(A, B, c)
     if plant.steps is not None:
         raise ValueError("A, B and c must be constant to be sampled, but a time axis arrived")
-    if not isinstance(period, numbers.Real) or not (math.isfinite(period) and period > 0):
-        raise ValueError(f"period must be a number above 0, but {period!r} arrived")
+    if real_number("period", period, 0.0) == 0:
+        raise ValueError("period must be above 0, but 0 arrived")
     return plant
 
 
@@ -97,4 +100,6 @@ def _generator(plant: AffinePlant) -> Float[Array, "k k"]:
 
 def _sampled(plant: AffinePlant, transition: Float[Array, "k k"]) -> AffinePlant:
     n, m = plant.states, plant.inputs
+    if is_concrete(transition) and not jnp.isfinite(transition).all():
+        raise ValueError("the sampled plant overflows: A times the period is too large")
     return AffinePlant(transition[:n, :n], transition[:n, n : n + m], transition[:n, -1])

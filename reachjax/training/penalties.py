@@ -37,7 +37,7 @@ def volume_penalty(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number of steps.
-        template: what every set looks like: facet directions, or ellipsoids.
+        template: what every set looks like: facet directions, ellipsoids, or both.
         measure: the size of one set. Logarithms weigh all steps alike, and are -inf for a flat set;
             `volume` is in the units of the states and weighs large sets most.
         options: keyword arguments of `reach`, such as `relaxation` and `solver`.
@@ -87,7 +87,7 @@ def specification_penalty(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number of steps.
-        template: what every set looks like: facet directions, or ellipsoids.
+        template: what every set looks like: facet directions, ellipsoids, or both.
         goal: where every state must be at the horizon.
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
             time to a sequence.

@@ -9,9 +9,13 @@ from functools import partial
 from itertools import pairwise
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
+from scipy.linalg import solve_discrete_are
+from scipy.optimize import minimize
 
 import reachjax as rj
 from experiments import (
@@ -190,6 +194,44 @@ def test_no_simulated_state_is_outside_its_ellipsoid_and_none_is_much_too_large(
     assert analysis.verdict.status is rj.VerdictStatus.PROVED
 
 
+@pytest.fixture(scope="module")
+def stranger():
+    """A loop whose network learned a saturated linear-quadratic regulator by quasi-Newton steps."""
+    dynamics = plant()
+    A, B = np.asarray(dynamics.A), np.asarray(dynamics.B)
+    P = solve_discrete_are(A, B, np.eye(6), 100 * np.eye(3))
+    K = np.linalg.solve(100 * np.eye(3) + B.T @ P @ B, B.T @ P @ A)
+    hover = np.array([0.0, 0.0, G])
+    rng = np.random.default_rng(3)
+    states = rng.uniform(-1, 1, (2000, 6)) * [5, 5, 3, 2, 2, 2]
+    inputs = jnp.asarray(np.clip(hover - states @ K.T, *INPUT_LIMITS))
+    sizes = (6, 12, 12, 3)
+    start = [(rng.normal(size=(o, i)) * np.sqrt(2 / i), np.zeros(o)) for i, o in pairwise(sizes)]
+    flat, layers_of = ravel_pytree(start)
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(weights):
+        outputs = jax.vmap(rj.MLP.from_layers(layers_of(weights)))(states)
+        return jnp.mean((outputs - inputs) ** 2) + 1e-4 * jnp.mean(weights**2)
+
+    found = minimize(loss, np.asarray(flat), jac=True, method="L-BFGS-B", options={"maxiter": 300})
+    net = rj.MLP.from_layers(layers_of(jnp.asarray(found.x)))
+    return rj.ClosedLoop(dynamics, net, rj.Box(*INPUT_LIMITS))
+
+
+@pytest.mark.slow
+def test_no_state_of_a_network_trained_elsewhere_is_outside_its_ellipsoid(stranger):
+    tube = rj.reach(stranger, initial_set(), STEPS, rj.EllipsoidTemplate())
+    states = quadrotor_simulation.simulate(
+        stranger, initial_set(), STEPS, 100_000, seed=5, progress=False
+    )
+    for t, region in enumerate(tube.sets):
+        largest = np.asarray(region.bounded_values(states[:, t])).max()
+        assert largest <= (1 + 1e-12 if t == 0 else 1), t
+    assert np.ptp(np.asarray(jax.vmap(stranger.input)(states[:, 0])), axis=0).max() > 0.01
+
+
 @pytest.mark.slow
 def test_volumes_are_those_of_an_independent_program(learned, analysis):
     layers = [
@@ -327,7 +369,7 @@ def test_the_loop_is_made_from_the_settings(tmp_path, learned):
         ({"training_steps": 0}, "--training-steps must be at least 1, got 0"),
         ({"simulations": 0}, "--simulations must be at least 1, got 0"),
         ({"hidden": (32, 0)}, "--hidden must be numbers of neurons"),
-        ({"penalty": -1.0}, "--penalty must be at least 0"),
+        ({"penalty": -1.0}, "--penalty must be finite and at least 0"),
         ({"seed": -1}, "--seed must be at least 0"),
     ],
 )

@@ -145,6 +145,40 @@ def test_bad_ellipsoids_are_named(arguments, message):
         rj.Ellipsoid(*arguments)
 
 
-def test_a_projection_on_a_coordinate_that_is_not_there_is_named():
-    with pytest.raises(ValueError, match=r"coordinates must be among 0 \.\. 1, but \(0, 2\)"):
-        ellipsoid(2).projection(0, 2)
+@pytest.mark.parametrize(
+    ("act", "error", "message"),
+    [
+        (lambda E: E.projection(0, 2), ValueError, r"distinct and among 0 \.\. 1, but \(0, 2\)"),
+        (lambda E: E.projection(1, 1), ValueError, r"distinct and among 0 \.\. 1, but \(1, 1\)"),
+        (lambda E: E.projection((0, 1)), TypeError, "a coordinate must be a whole number"),
+        (lambda E: E.sample(jax.random.key(0), -1), ValueError, "count must be at least 1"),
+        (lambda E: E.sample_boundary(jax.random.key(0), 1.5), TypeError, "count must be a whole"),
+        (
+            lambda E: E.surely_contains([[0.0, 0.0]]),
+            ValueError,
+            r"point must be one of shape \(n,\)",
+        ),
+        (lambda E: E.enclosing(E.normal_form, 0.0), ValueError, "level must be above 0"),
+        (
+            lambda E: E.enclosing(E.normal_form, -1.0),
+            ValueError,
+            "level must be above 0, but -1",
+        ),
+        (
+            lambda E: E.enclosing(E.normal_form._replace(A=np.ones((2, 2)))),
+            ValueError,
+            "form.A must be invertible",
+        ),
+        (lambda E: E.replace(shape=1j * E.shape), TypeError, "its entries are complex"),
+    ],
+)
+def test_mistakes_with_an_ellipsoid_are_named(act, error, message):
+    with pytest.raises(error, match=message):
+        act(ellipsoid(2))
+
+
+def test_a_shape_that_is_not_quite_symmetric_in_its_own_units_is_refused():
+    with pytest.raises(ValueError, match="must be symmetric"):
+        rj.Ellipsoid([0.0, 0.0], [[1.0, 0.0], [0.9e-12, 1e-24]])
+    rounded = rj.Ellipsoid([0.0, 0.0], [[1.0, 0.1 + 1e-17], [0.1, 1.0]])
+    np.testing.assert_array_equal(rounded.shape, rounded.shape.T)

@@ -161,7 +161,7 @@ def test_rows_at_rounding_level_and_empty_columns_do_not_reach_the_solver(settin
     }
     assert alone
     assert alone <= gone
-    np.testing.assert_array_equal(reduced.columns, np.flatnonzero(program.scale > 0))
+    np.testing.assert_array_equal(reduced.columns, np.flatnonzero(program.used))
     sizes = np.sqrt(reduced.generators.multiply(reduced.generators).sum(axis=0))
     np.testing.assert_allclose(sizes, 1.0)
 

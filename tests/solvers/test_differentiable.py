@@ -98,7 +98,7 @@ def five_steps(request):
     """(compiled value, arguments, their gradient); neurons leave and enter the basis on the way."""
     args = planar(*request.param)
     tube = rj.reach(*args, 5, TEMPLATE, samples=1)
-    kept = {tuple((np.asarray(tube.proof(t).program.scale) > 0).tolist()) for t in range(1, 6)}
+    kept = {tuple(np.asarray(tube.proof(t).program.used).tolist()) for t in range(1, 6)}
     assert len(kept) > 1
     assert all(s is rj.SolverStatus.SOLVED for t in range(1, 6) for s in tube.proof(t).statuses)
     f = jax.jit(partial(value, horizon=5))
@@ -206,7 +206,7 @@ def test_a_training_loop_compiles_once_while_neurons_become_stable():
         program = step_program(
             loop.replace(controller=net), X0, X0, TEMPLATE.directions, 0, rj.LocalBounds()
         )
-        stable.add(tuple((np.asarray(program.scale) == 0).tolist()))
+        stable.add(tuple((~np.asarray(program.used)).tolist()))
     assert len(stable) > 1
     assert len(compiled) == 1
 

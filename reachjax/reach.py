@@ -23,7 +23,7 @@ from reachjax.checks import (
 from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, LocalBounds
 from reachjax.sets import AbstractSet, AbstractTemplate
-from reachjax.solvers import AbstractSolver, Clarabel
+from reachjax.solvers import AbstractSolver, Auto
 from reachjax.successors import Step
 from reachjax.systems import ClosedLoop
 from reachjax.witnesses import initial_states, proposed_states, witnesses
@@ -38,7 +38,7 @@ EXAMPLES = {
     AbstractSet: "a set such as Box(lower, upper) or Polytope(A, b)",
     AbstractTemplate: "a template, such as Template.box(n) or EllipsoidTemplate()",
     AbstractRelaxation: "a relaxation object, such as LocalBounds()",
-    AbstractSolver: "a solver object, such as Clarabel()",
+    AbstractSolver: "a solver object, such as Auto()",
 }
 
 
@@ -93,7 +93,7 @@ def reach_step(
     *,
     t: int = 0,
     relaxation: AbstractRelaxation = LocalBounds(),  # noqa: B008  (immutable)
-    solver: AbstractSolver = Clarabel(),  # noqa: B008
+    solver: AbstractSolver = Auto(),  # noqa: B008
     samples: int = SAMPLES,
     seed: int = 0,
 ) -> tuple[AbstractSet, AbstractCertificate]:
@@ -136,7 +136,7 @@ def reach(
     template: AbstractTemplate,
     relaxation: AbstractRelaxation = LocalBounds(),  # noqa: B008  (immutable)
     window: int = 1,
-    solver: AbstractSolver = Clarabel(),  # noqa: B008
+    solver: AbstractSolver = Auto(),  # noqa: B008
     *,
     start: int = 0,
     samples: int = SAMPLES,

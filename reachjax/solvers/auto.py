@@ -7,14 +7,14 @@ import dataclasses
 from reachjax.checks import whole_number
 from reachjax.lmi import Program
 from reachjax.sets import NormalForm
-from reachjax.solvers.base import AbstractSolver, Enclosure, Solution
+from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, SolverStatus
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import Clarabel
 
 
 @dataclasses.dataclass(frozen=True)
 class Auto(AbstractSolver):
-    """Clarabel for small programs and for ellipsoids, the interior-point method for the others.
+    """Clarabel for the facets of small programs, the interior-point method for all else.
 
     The choice depends on the size of the basis alone, so that it is the same inside `jax.jit`, and
     `choice(certificate.program)` tells which solver a certificate's multipliers came from.
@@ -62,5 +62,9 @@ class Auto(AbstractSolver):
         return self.choice(program).propose(program)
 
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
-        """Propose the smallest ellipsoid around the successors, and its multipliers."""
-        return self.small.enclose(program, form)
+        """Propose the smallest ellipsoid around the successors, and its multipliers.
+
+        The `small` solver is asked where the `large` one ends without.
+        """
+        found = self.large.enclose(program, form)
+        return found if found.status == SolverStatus.SOLVED else self.small.enclose(program, form)

@@ -9,13 +9,16 @@ derivative is exact.
 
 from __future__ import annotations
 
+import time
 from typing import NamedTuple
 
 import numpy as np
 
 from reachjax.lmi import Program, with_successor
 from reachjax.sets import NormalForm
-from reachjax.solvers.barrier import Barrier, solved
+from reachjax.solvers.barrier import Barrier
+from reachjax.solvers.base import Enclosure, SolverStatus
+from reachjax.solvers.central_path import follow, solved
 from reachjax.solvers.compact import compact
 from reachjax.solvers.host import all_finite
 
@@ -24,11 +27,12 @@ WEIGHTS = (1e-6, 1e-7, 1e-8)
 that times the number of multipliers, at most. Derivatives lose digits below it, as the matrices
 become singular: ten times smaller, one of a thin ellipsoid was off by 7e-4, not by 1e-5."""
 
-FROM_AFAR = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
-"""Weights to begin with where a solver stalled far from the path."""
+FROM_AFAR = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 1e-5)
+"""Weights to begin with far from the path. Measured with every neuron kept: the first takes some 60
+Newton steps and each of the others about ten; beginning at 0.1 takes 200."""
 
-LARGEST = 10_000_000
-"""Numbers in all generators together, beyond which a solver's point is taken as it is."""
+LARGEST = 3000
+"""Multipliers, beyond which a solver's point is taken as it is: a step costs their cube."""
 
 
 class Sensitivity(NamedTuple):
@@ -66,6 +70,31 @@ class Sensitivity(NamedTuple):
         return cls(*half, *half)
 
 
+def enclosed(program: Program, given: NormalForm | None = None) -> Enclosure:
+    """The ellipsoid at the end of the central path, followed from afar.
+
+    Args:
+        program: whose objective rows are the successor's.
+        given: the ellipsoid up to a factor on `A` and `b`; free if it is None.
+    """
+    began, reduced, proposal = time.perf_counter(), compact(program), Enclosure.blank(program)
+    if len(reduced.kept) > LARGEST:
+        return proposal._replace(status=np.array(int(SolverStatus.LIMIT)))
+    barrier = Barrier(reduced, given)
+    found = follow(barrier, barrier.inside(), FROM_AFAR + WEIGHTS)
+    seconds = np.array(time.perf_counter() - began)
+    if found is None:
+        return proposal._replace(seconds=seconds)
+    y = found[0]
+    if given is not None and barrier.is_thinnest(y):
+        unbounded = np.array(int(SolverStatus.UNBOUNDED))
+        return proposal._replace(status=unbounded, seconds=seconds)
+    multipliers, form = barrier.unscaled(y, len(proposal.multipliers))
+    moments = barrier.whole(WEIGHTS[-1] * np.linalg.inv(barrier.schur(y)), len(program.transform))
+    status = np.array(int(SolverStatus.SOLVED))
+    return Enclosure(form, multipliers, moments, status, seconds)
+
+
 def centred(
     program: Program, multipliers: np.ndarray, form: NormalForm
 ) -> tuple[np.ndarray, NormalForm] | None:
@@ -74,8 +103,7 @@ def centred(
     None where the path is not reached, or the program is so large that it would take long.
     """
     reduced = compact(program)
-    size = len(reduced.kept) * (len(reduced.columns) + len(form.b)) ** 2
-    if size > LARGEST or not all_finite((multipliers, form)):
+    if len(reduced.kept) > LARGEST or not all_finite((multipliers, form)):
         return None
     barrier = Barrier(reduced)
     found = _centre(barrier, multipliers, form)
@@ -110,15 +138,11 @@ def sensitivity(
     framed = NormalForm(cotangent.A @ frame.A.T + np.outer(cotangent.b, frame.b), cotangent.b)
     w = solved(hessian, barrier.vector(framed))
     inverse = np.linalg.inv(barrier.schur(y))
-    moving = np.tensordot(w, barrier.terms, 1)
-    size, q = len(program.transform), len(form.b)
-    used = np.ix_(*2 * [np.r_[barrier.program.columns, size + np.arange(q)]])
+    moving = barrier.weighted(w)
     halves = []
     for vector, moments in ((y, -weight * inverse @ moving @ inverse), (w, -weight * inverse)):
-        whole = np.zeros((size + q, size + q))
-        whole[used] = moments
         weights, part = barrier.unscaled(vector, len(multipliers))
-        halves += [weights, part.of(frame), whole]
+        halves += [weights, part.of(frame), barrier.whole(moments, len(program.transform))]
     return Sensitivity(*halves)
 
 
@@ -127,5 +151,5 @@ def _centre(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The minimiser at the last weight, from a point near it or not, and the Hessian there."""
     near = barrier.near(multipliers, form, WEIGHTS[0])
-    found = None if near is None else barrier.follow(near, WEIGHTS)
-    return found or barrier.follow(barrier.inside(), FROM_AFAR + WEIGHTS)
+    found = None if near is None else follow(barrier, near, WEIGHTS)
+    return found or follow(barrier, barrier.inside(), FROM_AFAR + WEIGHTS)

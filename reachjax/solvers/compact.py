@@ -1,7 +1,4 @@
-"""The program as a conic solver should see it: a trimmed one, its generators as sparse columns.
-
-They are scaled to unit norm.
-"""
+"""The program as a solver on the host should see it: nothing unused, and unit sizes."""
 
 from __future__ import annotations
 
@@ -12,6 +9,7 @@ import scipy.sparse as sp
 
 from reachjax.lmi import Program
 from reachjax.sets import NormalForm
+from reachjax.solvers.pairs import Pairs
 from reachjax.solvers.trimming import trimmed
 
 THINNEST = 1e-4
@@ -21,15 +19,12 @@ interval radius: that keeps ellipsoids of least volume around flat sets from deg
 TINY = 1e-100
 """The least width of anything that is enclosed, in the units of the state."""
 
-CHUNK = 256
-"""Pairs whose dense outer products are held in memory at once."""
-
 
 class CompactProgram(NamedTuple):
     """`sum_k y_k G_k + p e' + e p' - 2 b e e' <= 0` with `|G_k| = 1`, in `n` used columns.
 
     Attributes:
-        generators: sparse `(n * n, K')`, the flattened `G_k`.
+        generators: the `G_k`.
         objective: `(f, n)`, of unit 1-norm and without a constant.
         centers: `(f,)`, the constants; a facet's offset is `centers + units b`.
         units: `(f,)`; the program's multipliers are those of the scaled objective times this. Zero
@@ -40,7 +35,7 @@ class CompactProgram(NamedTuple):
         norms: `(K',)`: the program's multiplier is `y_k / norms_k`.
     """
 
-    generators: sp.csc_array
+    generators: Pairs
     objective: np.ndarray
     centers: np.ndarray
     units: np.ndarray
@@ -84,34 +79,26 @@ class CompactProgram(NamedTuple):
 
 def compact(program: Program) -> CompactProgram:
     """Drop what is empty or noise, and bring the generators to unit norm."""
-    given = trimmed(program)
-    columns = np.flatnonzero(given.columns)
-    generators, norms = _generators(program, given.facts[:, columns])
-    kept = np.flatnonzero((norms > 0) & given.kept)
-    unit_size = sp.diags_array(1 / norms[kept])
+    given, products = trimmed(program), program.products
+    columns, kept = np.flatnonzero(given.columns), np.flatnonzero(given.kept)
+    number = np.full(len(given.kept), -1)
+    number[kept] = np.arange(len(kept))
+    owner, present = number[products.multiplier], given.facts.any(axis=1)
+    there = np.flatnonzero((owner >= 0) & present[products.left] & present[products.right])
+    owner, norms = owner[there], given.sizes[kept]
+    shares = np.asarray(products.sign)[there] / norms[owner], (owner, np.arange(len(there)))
     return CompactProgram(
-        generators=sp.csc_array(generators[:, kept] @ unit_size),
+        generators=Pairs(
+            rows=given.facts[:, columns],
+            left=np.asarray(products.left)[there],
+            right=np.asarray(products.right)[there],
+            sharing=sp.csr_array(shares, shape=(len(kept), len(there))),
+        ),
         objective=given.objective[:, columns],
         centers=given.centers,
         units=given.units,
-        free=np.asarray(program.products.free)[kept],
+        free=np.asarray(products.free)[kept],
         columns=columns,
         kept=kept,
-        norms=norms[kept],
+        norms=norms,
     )
-
-
-def _generators(program: Program, facts: np.ndarray) -> tuple[sp.csc_array, np.ndarray]:
-    """The flattened `sum sym(p' q)` of each multiplier's pairs `(n * n, K)`, and their norms."""
-    left, right = np.asarray(program.products.left), np.asarray(program.products.right)
-    owner, sign = np.asarray(program.products.multiplier), np.asarray(program.products.sign)
-    count, pairs, n = len(program.products.free), len(left), facts.shape[1]
-    blocks = []
-    for first in range(0, pairs, CHUNK):
-        here = slice(first, first + CHUNK)
-        outer = facts[left[here], :, None] * facts[right[here], None, :]
-        symmetric = sign[here, None, None] * (outer + outer.transpose(0, 2, 1)) / 2
-        blocks.append(sp.csr_array(symmetric.reshape(-1, n * n)))
-    sharing = sp.csr_array((np.ones(pairs), (owner, np.arange(pairs))), shape=(count, pairs))
-    generators = sp.csc_array((sharing @ sp.vstack(blocks, format="csr")).T)
-    return generators, np.sqrt(np.asarray(generators.multiply(generators).sum(axis=0)).ravel())

@@ -22,8 +22,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.checks import is_concrete, require_double_precision, whole_number
 from reachjax.lmi import Program
+from reachjax.sets import NormalForm
 from reachjax.solvers.arrangement import arranged, cut
-from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus, require_positive
+from reachjax.solvers.base import (
+    AbstractSolver,
+    Enclosure,
+    Solution,
+    SolverStatus,
+    require_positive,
+)
+from reachjax.solvers.centring import enclosed
 from reachjax.solvers.generators import Generators
 from reachjax.solvers.primal_dual import Point, start, step
 from reachjax.solvers.trimming import trimmed
@@ -218,6 +226,13 @@ class InteriorPoint(AbstractSolver):
             statuses=found.status,
             seconds=jnp.full_like(given.units, jnp.nan),
         )
+
+    def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
+        """Propose the smallest ellipsoid around the successors, and its multipliers.
+
+        Its central path is followed to its end, on the host (`barrier`).
+        """
+        return enclosed(program, form)
 
 
 @jax.custom_batching.sequential_vmap

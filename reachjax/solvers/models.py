@@ -19,7 +19,8 @@ class Multipliers:
     def __init__(self, program: CompactProgram):
         import cvxpy as cp
 
-        free, signed = program.generators[:, program.free], program.generators[:, ~program.free]
+        generators = program.generators.columns()
+        free, signed = generators[:, program.free], generators[:, ~program.free]
         self.program = program
         self.free = cp.Variable(free.shape[1]) if free.shape[1] else None
         self.signed = cp.Variable(signed.shape[1], nonneg=True)

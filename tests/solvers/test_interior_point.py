@@ -104,7 +104,7 @@ def test_the_schur_matrix_is_that_of_traces_of_explicit_matrices(kind):
     np.testing.assert_allclose(known, generators.paired(X), atol=1e-10)
     # and they are the program's own generators
     reduced, k = compact(given), len(layout.columns)
-    dense = reduced.generators.T.toarray().reshape(-1, k, k) * reduced.norms[:, None, None]
+    dense = reduced.generators.columns().T.toarray().reshape(-1, k, k) * reduced.norms[:, None, None]
     mine = G[:count, -k:, -k:] / layout.scale[:, None, None]
     assert set(layout.order.tolist()) == set(reduced.kept.tolist())
     np.testing.assert_allclose(mine[np.argsort(layout.order)], dense, atol=1e-12)

@@ -1,0 +1,78 @@
+"""Newton's method for a barrier function, from one weight to the next."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from reachjax.solvers.barrier import Barrier
+
+STEPS = 200
+"""Newton steps after which the centre counts as not found."""
+
+CENTRED = 1e-8
+"""The squared Newton decrement, in units of `mu`, at which it is found."""
+
+QUADRATIC = 0.05
+"""The squared decrement, in units of `mu`, below which full Newton steps surely converge."""
+
+
+def follow(
+    barrier: Barrier, y: np.ndarray, weights: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The minimiser at the last of some weights, from one to the next, and the Hessian there.
+
+    None where one of them is not reached.
+    """
+    hessian = np.zeros((len(y), len(y)))
+    for weight in weights:
+        centre = minimiser(barrier, y, weight)
+        if centre is None:
+            return None
+        y, hessian = centre
+    return y, hessian
+
+
+def minimiser(
+    barrier: Barrier, y: np.ndarray, weight: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Newton's method from a point inside: the minimiser and the Hessian there."""
+    value = barrier.value(y, weight)
+    for _ in range(STEPS if np.isfinite(value) else 0):
+        gradient, hessian = barrier.derivatives(y, weight)
+        step = -solved(hessian, gradient)
+        decrement = -float(gradient @ step)
+        if decrement <= CENTRED * weight:
+            better = y + step  # by the square of the decrement; the Hessian is to match
+            y = better if np.isfinite(barrier.value(better, weight)) else y
+            return y, barrier.derivatives(y, weight)[1]
+        if not np.isfinite(decrement):
+            return None
+        length, near = 1.0, decrement <= QUADRATIC * weight
+        # near the centre, differences of values are not seen: any point inside will do
+        while not (
+            (after := barrier.value(y + length * step, weight)) <= value - length * decrement / 4
+            or (near and np.isfinite(after))
+        ):
+            length /= 2
+            if length < 1e-10:
+                return None
+        y, value = y + length * step, after
+    return None
+
+
+def solved(hessian: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """`hessian^-1 vector`, scaled to a unit diagonal and regularised at rounding level."""
+    scale = 1 / np.sqrt(np.diag(hessian))
+    matrix = hessian * np.outer(scale, scale)
+    for shift in 1e-14 * 100.0 ** np.arange(4):
+        try:
+            factor = cho_factor(matrix + shift * np.eye(len(matrix)))
+            break
+        except LinAlgError:
+            continue
+    else:
+        return np.full(len(vector), np.nan)
+    solution = cho_solve(factor, scale * vector)
+    residual = scale * vector - matrix @ solution  # one step of refinement
+    return scale * (solution + cho_solve(factor, residual))

@@ -1,0 +1,64 @@
+"""Symmetric matrices that are sums of products of two rows, on the host.
+
+`G_k = sum w sym(l' r)` over the pairs that belong to `k`. Sums, inner products and Hessians of
+log-determinants need Gram matrices of the rows alone; only conic solvers ask for the `G_k`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+CHUNK = 256
+"""Pairs that are treated together: it bounds the memory that products of them take."""
+
+
+class Pairs(NamedTuple):
+    """The matrices `G_k`.
+
+    Attributes:
+        rows: `(m, n)`.
+        left: `(p,)`, row numbers.
+        right: `(p,)`, row numbers.
+        sharing: sparse `(K, p)`, the weight of each pair in each matrix.
+    """
+
+    rows: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+    sharing: sp.csr_array
+
+    def weighted(self, y: np.ndarray) -> np.ndarray:
+        """`sum_k y_k G_k` `(n, n)`."""
+        weights = self.sharing.T @ y
+        half = (weights[:, None] * self.rows[self.left]).T @ self.rows[self.right]
+        return (half + half.T) / 2
+
+    def paired(self, matrix: np.ndarray) -> np.ndarray:
+        """`<G_k, M>` `(K,)` for a symmetric matrix."""
+        return self.sharing @ np.sum((self.rows @ matrix)[self.left] * self.rows[self.right], 1)
+
+    def hessian(self, factor: np.ndarray) -> np.ndarray:
+        """`<G_k, W G_l W>` `(K, K)` for `W = factor' factor`."""
+        half = self.rows @ factor.T
+        gram = half @ half.T
+        by_left, by_right = gram[:, self.left], gram[:, self.right]
+        shared: np.ndarray = 0 * self.sharing.toarray()
+        for first in range(0, len(self.left), CHUNK):
+            here = slice(first, first + CHUNK)
+            crossed = by_left[self.left[here]] * by_right[self.right[here]]
+            crossed += by_right[self.left[here]] * by_left[self.right[here]]
+            shared += self.sharing[:, here] @ crossed
+        return (self.sharing @ shared.T) / 2
+
+    def columns(self) -> sp.csc_array:
+        """The flattened matrices, sparse `(n * n, K)`."""
+        n, blocks = self.rows.shape[1], []
+        for first in range(0, len(self.left), CHUNK):
+            here = slice(first, first + CHUNK)
+            outer = self.rows[self.left[here], :, None] * self.rows[self.right[here], None, :]
+            symmetric = (outer + outer.transpose(0, 2, 1)) / 2
+            blocks.append(sp.csr_array(symmetric.reshape(-1, n * n)))
+        return sp.csc_array((self.sharing @ sp.vstack(blocks, format="csr")).T)

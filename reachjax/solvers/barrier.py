@@ -4,10 +4,10 @@
 
 with `Z = [e e' - sum_k y_k G_k, V'; V, I]` and `V = R W + r e'`: smooth and strictly convex where
 the program has a point inside, and it always has. One more multiplier `t >= 0`, at a price, weighs
-`sum_i (1 - eta_i^2)`; the price keeps it at the size of `mu`. Without `kappa` there is no minimiser
-where products that say nothing let multipliers grow without bound (every neuron kept: the path of a
-quadrotor's first step was lost). Every part of `Z` but `t`'s is a product of two rows, so a step
-needs Gram matrices of rows only. Everything here is numpy on the host.
+`sum_i (1 - eta_i^2)`; a high price keeps it at the size of `mu`. Without `kappa` there would be no
+minimiser where products that say nothing let multipliers grow without bound (every neuron kept: the
+path of a quadrotor's first step was lost). Every part of `Z` but `t`'s is a product of two rows, so
+a step needs Gram matrices of rows only. Everything here is numpy on the host.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Barrier:
         self.terms = self._pairs()
         self.states = np.diag(np.r_[np.ones(self.n - 1), 1.0 - self.n, np.zeros(self.q)])
         self.constant = np.diag(np.r_[np.zeros(self.n - 1), 1.0, np.ones(self.q)])
-        self.price = float(self.n * self.q)
+        self.price = 1.0
         together = np.zeros(self.size.stop)
         together[self.signed] = 1.0
         self.spread = 1 + np.linalg.norm(self.weighted(together), 2)
@@ -82,6 +82,11 @@ class Barrier:
     def schur(self, y: np.ndarray) -> np.ndarray:
         """`Z`."""
         return self.constant + self.weighted(y)
+
+    def inverse(self, y: np.ndarray) -> np.ndarray:
+        """`Z^-1`, positive semidefinite whatever the rounding."""
+        factor = inverse_factor(self.schur(y))
+        return factor.T @ factor
 
     def form(self, y: np.ndarray) -> NormalForm:
         """`R` and `r`."""

@@ -13,6 +13,10 @@ STEPS = 200
 CENTRED = 1e-8
 """The squared Newton decrement, in units of `mu`, at which it is found."""
 
+STAGNANT = 1e-3
+"""So it is below this one if another step does not halve it: rounding moves multipliers along
+directions in which the function is flat."""
+
 QUADRATIC = 0.05
 """The squared decrement, in units of `mu`, below which full Newton steps surely converge."""
 
@@ -37,12 +41,13 @@ def minimiser(
     barrier: Barrier, y: np.ndarray, weight: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Newton's method from a point inside: the minimiser and the Hessian there."""
-    value = barrier.value(y, weight)
+    value, before = barrier.value(y, weight), np.inf
     for _ in range(STEPS if np.isfinite(value) else 0):
         gradient, hessian = barrier.derivatives(y, weight)
         step = -solved(hessian, gradient)
         decrement = -float(gradient @ step)
-        if decrement <= CENTRED * weight:
+        stagnant = before / 2 < decrement <= STAGNANT * weight
+        if decrement <= CENTRED * weight or stagnant:
             better = y + step  # by the square of the decrement; the Hessian is to match
             y = better if np.isfinite(barrier.value(better, weight)) else y
             return y, barrier.derivatives(y, weight)[1]
@@ -57,7 +62,7 @@ def minimiser(
             length /= 2
             if length < 1e-10:
                 return None
-        y, value = y + length * step, after
+        y, value, before = y + length * step, after, decrement
     return None
 
 

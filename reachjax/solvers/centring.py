@@ -10,6 +10,8 @@ derivative is exact.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +32,10 @@ become singular: ten times smaller, one of a thin ellipsoid was off by 7e-4, not
 FROM_AFAR = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 1e-5)
 """Weights to begin with far from the path. Measured with every neuron kept: the first takes some 60
 Newton steps and each of the others about ten; beginning at 0.1 takes 200."""
+
+PRICES = (1.0, 10.0, 100.0, 1000.0)
+"""Prices of `t` that are tried, in units of the sizes of basis and successor. Moments have a trace
+below the price; with many neurons kept, the lowest was too low by half."""
 
 LARGEST = 3000
 """Multipliers, beyond which a solver's point is taken as it is: a step costs their cube."""
@@ -81,7 +87,7 @@ def enclosed(program: Program, given: NormalForm | None = None) -> Enclosure:
     if len(reduced.kept) > LARGEST:
         return proposal._replace(status=np.array(int(SolverStatus.LIMIT)))
     barrier = Barrier(reduced, given)
-    found = follow(barrier, barrier.inside(), FROM_AFAR + WEIGHTS)
+    found = _end(barrier, barrier.inside, FROM_AFAR + WEIGHTS)
     seconds = np.array(time.perf_counter() - began)
     if found is None:
         return proposal._replace(seconds=seconds)
@@ -90,7 +96,7 @@ def enclosed(program: Program, given: NormalForm | None = None) -> Enclosure:
         unbounded = np.array(int(SolverStatus.UNBOUNDED))
         return proposal._replace(status=unbounded, seconds=seconds)
     multipliers, form = barrier.unscaled(y, len(proposal.multipliers))
-    moments = barrier.whole(WEIGHTS[-1] * np.linalg.inv(barrier.schur(y)), len(program.transform))
+    moments = barrier.whole(WEIGHTS[-1] * barrier.inverse(y), len(program.transform))
     status = np.array(int(SolverStatus.SOLVED))
     return Enclosure(form, multipliers, moments, status, seconds)
 
@@ -137,7 +143,7 @@ def sensitivity(
     # the transpose of `.of(frame)`
     framed = NormalForm(cotangent.A @ frame.A.T + np.outer(cotangent.b, frame.b), cotangent.b)
     w = solved(hessian, barrier.vector(framed))
-    inverse = np.linalg.inv(barrier.schur(y))
+    inverse = barrier.inverse(y)
     moving = barrier.weighted(w)
     halves = []
     for vector, moments in ((y, -weight * inverse @ moving @ inverse), (w, -weight * inverse)):
@@ -150,6 +156,21 @@ def _centre(
     barrier: Barrier, multipliers: np.ndarray, form: NormalForm
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The minimiser at the last weight, from a point near it or not, and the Hessian there."""
-    near = barrier.near(multipliers, form, WEIGHTS[0])
-    found = None if near is None else follow(barrier, near, WEIGHTS)
-    return found or follow(barrier, barrier.inside(), FROM_AFAR + WEIGHTS)
+    near = partial(barrier.near, multipliers, form, WEIGHTS[0])
+    return _end(barrier, near, WEIGHTS) or _end(barrier, barrier.inside, FROM_AFAR + WEIGHTS)
+
+
+def _end(
+    barrier: Barrier, start: Callable[[], np.ndarray | None], weights: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The minimiser at the last of some weights and the Hessian there.
+
+    At too low a price `t` stays, and the ellipsoid is smaller than the relaxation itself allows.
+    """
+    for price in PRICES:
+        barrier.price = price * barrier.n * barrier.q
+        first = start()
+        found = None if first is None else follow(barrier, first, weights)
+        if found is None or found[0][barrier.count] <= 2 * weights[-1] / barrier.price:
+            return found
+    return None

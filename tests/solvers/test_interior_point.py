@@ -14,7 +14,8 @@ import reachjax as rj
 from reachjax.lmi import step_program
 from reachjax.recheck import interval_offsets
 from reachjax.relaxation import AbstractRelaxation
-from reachjax.solvers import accepted_offsets, interior_point
+from reachjax.sets import NormalForm
+from reachjax.solvers import accepted_enclosure, accepted_offsets, centring, interior_point
 from reachjax.solvers.arrangement import arranged, bucket, cut
 from reachjax.solvers.compact import compact
 from reachjax.solvers.generators import inverse_factor
@@ -75,9 +76,9 @@ def simplex(n_x, seed):
     return rj.Polytope(region.A, region.b)
 
 
-def program(n_x=3, seed=0, hidden=(5, 3), network=he_network, X=box_of, relaxation=None):
+def program(n_x=3, seed=0, hidden=(5, 3), network=he_network, X=box_of, relaxation=None, rows=None):
     data = random_loop(n_x, hidden, seed, network=network)
-    rows = directions(n_x, seed, extra=1)[:: n_x + 1]
+    rows = directions(n_x, seed, extra=1)[:: n_x + 1] if rows is None else rows
     return program_of(data, X(n_x, seed), relaxation or rj.LocalBounds(), rows)
 
 
@@ -104,7 +105,9 @@ def test_the_schur_matrix_is_that_of_traces_of_explicit_matrices(kind):
     np.testing.assert_allclose(known, generators.paired(X), atol=1e-10)
     # and they are the program's own generators
     reduced, k = compact(given), len(layout.columns)
-    dense = reduced.generators.columns().T.toarray().reshape(-1, k, k) * reduced.norms[:, None, None]
+    dense = (
+        reduced.generators.columns().T.toarray().reshape(-1, k, k) * reduced.norms[:, None, None]
+    )
     mine = G[:count, -k:, -k:] / layout.scale[:, None, None]
     assert set(layout.order.tolist()) == set(reduced.kept.tolist())
     np.testing.assert_allclose(mine[np.argsort(layout.order)], dense, atol=1e-12)
@@ -325,21 +328,130 @@ def test_wrong_options_are_refused(options, error):
         rj.InteriorPoint(**options)
 
 
-def test_it_says_that_it_knows_no_ellipsoids():
-    with pytest.raises(NotImplementedError, match="InteriorPoint"):
-        SOLVER.enclose(program())
+ROUND = {
+    **{f"{n} states": {"n_x": n, "seed": n} for n in (1, 2, 3, 6)},
+    "every neuron": {"seed": 1, "relaxation": rj.PaperQC(repeated=False)},
+    "every pair": {"seed": 2, "relaxation": rj.PaperQC()},
+    "dead neurons": {"network": dead_network, "relaxation": rj.PaperQC()},
+    "a box": {"X": box_of, "seed": 3},
+    "many neurons": {"n_x": 6, "hidden": (20, 20), "relaxation": rj.PaperQC(repeated=False)},
+}
 
 
-def test_auto_chooses_by_size_alone_and_leaves_ellipsoids_to_clarabel():
+@pytest.fixture(scope="module", params=ROUND.values(), ids=ROUND.keys())
+def enclosed(request):
+    """(program of an ellipsoid, what is proposed for it)."""
+    n_x = request.param.get("n_x", 3)
+    given = program(**{"X": round_of, **request.param, "rows": np.eye(n_x)})
+    return given, SOLVER.enclose(given)
+
+
+SIGNS = 1e-5
+"""What moments may miss their signs by: the path's last point is a centre up to rounding."""
+
+
+def least_log_volume(given, enclosure):
+    """What `-log det A` is at least in this relaxation, by weak duality.
+
+    Where moments `X >= 0` weigh no product negatively and `b` not at all, `<X, Z> >= 0` says that
+    `<D, R> <= c` for `A = R K^-1` with a symmetric `R`, if `c = X_ee + trace X_22` and `D` is the
+    symmetric part of `-2 X_21 (K^-1 P)'`, where `P` are the rows of the successor. The largest
+    `det R` of these is that of `R = c / q D^-1`.
+    """
+    n, q, X = len(given.transform), len(enclosure.form.b), enclosure.moments
+    facts, products = given.facts.mid, given.products
+    pairs = np.einsum("pi,pi->p", facts[products.left] @ X[:n, :n], facts[products.right])
+    sums = np.bincount(products.multiplier, products.sign * pairs, len(products.free))
+    assert eigvalsh(X)[0] >= -1e-12 * np.trace(X)
+    assert abs(sums[products.free]).max(initial=0.0) <= SIGNS * np.trace(X)
+    assert sums[~products.free].min(initial=0.0) >= -SIGNS * np.trace(X)
+    assert abs(X[n:, n - 1]).max() <= SIGNS * np.trace(X)
+    K = compact(given).widths
+    D = -2 * X[n:, :n] @ (given.objective.mid / K[:, None]).T
+    c = X[n - 1, n - 1] + np.trace(X[n:, n:])
+    return np.linalg.slogdet((D + D.T) / 2)[1] - q * np.log(c / q) + np.log(K).sum()
+
+
+def test_an_ellipsoid_is_the_smallest_of_its_relaxation(enclosed):
+    given, enclosure = enclosed
+    assert int(enclosure.status) == rj.SolverStatus.SOLVED
+    form, level, optimal = accepted_enclosure(given, enclosure)
+    assert optimal
+    assert level == pytest.approx(1.0, abs=1e-6)
+    size = -np.linalg.slogdet(form.A)[1]
+    assert size == pytest.approx(least_log_volume(given, enclosure), abs=1e-4)
+
+
+def test_ellipsoids_are_those_of_clarabel_where_it_solves(enclosed):
+    given, enclosure = enclosed
+    reference = rj.Clarabel().enclose(given)
+    if reference.status == rj.SolverStatus.SOLVED:
+        sizes = [-np.linalg.slogdet(found.form.A)[1] for found in (enclosure, reference)]
+        assert sizes[0] == pytest.approx(sizes[1], abs=1e-5)
+
+
+def test_a_given_shape_gets_the_size_that_clarabel_gives_it(enclosed):
+    given, enclosure = enclosed
+    q = len(given.objective.mid)
+    shape = NormalForm(enclosure.form.A @ np.diag(np.linspace(1, 2, q)), 0.7 * enclosure.form.b)
+    ours, theirs = (solver.enclose(given, shape) for solver in (SOLVER, rj.Clarabel()))
+    assert int(ours.status) == rj.SolverStatus.SOLVED
+    assert accepted_enclosure(given, ours, shape)[2]
+    factor = np.sum(ours.form.A * shape.A) / np.sum(shape.A**2)
+    np.testing.assert_allclose(ours.form.A, factor * shape.A, rtol=1e-9)
+    np.testing.assert_allclose(ours.form.b, factor * shape.b, rtol=1e-9, atol=1e-12)
+    if theirs.status == rj.SolverStatus.SOLVED:
+        np.testing.assert_allclose(ours.form.A, theirs.form.A, rtol=1e-5, atol=1e-8)
+
+
+def test_all_neurons_of_a_step_that_clarabel_gives_up_on():
+    """The paper's constraints on a set so small that all neurons are affine there."""
+    given = program(
+        n_x=6,
+        hidden=(20, 20),
+        X=lambda n_x, seed: rj.Ellipsoid(np.zeros(n_x), 1e-6 * np.eye(n_x)),
+        rows=np.eye(6),
+        relaxation=rj.PaperQC(repeated=False),
+    )
+    assert int(SOLVER.enclose(given).status) == rj.SolverStatus.SOLVED
+
+
+def test_a_shape_around_one_point_has_no_size():
+    given = program(X=round_of, rows=np.eye(3))
+    given = given.with_midpoints(given.facts.mid, 0 * given.objective.mid)
+    found = SOLVER.enclose(given, NormalForm(np.eye(3), np.zeros(3)))
+    assert int(found.status) == rj.SolverStatus.UNBOUNDED
+    assert np.all(found.multipliers == 0)
+
+
+@pytest.mark.parametrize("kind", GARBAGE)
+def test_ellipsoids_from_garbage_are_sound_or_blank(kind):
+    given = program(X=round_of, hidden=(4,), rows=np.eye(3))
+    rows = GARBAGE[kind](given.facts.mid, np.random.default_rng(0))
+    given = given.with_midpoints(rows, given.objective.mid)
+    found = SOLVER.enclose(given)
+    assert {rj.SolverStatus(int(found.status)).advice}
+    assert np.isfinite(found.multipliers).all()
+    assert np.all(found.multipliers[~given.products.free] >= 0)
+
+
+def test_programs_with_too_many_multipliers_are_left_alone(monkeypatch):
+    monkeypatch.setattr(centring, "LARGEST", 3)
+    found = SOLVER.enclose(program(X=round_of, rows=np.eye(3)))
+    assert int(found.status) == rj.SolverStatus.LIMIT
+    assert np.all(found.multipliers == 0)
+
+
+def test_auto_chooses_by_size_alone_and_asks_the_small_one_where_the_large_one_fails(monkeypatch):
     small, large = program(), program(hidden=(20, 10), relaxation=rj.PaperQC(repeated=False))
     auto = rj.Auto()
     assert auto.choice(small) == rj.Clarabel()
     assert auto.choice(large) == rj.InteriorPoint()
     np.testing.assert_array_equal(auto.solve(small).offsets, rj.Clarabel().solve(small).offsets)
     np.testing.assert_array_equal(auto.solve(large).offsets, SOLVER.solve(large).offsets)
-    loop, box = closed_loop(random_loop(2)), box_of(2, 0)
-    found, _ = rj.reach_step(loop, box, rj.EllipsoidTemplate(), solver=auto)
-    other, _ = rj.reach_step(loop, box, rj.EllipsoidTemplate(), solver=rj.Clarabel())
-    np.testing.assert_array_equal(found.shape, other.shape)
+    given = program(X=round_of, rows=np.eye(3))
+    np.testing.assert_array_equal(auto.enclose(given).form.A, SOLVER.enclose(given).form.A)
+    monkeypatch.setattr(centring, "LARGEST", 3)
+    np.testing.assert_array_equal(auto.enclose(given).form.A, rj.Clarabel().enclose(given).form.A)
     with pytest.raises(TypeError, match=r"Auto\.small"):
         rj.Auto(small="clarabel")

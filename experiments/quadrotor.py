@@ -45,7 +45,7 @@ class Settings:
 
     relaxation: Literal["local-bounds", "paper-repeated", "paper"] = "local-bounds"
     """Which products of facts are used; "paper" leaves out lambda_ij. The paper's two keep every
-    neuron in the program: minutes a step, and here too loose or too hard for the solver."""
+    neuron in the program: seconds a step, minutes with lambda_ij, and here far too loose."""
     samples: int = 4531
     """State-input pairs of the MPC that the network learns from."""
     hidden: tuple[int, ...] = (32, 32)

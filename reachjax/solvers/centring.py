@@ -33,11 +33,11 @@ FROM_AFAR = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 1e-
 """Weights to begin with far from the path. Measured with every neuron kept: the first takes some 60
 Newton steps and each of the others about ten; beginning at 0.1 takes 200."""
 
-PRICES = (1.0, 10.0, 100.0, 1000.0)
-"""Prices of `t` that are tried, in units of the sizes of basis and successor. Moments have a trace
-below the price; with many neurons kept, the lowest was too low by half."""
+PRICES = (10.0, 100.0, 1000.0)
+"""Prices of `t` that are tried, in units of the sizes of basis and successor. The trace of moments
+stays below the price; with many neurons kept, 1 was seen to be too low by half."""
 
-LARGEST = 3000
+LARGEST = 1500
 """Multipliers, beyond which a solver's point is taken as it is: a step costs their cube."""
 
 

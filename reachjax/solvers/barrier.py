@@ -1,6 +1,7 @@
 """The barrier function of minimum-volume ellipsoids.
 
-    f(y) = -log det R - mu (log det Z + sum_k log y_k - kappa / 2 sum_k y_k^2),
+    f(y) = -log det R + price t - mu (log det Z + log det(bound - R) + sum_k log y_k
+           - kappa / 2 sum_k y_k^2),
 
 with `Z = [e e' - sum_k y_k G_k, V'; V, I]` and `V = R W + r e'`: smooth and strictly convex where
 the program has a point inside, and it always has. One more multiplier `t >= 0`, at a price, weighs
@@ -85,7 +86,7 @@ class Barrier:
 
     def inverse(self, y: np.ndarray) -> np.ndarray:
         """`Z^-1`, positive semidefinite whatever the rounding."""
-        factor = inverse_factor(self.schur(y))
+        factor = inverse_cholesky(self.schur(y))
         return factor.T @ factor
 
     def form(self, y: np.ndarray) -> NormalForm:
@@ -171,7 +172,7 @@ class Barrier:
 
     def derivatives(self, y: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and Hessian."""
-        factor = inverse_factor(self.schur(y))
+        factor = inverse_cholesky(self.schur(y))
         inverse = factor.T @ factor
         moved = inverse @ self.states @ inverse
         gradient = -weight * self.terms.paired(inverse)
@@ -186,7 +187,7 @@ class Barrier:
         gradient[self.signed] -= weight / y[self.signed]
         hessian[self.signed, self.signed] += weight / y[self.signed] ** 2
         for each, block, sign in self._blocks(y, weight):
-            factor = inverse_factor(block)
+            factor = inverse_cholesky(block)
             scaled = factor @ self.sizes @ factor.T
             flat = scaled.reshape(len(scaled), -1)
             gradient[self.size] -= sign * each * np.trace(scaled, axis1=1, axis2=2)
@@ -194,7 +195,7 @@ class Barrier:
         return gradient, hessian
 
 
-def inverse_factor(matrix: np.ndarray) -> np.ndarray:
+def inverse_cholesky(matrix: np.ndarray) -> np.ndarray:
     """The inverse of the Cholesky factor."""
     factor = np.linalg.cholesky(matrix)
     return solve_triangular(factor, np.eye(len(matrix)), lower=True, check_finite=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
@@ -21,20 +23,29 @@ QUADRATIC = 0.05
 """The squared decrement, in units of `mu`, below which full Newton steps surely converge."""
 
 
-def follow(
-    barrier: Barrier, y: np.ndarray, weights: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """The minimiser at the last of some weights, from one to the next, and the Hessian there.
+class Centre(NamedTuple):
+    """A point of the path.
 
-    None where one of them is not reached.
+    Attributes:
+        y: the minimiser.
+        hessian: of the barrier function there.
+        weight: `mu`.
     """
-    hessian = np.zeros((len(y), len(y)))
+
+    y: np.ndarray
+    hessian: np.ndarray
+    weight: float
+
+
+def follow(barrier: Barrier, y: np.ndarray, weights: tuple[float, ...]) -> Centre | None:
+    """The last centre that is reached, from one weight to the next; None without any."""
+    last = None
     for weight in weights:
         centre = minimiser(barrier, y, weight)
         if centre is None:
-            return None
-        y, hessian = centre
-    return y, hessian
+            break
+        last, y = Centre(*centre, weight), centre[0]
+    return last
 
 
 def minimiser(

@@ -69,18 +69,19 @@ class Auto(AbstractSolver):
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
         """Propose the smallest ellipsoid around the successors, and its multipliers.
 
-        What counts here is the program without what is unused. Where the first solver ends without
-        an ellipsoid the other is asked.
+        What counts here is the program without what is unused. Where the one that is chosen fails,
+        the other is asked.
         """
         reduced = compact(program)
-        solvers = [self.small, self.large]
         if _is_lean(len(reduced.kept), len(reduced.columns) + len(program.objective.mid)):
-            solvers.reverse()
-        first = solvers[0].enclose(program, form)
-        if first.status == SolverStatus.SOLVED:
-            return first
-        second = solvers[1].enclose(program, form)
-        return first if second.status not in ANSWERS else second
+            first, second, enough = self.large, self.small, (SolverStatus.SOLVED,)
+        else:  # an inaccurate ellipsoid is centred anyhow
+            first, second, enough = self.small, self.large, ANSWERS
+        found = first.enclose(program, form)
+        if found.status in enough:
+            return found
+        other = second.enclose(program, form)
+        return other if other.status in ANSWERS else found
 
 
 def _is_lean(multipliers: int, size: int) -> bool:

@@ -180,6 +180,8 @@ def _end(
         barrier.price = price * barrier.n * barrier.q
         first = start()
         found = None if first is None else follow(barrier, first, weights)
-        if found is None or found.y[barrier.count] <= 2 * found.weight / barrier.price:
+        # it bounds alone the columns that no product does: of each, the moment takes mu / t
+        unit = (1 + barrier.n) * found.weight / barrier.price if found else np.inf
+        if found is None or found.y[barrier.count] <= unit:
             return found
     return None

@@ -116,10 +116,6 @@ class Barrier:
         whole[np.ix_(used, used)] = moments
         return whole
 
-    def is_thinnest(self, y: np.ndarray) -> bool:
-        """Whether the size is about as small as it may be."""
-        return bool(np.linalg.norm(np.tensordot(y[self.size], self.sizes, 1), 2) > 0.5 / THINNEST)
-
     def inside(self) -> np.ndarray:
         """A point inside, wherever the solution is: a large `t`, all else small."""
         y, t = np.zeros(self.size.stop), 1 / (2 * self.n)

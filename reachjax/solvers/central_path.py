@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from reachjax.solvers.barrier import Barrier
+from reachjax.solvers.barrier import AbstractBarrier
 
 STEPS = 200
 """Newton steps after which the centre counts as not found."""
@@ -22,7 +22,7 @@ QUADRATIC = 0.05
 
 
 def follow(
-    barrier: Barrier, y: np.ndarray, weights: tuple[float, ...]
+    barrier: AbstractBarrier, y: np.ndarray, weights: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The minimiser at the last of some weights, from one to the next, and the Hessian there.
 
@@ -38,7 +38,7 @@ def follow(
 
 
 def minimiser(
-    barrier: Barrier, y: np.ndarray, weight: float
+    barrier: AbstractBarrier, y: np.ndarray, weight: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Newton's method from a point inside: the minimiser and the Hessian there."""
     value, before = barrier.value(y, weight), np.inf

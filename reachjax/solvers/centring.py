@@ -18,10 +18,10 @@ import numpy as np
 
 from reachjax.lmi import Program, with_successor
 from reachjax.sets import NormalForm
-from reachjax.solvers.barrier import Barrier
 from reachjax.solvers.base import Enclosure, SolverStatus
 from reachjax.solvers.central_path import follow, solved
 from reachjax.solvers.compact import compact
+from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 from reachjax.solvers.host import all_finite
 
 WEIGHTS = (1e-6, 1e-7, 1e-8)
@@ -86,7 +86,7 @@ def enclosed(program: Program, given: NormalForm | None = None) -> Enclosure:
     began, reduced, proposal = time.perf_counter(), compact(program), Enclosure.blank(program)
     if len(reduced.kept) > LARGEST:
         return proposal._replace(status=np.array(int(SolverStatus.LIMIT)))
-    barrier = Barrier(reduced, given)
+    barrier = EllipsoidBarrier(reduced, given)
     found = _end(barrier, barrier.inside, FROM_AFAR + WEIGHTS)
     seconds = np.array(time.perf_counter() - began)
     if found is None:
@@ -111,7 +111,7 @@ def centred(
     reduced = compact(program)
     if len(reduced.kept) > LARGEST or not all_finite((multipliers, form)):
         return None
-    barrier = Barrier(reduced)
+    barrier = EllipsoidBarrier(reduced)
     found = _centre(barrier, multipliers, form)
     return None if found is None else barrier.unscaled(found[0], len(multipliers))
 
@@ -132,7 +132,7 @@ def sensitivity(
         cotangent: weights of `A` and `b`.
         frame: of the successor, in which the solution was centred.
     """
-    barrier = Barrier(compact(with_successor(program, frame)))
+    barrier = EllipsoidBarrier(compact(with_successor(program, frame)))
     found = None
     if all_finite((multipliers, form, cotangent)):
         found = _centre(barrier, multipliers, form.of(frame.inverse))
@@ -153,7 +153,7 @@ def sensitivity(
 
 
 def _centre(
-    barrier: Barrier, multipliers: np.ndarray, form: NormalForm
+    barrier: EllipsoidBarrier, multipliers: np.ndarray, form: NormalForm
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The minimiser at the last weight, from a point near it or not, and the Hessian there."""
     near = partial(barrier.near, multipliers, form, WEIGHTS[0])
@@ -161,14 +161,14 @@ def _centre(
 
 
 def _end(
-    barrier: Barrier, start: Callable[[], np.ndarray | None], weights: tuple[float, ...]
+    barrier: EllipsoidBarrier, start: Callable[[], np.ndarray | None], weights: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The minimiser at the last of some weights and the Hessian there.
 
     At too low a price `t` stays, and the ellipsoid is smaller than the relaxation itself allows.
     """
     for price in PRICES:
-        barrier.price = price * barrier.n * barrier.q
+        barrier.cost[barrier.count] = price * barrier.n * barrier.q
         first = start()
         found = None if first is None else follow(barrier, first, weights)
         if found is None or found[0][barrier.count] <= 2 * weights[-1] / barrier.price:

@@ -1,0 +1,136 @@
+"""Offsets on the central path at a chosen barrier weight: looser, and smooth in all data.
+
+An optimal offset has kinks: where a facet only touches, or an optimal point is not unique. The
+offset of the minimiser of a barrier function has none, is no smaller, and larger by the weight times
+the sizes of basis and multipliers at most. It moves as the implicit function theorem says, with the
+Hessian of that function.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.lmi import Program, lagrangian
+from reachjax.recheck import interval_offsets, sound_offsets
+from reachjax.solvers.base import Solution, SolverStatus
+from reachjax.solvers.central_path import minimiser_at, solved
+from reachjax.solvers.compact import CompactProgram, compact
+from reachjax.solvers.differentiable import asked_for
+from reachjax.solvers.facet_barrier import FacetBarrier
+from reachjax.solvers.host import all_finite, on_host, shapes_of
+
+
+class Slopes(NamedTuple):
+    """The derivative of each facet's offset `b` in its own units, as that of two Lagrangians.
+
+    Attributes:
+        multipliers: `(f, K)`, at the centre.
+        moments: `(f, n, n)`, how the moments there answer the offset.
+        multipliers_slope: `(f, K)`, how the multipliers answer it.
+        moments_slope: `(f, n, n)`, the moments there.
+    """
+
+    multipliers: np.ndarray
+    moments: np.ndarray
+    multipliers_slope: np.ndarray
+    moments_slope: np.ndarray
+
+    @classmethod
+    def unknown(cls, facets: int, count: int, size: int) -> Slopes:
+        """NaN throughout."""
+        vectors, matrices = np.full((facets, count), np.nan), np.full((facets, size, size), np.nan)
+        return cls(vectors, matrices, vectors.copy(), matrices.copy())
+
+
+def smoothed_offsets(
+    program: Program, weight: float
+) -> tuple[Float[Array, " f"], Solution]:
+    """The offsets of the centres, proved; differentiable in the program's rows.
+
+    Args:
+        program: the facets of one step.
+        weight: `mu`, in units of each facet's interval radius.
+
+    Returns:
+        The offsets `(f,)`, and the multipliers and moments (which have no derivative).
+    """
+    result: Any = _smoothed(weight, program.facts.mid, program.objective.mid, program)
+    offsets, _, solution, _ = result
+    return offsets, solution
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _smoothed(weight, facts, objective, program):
+    facets, size = objective.shape
+    count = program.products.free.shape[0]
+    solution = shapes_of(Solution.blank(facets, count, size))
+    numbers = jax.ShapeDtypeStruct((facets,), float)
+    slopes = shapes_of(Slopes.unknown(facets, count, size))
+    return on_host(partial(_solve, weight), (numbers, numbers, solution, slopes), program)
+
+
+def _forward(weight, facts, objective, program):
+    result: Any = _smoothed(weight, facts, objective, program)
+    return result, (program, *result[1:])
+
+
+def _backward(weight, residual, cotangents):
+    program, centred, solution, slopes = residual
+
+    def value(facts, objective):
+        center, linear = objective[:, -1], objective.at[:, -1].set(0.0)
+        unit = jnp.sum(abs(linear), axis=1)
+        size = jnp.where(unit > 0, unit, 1.0)
+        rows = program.with_midpoints(facts, linear / size[:, None])
+        flat = program.with_midpoints(facts, 0 * linear)
+        # of the slope only the derivative counts
+        slope = lagrangian(rows, slopes.multipliers, slopes.moments) - lagrangian(
+            flat, slopes.multipliers_slope, slopes.moments_slope
+        )
+        held = jax.lax.stop_gradient(size)
+        return center + unit * centred + held * (slope - jax.lax.stop_gradient(slope))
+
+    pull: Any = jax.vjp(value, program.facts.mid, program.objective.mid)[1]
+    return *pull(jnp.where(asked_for(cotangents[2]), jnp.nan, cotangents[0])), None
+
+
+_smoothed.defvjp(_forward, _backward)
+
+
+def _solve(weight: float, program: Program):
+    """Proved offsets, those of the centres in their units, the proposal, and its slopes."""
+    facets, size = program.objective.mid.shape
+    count = len(program.products.free)
+    solution, slopes = Solution.blank(facets, count, size), Slopes.unknown(facets, count, size)
+    centres = np.full(facets, np.nan)
+    if not all_finite(program):
+        return np.full(facets, np.nan), centres, solution, slopes
+    reduced = compact(program)
+    for i in range(facets):
+        began = time.perf_counter()
+        centres[i] = _centre(reduced, i, weight, solution, slopes)
+        solution.seconds[i] = time.perf_counter() - began
+    by_intervals = interval_offsets(program)
+    proved = np.fmin(sound_offsets(program, solution.multipliers), by_intervals)
+    solution.offsets[:] = reduced.centers + reduced.units * centres
+    ours = solution.statuses == SolverStatus.SOLVED
+    short = proved > solution.offsets + 1e-6 * (by_intervals - reduced.centers)
+    centres[short] = np.nan
+    return np.where(ours, np.fmax(proved, solution.offsets), proved), centres, solution, slopes
+
+
+def _centre(reduced: CompactProgram, i: int, weight: float, solution, slopes) -> float:
+    """The offset of a facet's centre in its units, the rest written in its place."""
+    used = np.ix_(reduced.columns, reduced.columns)
+    for part in (solution.moments, slopes.moments, slopes.moments_slope):
+        part[i] = 0.0
+    for part in (slopes.multipliers, slopes.multipliers_slope):
+        part[i] = 0.0
+    ...

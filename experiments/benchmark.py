@@ -28,13 +28,12 @@ os.environ.setdefault("RAYON_NUM_THREADS", "1")  # Clarabel's
 import jax
 import numpy as np
 import rich
-import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import reachjax as rj
 from experiments import double_integrator
-from experiments.command import blank_table
+from experiments.command import blank_table, require_folder, run_experiment
 from experiments.double_integrator import INITIAL_BOX, INPUT_BOX, A, B
 from experiments.reference import basis_sizes, paper_step
 from reachjax.solvers.compact import compact
@@ -283,6 +282,7 @@ def _plain(value):
 
 def main(settings: Settings) -> None:
     """Measure every method on every network; each table is printed as soon as it is complete."""
+    require_folder(settings.output)
     jax.config.update("jax_enable_x64", True)
     results, networks, named = [], cases(settings), methods(settings)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
@@ -302,4 +302,4 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    run_experiment(main, Settings)

@@ -21,9 +21,17 @@ def run_experiment(main: Callable[[Any], None], settings: type) -> None:
         raise SystemExit("interrupted: run again to continue with what is stored") from None
 
 
+def require_folder(output: Path) -> None:
+    """Make the folder of results, or raise a `ValueError` that says why it cannot be one."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"--output must be a folder, but {output} arrived: {error}") from None
+
+
 def configure_jax(output: Path) -> None:
     """64-bit floats, and a compilation cache in the folder of results."""
-    output.mkdir(parents=True, exist_ok=True)
+    require_folder(output)
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", str(output / "jax_cache"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

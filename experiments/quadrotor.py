@@ -62,7 +62,7 @@ class Settings:
     """Keep the paper's `|v| <= 1` in place of the goal, which they put out of reach: another MPC,
     sampled first (minutes)."""
     resample: bool = False
-    """Solve the MPC for all samples (minutes) and train on these, under `output/resampled`."""
+    """Solve the MPC for all samples (minutes) and train on these, in a folder `resampled`."""
     retrain: bool = False
     """Train again although the weights are there."""
     output: Path = Path("results/quadrotor")
@@ -83,15 +83,16 @@ class Settings:
     @property
     def folder(self) -> Path:
         """Where samples and weights are, and where results go."""
-        if self.velocity_limits:
-            return self.output / "velocity_limits"
-        return self.output / "resampled" if self.resample else self.output
+        folder = self.output / "velocity_limits" if self.velocity_limits else self.output
+        return folder / "resampled" if self.resample else folder
 
 
 def learn(settings: Settings) -> tuple[Samples, Fit]:
     """The samples and the network fitted to them, stored ones where there are."""
     if settings.folder == settings.output:
-        quadrotor_controller.use_committed(settings.folder)
+        learned = ("samples", "hidden", "training_steps", "penalty", "seed")
+        usual = all(getattr(settings, name) == getattr(Settings, name) for name in learned)
+        quadrotor_controller.use_committed(settings.folder, replacing=usual)
     mpc = quadrotor_controller.teacher(settings.velocity_limits)
     samples = quadrotor_controller.sample(mpc, settings.samples, settings.seed, settings.folder)
     fit = train_network(

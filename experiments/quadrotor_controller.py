@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from experiments import stored
 from experiments.imitation import evaluate
 from experiments.quadrotor_model import (
     INITIAL_CENTER,
@@ -89,12 +90,19 @@ def teacher(velocity_limits: bool) -> QuadrotorMPC:
     return QuadrotorMPC(horizon=70, velocity_limit=VELOCITY_LIMITS[1, 0] - VELOCITY_MARGIN)
 
 
-def use_committed(folder: Path) -> None:
-    """Copy the committed samples and weights into `folder`, where it has none of its own."""
+def use_committed(folder: Path, replacing: bool = False) -> None:
+    """Copy the committed samples and weights into `folder`, where it has none of its own.
+
+    With `replacing`, also where other settings made what is there; that is kept by another name.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("samples.npz", "weights.npz"):
-        if not (folder / name).exists():
-            shutil.copy(DATA / f"quadrotor_{name}", folder / name)
+        ours, theirs = folder / name, DATA / f"quadrotor_{name}"
+        if ours.exists():
+            if not replacing or stored.settings_of(ours) == stored.settings_of(theirs):
+                continue
+            ours.replace(ours.with_stem(f"{ours.stem}_of_other_settings"))
+        shutil.copy(theirs, ours)
 
 
 def sample(

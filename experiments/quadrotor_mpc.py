@@ -33,6 +33,8 @@ from experiments.quadrotor_model import ANGLE_LIMIT, GRAVITY, PERIOD
 
 MOST_ITERATIONS = 200
 """Of IPOPT; where there is a plan, it needs some 20."""
+INTERRUPTED = "NonIpopt_Exception_Thrown"
+"""What IPOPT makes of Ctrl-C, which it swallows."""
 STEEPEST = 0.65
 """Angles, in radians, up to which the program is convex."""
 
@@ -90,6 +92,8 @@ class QuadrotorMPC:
         if status == "Solve_Succeeded":
             angles_and_thrust = np.array(solution["x"])[: 3 * self.horizon].reshape(-1, 3)
             return np.hstack([np.tan(angles_and_thrust[:, :2]), angles_and_thrust[:, 2:]])
+        if status == INTERRUPTED:
+            raise KeyboardInterrupt
         if not self._has_plan(x):
             return None
         raise RuntimeError(f"the MPC program at x = {x} has a plan, but IPOPT ended with {status}")

@@ -18,7 +18,7 @@ from experiments.command import at_least_one, bar
 from experiments.mpc import LinearMPC
 
 # Candidate states are drawn in blocks of this size. The file is written after each block, so an
-# interruption loses a fraction of a second.
+# interruption loses one block: a fraction of a second, or some ten for a nonlinear MPC.
 CANDIDATES = 200
 
 

@@ -12,6 +12,15 @@ import numpy as np
 import rich
 
 
+def settings_of(path):
+    """The settings that made a file, None where it cannot be read."""
+    try:
+        with np.load(path) as file:
+            return json.loads(str(file["settings"]))
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return None
+
+
 def load(path, settings):
     """The arrays at `path` if `settings` made them, else None."""
     if path is None or not Path(path).exists():

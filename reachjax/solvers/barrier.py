@@ -142,4 +142,5 @@ def _together(generators: Pairs, others: Pairs) -> Pairs:
 
 def inverse_factor(matrix: np.ndarray) -> np.ndarray:
     """The inverse of the Cholesky factor."""
-    return solve_triangular(np.linalg.cholesky(matrix), np.eye(len(matrix)), lower=True)
+    factor = np.linalg.cholesky(matrix)
+    return solve_triangular(factor, np.eye(len(matrix)), lower=True, check_finite=False)

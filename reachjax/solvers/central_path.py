@@ -72,12 +72,12 @@ def solved(hessian: np.ndarray, vector: np.ndarray) -> np.ndarray:
     matrix = hessian * np.outer(scale, scale)
     for shift in 1e-14 * 100.0 ** np.arange(4):
         try:
-            factor = cho_factor(matrix + shift * np.eye(len(matrix)))
+            factor = cho_factor(matrix + shift * np.eye(len(matrix)), check_finite=False)
             break
         except LinAlgError:
             continue
     else:
         return np.full(len(vector), np.nan)
-    solution = cho_solve(factor, scale * vector)
+    solution = cho_solve(factor, scale * vector, check_finite=False)
     residual = scale * vector - matrix @ solution  # one step of refinement
-    return scale * (solution + cho_solve(factor, residual))
+    return scale * (solution + cho_solve(factor, residual, check_finite=False))

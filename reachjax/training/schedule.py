@@ -57,8 +57,10 @@ class PenaltySchedule(Replaceable):
             TypeError: the step is no whole number.
             ValueError: it is negative.
         """
-        if is_concrete(step) and np.ndim(step) == 0:
-            whole_number("step", step, 0)
+        if not jnp.issubdtype(jnp.result_type(step), jnp.integer):
+            raise TypeError(f"step must be a whole number, but {described(step)} arrived")
+        if is_concrete(step) and np.min(step) < 0:
+            raise ValueError(f"step must be at least 0, but {step} arrived")
         since = jnp.asarray(step) - self.warmup
         computed = (since >= 0) & (since % self.every == 0)
         grown = jnp.minimum(1.0, (since + 1) / max(self.ramp, 1))
@@ -92,11 +94,15 @@ class PenaltySchedule(Replaceable):
             raise ValueError(f"step must be one number, but one of shape {weight.shape} arrived")
 
         def weighed(*arguments):
-            value = jnp.asarray(penalty(*arguments))
-            if value.shape != ():
-                raise ValueError(
-                    f"penalty must give one number, but an array of shape {value.shape} arrived"
-                )
+            given = penalty(*arguments)
+            expected = "penalty must give one real number"
+            try:
+                value = jnp.asarray(given)
+            except (TypeError, ValueError):
+                raise TypeError(f"{expected}, but {described(given)} arrived") from None
+            if value.shape != () or jnp.iscomplexobj(value):
+                kind = f"an array of shape {value.shape} and kind {value.dtype}"
+                raise ValueError(f"{expected}, but {kind} arrived")
             return (weight * value).astype(weight.dtype)
 
         def nothing(*_):

@@ -24,6 +24,7 @@ from experiments import (
     quadrotor_controller,
     quadrotor_report,
     quadrotor_simulation,
+    stored,
 )
 from experiments.imitation import evaluate
 from experiments.quadrotor import Settings, certify, closed_loop, learn, loop_with, main
@@ -290,6 +291,26 @@ def test_the_teacher_with_velocity_limits_has_a_plan_within_them():
     mpc = quadrotor_controller.teacher(velocity_limits=True)
     states = flown(mpc, INITIAL_CENTER, STEPS)
     assert np.all(abs(states[1:, 3:]) <= 0.9 + 1e-6)
+
+
+def test_files_of_other_settings_make_way_for_the_committed_ones_and_are_kept(tmp_path):
+    quadrotor_controller.use_committed(tmp_path)
+    ours = tmp_path / "weights.npz"
+    committed = ours.read_bytes()
+    stored.save(ours, {"seed": -1}, W0=np.ones(1))
+    other = ours.read_bytes()
+    quadrotor_controller.use_committed(tmp_path)
+    assert ours.read_bytes() == other
+    quadrotor_controller.use_committed(tmp_path, replacing=True)
+    assert ours.read_bytes() == committed
+    assert (tmp_path / "weights_of_other_settings.npz").read_bytes() == other
+
+
+@pytest.mark.parametrize("velocity_limits", [False, True])
+def test_new_samples_never_overwrite_the_committed_ones(tmp_path, velocity_limits):
+    settings = Settings(output=tmp_path, velocity_limits=velocity_limits)
+    anew = Settings(output=tmp_path, velocity_limits=velocity_limits, resample=True)
+    assert anew.folder == settings.folder / "resampled"
 
 
 def test_an_interrupted_resampling_continues(tmp_path, monkeypatch):

@@ -196,6 +196,20 @@ def test_giving_up_is_not_taken_for_infeasible(mpc, monkeypatch):
                 hasty.plan(x)
 
 
+def test_an_interruption_inside_ipopt_is_one(mpc, monkeypatch):
+    class Swallowing:
+        def __call__(self, **_):
+            return {}
+
+        def stats(self):
+            return {"return_status": "NonIpopt_Exception_Thrown"}
+
+    interrupted = replace(mpc)
+    monkeypatch.setitem(vars(interrupted), "_program", (Swallowing(), {}))
+    with pytest.raises(KeyboardInterrupt):
+        interrupted.plan(np.zeros(6))
+
+
 def test_the_program_is_convex_up_to_the_steepest_angle_and_not_much_beyond():
     s = np.linspace(0, np.tan(STEEPEST), 1001)
     assert np.all(np.diff(np.arctan(s) ** 2, 2) > 0)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.command import require_folder
 from experiments.mpc import LinearMPC
 from experiments.sampling import sample_draws, sample_policy
 
@@ -150,3 +151,11 @@ def test_draws_that_are_never_feasible_are_named():
 def test_no_samples_is_an_error():
     with pytest.raises(ValueError, match="count must be at least 1, got 0"):
         sample(0)
+
+
+@pytest.mark.parametrize("below", ["", "x"])
+def test_results_go_to_a_folder_or_the_option_is_named(tmp_path, below):
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(ValueError, match=r"--output must be a folder, but .* arrived"):
+        require_folder(file / below)

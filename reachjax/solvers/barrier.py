@@ -37,10 +37,11 @@ class AbstractBarrier(abc.ABC):
         others: what the other variables add to `Z` `(N, N)`, whose first `n` columns are the
             program's.
         constant: `(N, N)`, `Z` at zero.
+        unit: of the price of `t`: the size that the trace of the moments may have.
     """
 
-    def __init__(self, program: CompactProgram, others: Pairs, constant: np.ndarray):
-        self.program = program
+    def __init__(self, program: CompactProgram, others: Pairs, constant: np.ndarray, unit: float):
+        self.program, self.unit = program, unit
         self.n, self.count = program.objective.shape[1], len(program.kept)
         self.signed = np.r_[np.flatnonzero(~program.free), self.count]
         self.terms = _together(program.generators, others)

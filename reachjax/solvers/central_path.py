@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from reachjax.solvers.barrier import AbstractBarrier
+
+FROM_AFAR = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 1e-5)
+"""Weights to begin with far from the path. Measured with every neuron kept: the first takes some 60
+Newton steps and each of the others about ten; beginning at 0.1 takes 200."""
+
+PRICES = (10.0, 100.0, 1000.0)
+"""Prices of `t` that are tried, in units of the sizes of basis and successor. The trace of moments
+stays below the price; with many neurons kept, 1 was seen to be too low by half."""
 
 STEPS = 200
 """Newton steps after which the centre counts as not found."""
@@ -19,6 +29,22 @@ directions in which the function is flat."""
 
 QUADRATIC = 0.05
 """The squared decrement, in units of `mu`, below which full Newton steps surely converge."""
+
+
+def path_end(
+    barrier: AbstractBarrier, start: Callable[[], np.ndarray | None], weights: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The minimiser at the last of some weights and the Hessian there.
+
+    At too low a price `t` stays, and the ellipsoid is smaller than the relaxation itself allows.
+    """
+    for price in PRICES:
+        barrier.cost[barrier.count] = price * barrier.unit
+        first = start()
+        found = None if first is None else follow(barrier, first, weights)
+        if found is None or found[0][barrier.count] <= 2 * weights[-1] / barrier.price:
+            return found
+    return None
 
 
 def follow(

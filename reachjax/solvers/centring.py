@@ -10,7 +10,6 @@ derivative is exact.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -19,7 +18,7 @@ import numpy as np
 from reachjax.lmi import Program, with_successor
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import Enclosure, SolverStatus
-from reachjax.solvers.central_path import follow, solved
+from reachjax.solvers.central_path import FROM_AFAR, path_end, solved
 from reachjax.solvers.compact import compact
 from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 from reachjax.solvers.host import all_finite
@@ -28,14 +27,6 @@ WEIGHTS = (1e-6, 1e-7, 1e-8)
 """Barrier weights `mu`, followed downwards. At the last one the logarithm of the volume is off by
 that times the number of multipliers, at most. Derivatives lose digits below it, as the matrices
 become singular: ten times smaller, one of a thin ellipsoid was off by 7e-4, not by 1e-5."""
-
-FROM_AFAR = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 1e-5)
-"""Weights to begin with far from the path. Measured with every neuron kept: the first takes some 60
-Newton steps and each of the others about ten; beginning at 0.1 takes 200."""
-
-PRICES = (10.0, 100.0, 1000.0)
-"""Prices of `t` that are tried, in units of the sizes of basis and successor. The trace of moments
-stays below the price; with many neurons kept, 1 was seen to be too low by half."""
 
 LARGEST = 1500
 """Multipliers, beyond which a solver's point is taken as it is: a step costs their cube."""
@@ -87,7 +78,7 @@ def enclosed(program: Program, given: NormalForm | None = None) -> Enclosure:
     if len(reduced.kept) > LARGEST:
         return proposal._replace(status=np.array(int(SolverStatus.LIMIT)))
     barrier = EllipsoidBarrier(reduced, given)
-    found = _end(barrier, barrier.inside, FROM_AFAR + WEIGHTS)
+    found = path_end(barrier, barrier.inside, FROM_AFAR + WEIGHTS)
     seconds = np.array(time.perf_counter() - began)
     if found is None:
         return proposal._replace(seconds=seconds)
@@ -157,20 +148,6 @@ def _centre(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The minimiser at the last weight, from a point near it or not, and the Hessian there."""
     near = partial(barrier.near, multipliers, form, WEIGHTS[0])
-    return _end(barrier, near, WEIGHTS) or _end(barrier, barrier.inside, FROM_AFAR + WEIGHTS)
-
-
-def _end(
-    barrier: EllipsoidBarrier, start: Callable[[], np.ndarray | None], weights: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """The minimiser at the last of some weights and the Hessian there.
-
-    At too low a price `t` stays, and the ellipsoid is smaller than the relaxation itself allows.
-    """
-    for price in PRICES:
-        barrier.cost[barrier.count] = price * barrier.n * barrier.q
-        first = start()
-        found = None if first is None else follow(barrier, first, weights)
-        if found is None or found[0][barrier.count] <= 2 * weights[-1] / barrier.price:
-            return found
-    return None
+    return path_end(barrier, near, WEIGHTS) or path_end(
+        barrier, barrier.inside, FROM_AFAR + WEIGHTS
+    )

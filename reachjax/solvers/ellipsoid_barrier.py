@@ -35,7 +35,9 @@ class EllipsoidBarrier(AbstractBarrier):
         else:
             self.forms, self.sizes = _sizes_of(program.to_unit_box(given))
         constant = np.diag(np.r_[np.zeros(n - 1), 1.0, np.ones(self.q)])
-        super().__init__(program, _schur_pairs(program.objective, self.forms), constant)
+        super().__init__(
+            program, _schur_pairs(program.objective, self.forms), constant, float(n * self.q)
+        )
 
     def form(self, y: np.ndarray) -> NormalForm:
         """`R` and `r`."""

@@ -26,8 +26,7 @@ from reachjax.solvers.accepted import ANSWERS, accepted_enclosure, log_volume
 from reachjax.solvers.base import AbstractSolver, Enclosure, SolverStatus
 from reachjax.solvers.centring import Sensitivity, centred, sensitivity
 from reachjax.solvers.compact import compact
-from reachjax.solvers.differentiable import asked_for
-from reachjax.solvers.host import all_finite, on_host, shapes_of
+from reachjax.solvers.host import all_finite, asked_for, on_host, shapes_of
 
 ATTEMPTS = 3
 """How often a program is solved, each time in better coordinates."""

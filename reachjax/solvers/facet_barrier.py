@@ -27,7 +27,7 @@ class FacetBarrier(AbstractBarrier):
         n, row = program.objective.shape[1], program.objective[facet]
         e, zero = np.eye(n)[-1:], np.zeros(1, dtype=int)
         corner = Pairs(e, left=zero, right=zero, sharing=sp.csr_array([[2.0]]))
-        super().__init__(program, corner, -np.outer(row, e) - np.outer(e, row))
+        super().__init__(program, corner, -np.outer(row, e) - np.outer(e, row), float(n))
         self.cost[-1] = 1.0
 
     def inside(self) -> np.ndarray:

@@ -151,6 +151,9 @@ class InteriorPoint(AbstractSolver):
         tolerance: of residuals and gap, relative, that counts as solved. Iterations go on to a
             thousandth of it as long as they gain, which most programs reach.
         max_iterations: a facet that needs more is reported with status `LIMIT`.
+        smoothing: a barrier weight, in units of each facet's interval radius. Above 0, offsets are
+            those on the central path there: looser by at most that times the number of basis
+            entries and multipliers, without kinks, and with derivatives of that smooth function.
 
     Raises:
         TypeError: an option is no number.
@@ -167,6 +170,7 @@ class InteriorPoint(AbstractSolver):
 
     tolerance: float = 1e-6
     max_iterations: int = 200
+    smoothing: float = 0.0
 
     def __post_init__(self):
         require_positive(self)

@@ -1,9 +1,9 @@
 """Offsets on the central path at a chosen barrier weight: looser, and smooth in all data.
 
 An optimal offset has kinks: where a facet only touches, or an optimal point is not unique. The
-offset of the minimiser of a barrier function has none, is no smaller, and larger by the weight times
-the sizes of basis and multipliers at most. It moves as the implicit function theorem says, with the
-Hessian of that function.
+offset of the minimiser of a barrier function has none, is no smaller, and larger by at most the
+weight times the number of basis entries and multipliers. It moves as the implicit function theorem
+says, with the Hessian of that function.
 """
 
 from __future__ import annotations
@@ -20,11 +20,10 @@ from jaxtyping import Array, Float
 from reachjax.lmi import Program, lagrangian
 from reachjax.recheck import interval_offsets, sound_offsets
 from reachjax.solvers.base import Solution, SolverStatus
-from reachjax.solvers.central_path import minimiser_at, solved
+from reachjax.solvers.central_path import FROM_AFAR, path_end, solved
 from reachjax.solvers.compact import CompactProgram, compact
-from reachjax.solvers.differentiable import asked_for
 from reachjax.solvers.facet_barrier import FacetBarrier
-from reachjax.solvers.host import all_finite, on_host, shapes_of
+from reachjax.solvers.host import all_finite, asked_for, on_host, shapes_of
 
 
 class Slopes(NamedTuple):
@@ -49,9 +48,7 @@ class Slopes(NamedTuple):
         return cls(vectors, matrices, vectors.copy(), matrices.copy())
 
 
-def smoothed_offsets(
-    program: Program, weight: float
-) -> tuple[Float[Array, " f"], Solution]:
+def smoothed_offsets(program: Program, weight: float) -> tuple[Float[Array, " f"], Solution]:
     """The offsets of the centres, proved; differentiable in the program's rows.
 
     Args:
@@ -78,11 +75,12 @@ def _smoothed(weight, facts, objective, program):
 
 def _forward(weight, facts, objective, program):
     result: Any = _smoothed(weight, facts, objective, program)
-    return result, (program, *result[1:])
+    _, centred, _, slopes = result
+    return result, (program, centred, slopes)
 
 
 def _backward(weight, residual, cotangents):
-    program, centred, solution, slopes = residual
+    program, centred, slopes = residual
 
     def value(facts, objective):
         center, linear = objective[:, -1], objective.at[:, -1].set(0.0)
@@ -118,7 +116,7 @@ def _solve(weight: float, program: Program):
         centres[i] = _centre(reduced, i, weight, solution, slopes)
         solution.seconds[i] = time.perf_counter() - began
     by_intervals = interval_offsets(program)
-    proved = np.fmin(sound_offsets(program, solution.multipliers), by_intervals)
+    proved = np.fmin(sound_offsets(program, np.asarray(solution.multipliers)), by_intervals)
     solution.offsets[:] = reduced.centers + reduced.units * centres
     ours = solution.statuses == SolverStatus.SOLVED
     short = proved > solution.offsets + 1e-6 * (by_intervals - reduced.centers)
@@ -126,11 +124,33 @@ def _solve(weight: float, program: Program):
     return np.where(ours, np.fmax(proved, solution.offsets), proved), centres, solution, slopes
 
 
-def _centre(reduced: CompactProgram, i: int, weight: float, solution, slopes) -> float:
-    """The offset of a facet's centre in its units, the rest written in its place."""
+def _centre(
+    reduced: CompactProgram, i: int, weight: float, solution: Solution, slopes: Slopes
+) -> float:
+    """The offset of a facet's centre in its units, NaN where none is found; the rest is written."""
+    if reduced.units[i] == 0:  # one value, whatever the weight
+        for part in (*slopes, solution.moments):
+            part[i] = 0.0
+        solution.moments[i, -1, -1], solution.statuses[i] = 1.0, SolverStatus.SOLVED
+        return 0.0
+    barrier = FacetBarrier(reduced, i)
+    weights = (*(each for each in FROM_AFAR if each > weight), weight)
+    found = path_end(barrier, barrier.inside, weights)
+    if found is None:
+        return np.nan
+    (y, hessian), count = found, solution.multipliers.shape[1]
+    move, inverse = (
+        solved(hessian, barrier.cost * (np.arange(len(y)) == len(y) - 1)),
+        barrier.inverse(y),
+    )
+    answer = inverse @ barrier.weighted(move) @ inverse
+    for part, vector in ((slopes.multipliers, y), (slopes.multipliers_slope, move)):
+        part[i] = barrier.multipliers(vector, count)
     used = np.ix_(reduced.columns, reduced.columns)
-    for part in (solution.moments, slopes.moments, slopes.moments_slope):
+    moments = (slopes.moments, answer), (slopes.moments_slope, inverse), (solution.moments, inverse)
+    for part, matrix in moments:
         part[i] = 0.0
-    for part in (slopes.multipliers, slopes.multipliers_slope):
-        part[i] = 0.0
-    ...
+        part[i][used] = 2 * weight * matrix
+    solution.multipliers[i] = reduced.units[i] * slopes.multipliers[i]
+    solution.statuses[i] = SolverStatus.SOLVED
+    return float(y[-1])

@@ -19,11 +19,13 @@ from jaxtyping import Array, Float
 
 from reachjax.lmi import Program, lagrangian
 from reachjax.recheck import interval_offsets, sound_offsets
+from reachjax.solvers.barrier import DAMPING
 from reachjax.solvers.base import Solution, SolverStatus
 from reachjax.solvers.central_path import FROM_AFAR, path_end, solved
 from reachjax.solvers.compact import CompactProgram, compact
 from reachjax.solvers.facet_barrier import FacetBarrier
 from reachjax.solvers.host import all_finite, asked_for, on_host, shapes_of
+from reachjax.solvers.trimming import trimmed
 
 
 class Slopes(NamedTuple):
@@ -92,6 +94,9 @@ def _backward(weight, residual, cotangents):
         slope = lagrangian(rows, slopes.multipliers, slopes.moments) - lagrangian(
             flat, slopes.multipliers_slope, slopes.moments_slope
         )
+        # damping is of multipliers of generators of unit size
+        together = slopes.multipliers * slopes.multipliers_slope
+        slope -= DAMPING * weight * together @ trimmed(rows).sizes ** 2
         held = jax.lax.stop_gradient(size)
         return center + unit * centred + held * (slope - jax.lax.stop_gradient(slope))
 

@@ -9,11 +9,9 @@ from reachjax.lmi import Program, form_rows
 from reachjax.recheck import interval_offsets, sound_level, sound_offsets
 from reachjax.rounding import gamma
 from reachjax.sets import NormalForm
-from reachjax.solvers.base import Enclosure, Solution, SolverStatus
+from reachjax.solvers.base import ANSWERS, Enclosure, Solution
 from reachjax.solvers.compact import TINY, compact
 from reachjax.solvers.trimming import Trimmed, summed, trimmed
-
-ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
 
 SHORTFALL = 1e-3
 """A claim counts as the optimum if multipliers and moments bear it out to this part of what is

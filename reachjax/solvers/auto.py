@@ -7,23 +7,27 @@ import dataclasses
 from reachjax.checks import whole_number
 from reachjax.lmi import Program
 from reachjax.sets import NormalForm
-from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, SolverStatus
+from reachjax.solvers.base import ANSWERS, AbstractSolver, Enclosure, Solution, SolverStatus
+from reachjax.solvers.compact import compact
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import Clarabel
 
 
 @dataclasses.dataclass(frozen=True)
 class Auto(AbstractSolver):
-    """Clarabel for the facets of small programs, the interior-point method for all else.
+    """Clarabel for small programs and very many products, the interior-point method for others.
 
-    The choice depends on the size of the basis alone, so that it is the same inside `jax.jit`, and
+    Clarabel's time grows with the entries of the matrix, `n (n + 1) / 2`, the interior-point
+    method's with the number of multipliers, so the latter is chosen where these are fewer. For
+    facets the choice depends on shapes alone, so that it is the same inside `jax.jit`, and
     `choice(certificate.program)` tells which solver a certificate's multipliers came from.
 
     Args:
-        small: what solves programs up to the limit.
-        large: what solves larger ones.
-        limit: the largest basis, with its constant, that counts as small. Measured: per facet both
-            take as long at some 25 entries, and a compilation is worth some facets more.
+        small: what solves facets of programs up to the limit, and programs of more multipliers
+            than entries.
+        large: what solves the others.
+        limit: the largest basis, with its constant, that counts as small for facets. Measured: per
+            facet both take as long at some 25 entries, and a compilation is worth some facets more.
 
     Raises:
         TypeError: an option is of another kind.
@@ -51,7 +55,8 @@ class Auto(AbstractSolver):
 
     def choice(self, program: Program) -> AbstractSolver:
         """What solves the facets of this program."""
-        return self.large if len(program.transform) > self.limit else self.small
+        size, count = len(program.transform), len(program.products.free)
+        return self.large if size > self.limit and _is_lean(count, size) else self.small
 
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet."""
@@ -64,7 +69,21 @@ class Auto(AbstractSolver):
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
         """Propose the smallest ellipsoid around the successors, and its multipliers.
 
-        The `small` solver is asked where the `large` one ends without.
+        What counts here is the program without what is unused. Where the one that is chosen fails,
+        the other is asked.
         """
-        found = self.large.enclose(program, form)
-        return found if found.status == SolverStatus.SOLVED else self.small.enclose(program, form)
+        reduced = compact(program)
+        if _is_lean(len(reduced.kept), len(reduced.columns) + len(program.objective.mid)):
+            first, second, enough = self.large, self.small, (SolverStatus.SOLVED,)
+        else:  # an inaccurate ellipsoid is centred anyhow
+            first, second, enough = self.small, self.large, ANSWERS
+        found = first.enclose(program, form)
+        if found.status in enough:
+            return found
+        other = second.enclose(program, form)
+        return other if other.status in ANSWERS else found
+
+
+def _is_lean(multipliers: int, size: int) -> bool:
+    """Whether there are fewer multipliers than entries of a symmetric matrix."""
+    return multipliers < size * (size + 1) / 2

@@ -79,7 +79,7 @@ class AbstractBarrier(abc.ABC):
 
     def inverse(self, y: np.ndarray) -> np.ndarray:
         """`Z^-1`, positive semidefinite whatever the rounding."""
-        factor = inverse_factor(self.schur(y))
+        factor = inverse_cholesky(self.schur(y))
         return factor.T @ factor
 
     def multipliers(self, y: np.ndarray, count: int) -> np.ndarray:
@@ -105,7 +105,7 @@ class AbstractBarrier(abc.ABC):
 
     def derivatives(self, y: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and Hessian."""
-        factor = inverse_factor(self.schur(y))
+        factor = inverse_cholesky(self.schur(y))
         inverse = factor.T @ factor
         moved = inverse @ self.states @ inverse
         gradient = self.cost - weight * self.terms.paired(inverse)
@@ -119,7 +119,7 @@ class AbstractBarrier(abc.ABC):
         gradient[self.signed] -= weight / y[self.signed]
         hessian[self.signed, self.signed] += weight / y[self.signed] ** 2
         for each, block, slopes in self.blocks(y, weight):
-            factor = inverse_factor(block)
+            factor = inverse_cholesky(block)
             scaled = factor @ slopes @ factor.T
             flat = scaled.reshape(len(scaled), -1)
             gradient[self.others] -= each * np.trace(scaled, axis1=1, axis2=2)
@@ -141,7 +141,7 @@ def _together(generators: Pairs, others: Pairs) -> Pairs:
     )
 
 
-def inverse_factor(matrix: np.ndarray) -> np.ndarray:
+def inverse_cholesky(matrix: np.ndarray) -> np.ndarray:
     """The inverse of the Cholesky factor."""
     factor = np.linalg.cholesky(matrix)
     return solve_triangular(factor, np.eye(len(matrix)), lower=True, check_finite=False)

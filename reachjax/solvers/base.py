@@ -37,6 +37,9 @@ class SolverStatus(enum.IntEnum):
         return _ADVICE[self]
 
 
+ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
+"""The ends after which there is a proposal."""
+
 _ADVICE = {
     SolverStatus.SOLVED: "solved to the tolerance asked for",
     SolverStatus.INACCURATE: "the tolerance was not reached: the bound is sound, perhaps loose; "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
@@ -31,10 +32,24 @@ QUADRATIC = 0.05
 """The squared decrement, in units of `mu`, below which full Newton steps surely converge."""
 
 
+class Centre(NamedTuple):
+    """A point of the path.
+
+    Attributes:
+        y: the minimiser.
+        hessian: of the barrier function there.
+        weight: `mu`.
+    """
+
+    y: np.ndarray
+    hessian: np.ndarray
+    weight: float
+
+
 def path_end(
     barrier: AbstractBarrier, start: Callable[[], np.ndarray | None], weights: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """The minimiser at the last of some weights and the Hessian there.
+) -> Centre | None:
+    """The last centre that is reached.
 
     At too low a price `t` stays, and the ellipsoid is smaller than the relaxation itself allows.
     """
@@ -42,25 +57,20 @@ def path_end(
         barrier.cost[barrier.count] = price * barrier.unit
         first = start()
         found = None if first is None else follow(barrier, first, weights)
-        if found is None or found[0][barrier.count] <= 2 * weights[-1] / barrier.price:
+        if found is None or found.y[barrier.count] <= 2 * found.weight / barrier.price:
             return found
     return None
 
 
-def follow(
-    barrier: AbstractBarrier, y: np.ndarray, weights: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """The minimiser at the last of some weights, from one to the next, and the Hessian there.
-
-    None where one of them is not reached.
-    """
-    hessian = np.zeros((len(y), len(y)))
+def follow(barrier: AbstractBarrier, y: np.ndarray, weights: tuple[float, ...]) -> Centre | None:
+    """The last centre that is reached, from one weight to the next; None without any."""
+    last = None
     for weight in weights:
         centre = minimiser(barrier, y, weight)
         if centre is None:
-            return None
-        y, hessian = centre
-    return y, hessian
+            break
+        last, y = Centre(*centre, weight), centre[0]
+    return last
 
 
 def minimiser(

@@ -18,15 +18,19 @@ import numpy as np
 from reachjax.lmi import Program, with_successor
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import Enclosure, SolverStatus
-from reachjax.solvers.central_path import FROM_AFAR, path_end, solved
+from reachjax.solvers.central_path import FROM_AFAR, Centre, path_end, solved
 from reachjax.solvers.compact import compact
 from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 from reachjax.solvers.host import all_finite
 
 WEIGHTS = (1e-6, 1e-7, 1e-8)
 """Barrier weights `mu`, followed downwards. At the last one the logarithm of the volume is off by
-that times the number of multipliers, at most. Derivatives lose digits below it, as the matrices
-become singular: ten times smaller, one of a thin ellipsoid was off by 7e-4, not by 1e-5."""
+that times the number of multipliers and rows, and by the damping of large multipliers (2e-6 where
+they were 1400). Derivatives lose digits below it, as the matrices become singular: ten times
+smaller, one of a thin ellipsoid was off by 7e-4, not by 1e-5."""
+
+USEFUL = 1e-3
+"""A path that is lost at a smaller weight still gives an ellipsoid, looser by that as above."""
 
 LARGEST = 1500
 """Multipliers, beyond which a solver's point is taken as it is: a step costs their cube."""
@@ -74,22 +78,24 @@ def enclosed(program: Program, given: NormalForm | None = None) -> Enclosure:
         program: whose objective rows are the successor's.
         given: the ellipsoid up to a factor on `A` and `b`; free if it is None.
     """
-    began, reduced, proposal = time.perf_counter(), compact(program), Enclosure.blank(program)
-    if len(reduced.kept) > LARGEST:
-        return proposal._replace(status=np.array(int(SolverStatus.LIMIT)))
+    began, proposal = time.perf_counter(), Enclosure.blank(program)
+    if not all_finite((program, given)) or (given is not None and not given.A.any()):
+        return proposal
+    reduced = compact(program)
+    if len(reduced.kept) > LARGEST or not len(reduced.columns):
+        return proposal
     barrier = EllipsoidBarrier(reduced, given)
     found = path_end(barrier, barrier.inside, FROM_AFAR + WEIGHTS)
     seconds = np.array(time.perf_counter() - began)
-    if found is None:
+    if found is None or found.weight > USEFUL:
         return proposal._replace(seconds=seconds)
-    y = found[0]
-    if given is not None and barrier.is_thinnest(y):
+    if given is not None and barrier.is_thinnest(found.y):
         unbounded = np.array(int(SolverStatus.UNBOUNDED))
         return proposal._replace(status=unbounded, seconds=seconds)
-    multipliers, form = barrier.unscaled(y, len(proposal.multipliers))
-    moments = barrier.whole(WEIGHTS[-1] * barrier.inverse(y), len(program.transform))
-    status = np.array(int(SolverStatus.SOLVED))
-    return Enclosure(form, multipliers, moments, status, seconds)
+    multipliers, form = barrier.unscaled(found.y, len(proposal.multipliers))
+    moments = barrier.whole(found.weight * barrier.inverse(found.y), len(program.transform))
+    ended = SolverStatus.SOLVED if found.weight == WEIGHTS[-1] else SolverStatus.INACCURATE
+    return Enclosure(form, multipliers, moments, np.array(int(ended)), seconds)
 
 
 def centred(
@@ -104,7 +110,7 @@ def centred(
         return None
     barrier = EllipsoidBarrier(reduced)
     found = _centre(barrier, multipliers, form)
-    return None if found is None else barrier.unscaled(found[0], len(multipliers))
+    return None if found is None else barrier.unscaled(found.y, len(multipliers))
 
 
 def sensitivity(
@@ -123,14 +129,15 @@ def sensitivity(
         cotangent: weights of `A` and `b`.
         frame: of the successor, in which the solution was centred.
     """
+    if not all_finite((program, multipliers, form, cotangent, frame)):
+        return Sensitivity.unknown(program)
     barrier = EllipsoidBarrier(compact(with_successor(program, frame)))
     found = None
-    if all_finite((multipliers, form, cotangent)):
+    if barrier.count <= LARGEST:
         found = _centre(barrier, multipliers, form.of(frame.inverse))
     if found is None:
         return Sensitivity.unknown(program)
-    y, hessian = found
-    weight = WEIGHTS[-1]
+    y, hessian, weight = found
     # the transpose of `.of(frame)`
     framed = NormalForm(cotangent.A @ frame.A.T + np.outer(cotangent.b, frame.b), cotangent.b)
     w = solved(hessian, barrier.vector(framed))
@@ -143,11 +150,11 @@ def sensitivity(
     return Sensitivity(*halves)
 
 
-def _centre(
-    barrier: EllipsoidBarrier, multipliers: np.ndarray, form: NormalForm
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """The minimiser at the last weight, from a point near it or not, and the Hessian there."""
+def _centre(barrier: EllipsoidBarrier, multipliers: np.ndarray, form: NormalForm) -> Centre | None:
+    """The centre at the last weight, from a point near it or not; None where it is not reached."""
     near = partial(barrier.near, multipliers, form, WEIGHTS[0])
-    return path_end(barrier, near, WEIGHTS) or path_end(
-        barrier, barrier.inside, FROM_AFAR + WEIGHTS
-    )
+    for start, weights in ((near, WEIGHTS), (barrier.inside, FROM_AFAR + WEIGHTS)):
+        found = path_end(barrier, start, weights)
+        if found is not None and found.weight == WEIGHTS[-1]:
+            return found
+    return None

@@ -21,7 +21,7 @@ TINY = 1e-100
 
 
 class CompactProgram(NamedTuple):
-    """`sum_k y_k G_k + p e' + e p' - 2 b e e' <= 0` with `|G_k| = 1`, in `n` used columns.
+    """`sum_k y_k G_k + p e' + e p' - 2 b e e' <= 0` with `|G_k|` about 1, in `n` used columns.
 
     Attributes:
         generators: the `G_k`.

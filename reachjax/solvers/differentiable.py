@@ -11,10 +11,11 @@ is NaN unless the solver reports `SOLVED` with an optimal value that its multipl
 moments attain, so that no number of a failed solve reaches an optimiser. What a solver proposes
 (multipliers, moments, its own offsets) has no derivative: asking for one gives NaN.
 
-**Accuracy.** The derivative is as good as the solver: at its default tolerance of 1e-9 the tests
-hold it to 1e-3 of fourth-order differences, over one step and over five. At 1e-6 it was off by up
-to 3e-3, at 1e-4 by up to 7e-2 (of its norm). Flat sets and points keep these digits; of sets, and
-input ranges, of a width below some 1e-8 of their size the derivative in the width loses them.
+**Accuracy.** The derivative is as good as the solver: with the default solvers, which go on to
+1e-9, the tests hold it to 1e-3 of fourth-order differences, over one step and over five. At 1e-6
+it was off by up to 3e-3, at 1e-4 by up to 7e-2 (of its norm). Flat sets and points keep these
+digits; of sets, and input ranges, of a width below some 1e-8 of their size the derivative in the
+width loses them.
 
 **Kinks.** Where a facet only touches, a neuron becomes stable, or an optimal point is not unique,
 an offset has a kink: the derivative is then one of its generalised gradients, and central

@@ -1,7 +1,7 @@
 """Ellipsoids around the successors, proved, and their derivative.
 
 **A given shape.** Only its size is sought. Its factor is an optimal value, so the envelope theorem
-gives the derivative exactly, as for offsets.
+gives the derivative, as for offsets.
 
 **Any shape.** The ellipsoid is an optimal *point*. What is reported is the point on the central
 path nearby, at a small barrier weight, and its derivative (see `centring`).
@@ -22,8 +22,8 @@ from jaxtyping import Array
 
 from reachjax.lmi import Program, form_rows, schur_lagrangian, with_successor
 from reachjax.sets import Ellipsoid, NormalForm
-from reachjax.solvers.accepted import ANSWERS, accepted_enclosure, log_volume
-from reachjax.solvers.base import AbstractSolver, Enclosure, SolverStatus
+from reachjax.solvers.accepted import accepted_enclosure, log_volume
+from reachjax.solvers.base import ANSWERS, AbstractSolver, Enclosure, SolverStatus
 from reachjax.solvers.centring import Sensitivity, centred, sensitivity
 from reachjax.solvers.compact import compact
 from reachjax.solvers.host import all_finite, asked_for, on_host, shapes_of
@@ -134,6 +134,7 @@ def _ellipsoid_forward(solver, facts, objective, program):
 def _ellipsoid_backward(solver, residual, cotangents):
     program, form, optimal, multipliers, frame = residual
     trusted = optimal & ~asked_for(cotangents[3])
+    multipliers = jnp.where(trusted, multipliers, jnp.nan)  # nothing is sought for these
     shapes = shapes_of(Sensitivity.unknown(program))
     arguments = (program, multipliers, form, cotangents[0], frame)
     held: Any = on_host(lambda given: sensitivity(*given), shapes, arguments)

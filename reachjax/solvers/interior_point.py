@@ -3,7 +3,7 @@
 Cones of general conic solvers hold a dense block of `n (n + 1) / 2` rows for a matrix inequality of
 size `n`. Here a multiplier's matrix is a product of two rows, so Gram matrices of rows are enough
 (`generators`), and an iteration costs `O(n^3)`. It runs on plain arrays and inside `jax.jit`,
-`jax.grad` and `jax.lax.scan`, without a call to the host.
+`jax.grad` and `jax.lax.scan` alike; ellipsoids are sought on the host (`centring`).
 
 **When it stalls.** The iterate with the smallest residuals is kept. It is reported as inaccurate,
 its multipliers are nonnegative and finite, and what they prove is what counts (`recheck`).
@@ -146,6 +146,7 @@ class InteriorPoint(AbstractSolver):
     """The library's own interior-point method: JAX, and fast where there are many neurons.
 
     It compiles once for each of a few padded sizes; on the CPU facets are solved one by one.
+    Ellipsoids are sought along their central path, which the options have no part in.
 
     Args:
         tolerance: of residuals and gap, relative, that counts as solved. Iterations go on to a

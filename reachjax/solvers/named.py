@@ -1,4 +1,4 @@
-"""Conic solvers by name: Clarabel by default, any other that cvxpy knows alike."""
+"""Conic solvers by name: Clarabel, and any other that cvxpy knows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from reachjax.solvers.conic import AbstractConicSolver
 
 @dataclasses.dataclass(frozen=True)
 class Clarabel(AbstractConicSolver):
-    """The interior-point code Clarabel, the default.
+    """The interior-point code Clarabel, which `Auto` takes for small programs.
 
     Args:
         tolerance: of feasibility and of the gap, relative and absolute.

@@ -25,7 +25,7 @@ from reachjax.solvers.central_path import FROM_AFAR, path_end, solved
 from reachjax.solvers.compact import CompactProgram, compact
 from reachjax.solvers.facet_barrier import FacetBarrier
 from reachjax.solvers.host import all_finite, asked_for, on_host, shapes_of
-from reachjax.solvers.trimming import trimmed
+from reachjax.solvers.trimming import squared_sizes
 
 
 class Slopes(NamedTuple):
@@ -96,7 +96,7 @@ def _backward(weight, residual, cotangents):
         )
         # damping is of multipliers of generators of unit size
         together = slopes.multipliers * slopes.multipliers_slope
-        slope -= DAMPING * weight * together @ trimmed(rows).sizes ** 2
+        slope -= DAMPING * weight * together @ squared_sizes(program.products, facts)
         held = jax.lax.stop_gradient(size)
         return center + unit * centred + held * (slope - jax.lax.stop_gradient(slope))
 
@@ -141,9 +141,10 @@ def _centre(
     barrier = FacetBarrier(reduced, i)
     weights = (*(each for each in FROM_AFAR if each > weight), weight)
     found = path_end(barrier, barrier.inside, weights)
-    if found is None:
+    if found is None or found.weight > weight:
         return np.nan
-    (y, hessian), count = found, solution.multipliers.shape[1]
+    y, hessian, _ = found
+    count = solution.multipliers.shape[1]
     move, inverse = (
         solved(hessian, barrier.cost * (np.arange(len(y)) == len(y) - 1)),
         barrier.inverse(y),

@@ -95,7 +95,7 @@ def test_a_wrong_shape_of_multipliers_is_named(solved):
         sound_level(held, np.nan * enclosure.multipliers, enclosure.form)
 
 
-def final(template, horizon, solver=rj.Clarabel(), relaxation=rj.LocalBounds()):  # noqa: B008
+def final(template, horizon, solver=rj.Auto(), relaxation=rj.LocalBounds()):  # noqa: B008
     """A number that depends on centre and shape of the last set, and on all volumes."""
 
     def f(loop, X0):

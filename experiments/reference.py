@@ -31,6 +31,8 @@ CLARABEL_TIGHT = {
     **{f"tol_{name}": 1e-9 for name in ("gap_abs", "gap_rel", "feas")},
     **{f"reduced_tol_{name}": 1e-7 for name in ("gap_abs", "gap_rel", "feas")},
 }
+UNITS = (1.0, 8.0, 0.125)
+"""Units of the objective, tried in turn where the solver breaks down."""
 
 
 def basis_sizes(layers, boxed):
@@ -147,11 +149,19 @@ def paper_step(
         start = time.perf_counter()
         b = cp.Variable()
         M, constraints = paper_lmi(layers, A, B, c, u_lower, u_upper, set_A, set_b, a, b, repeated)
-        problem = cp.Problem(cp.Minimize(b), [M << 0, *constraints])
-        problem.solve(**(CLARABEL_TIGHT if options is None else options))
+        status = "unsolved"
+        for unit in UNITS:
+            problem = cp.Problem(cp.Minimize(unit * b), [M << 0, *constraints])
+            try:
+                problem.solve(**(CLARABEL_TIGHT if options is None else options))
+                status = problem.status
+            except cp.SolverError:
+                status = "solver_error"
+            if status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+                break
+        else:
+            raise RuntimeError(f"facet {i}: expected status 'optimal', got '{status}'")
         seconds[i] = time.perf_counter() - start
-        if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
-            raise RuntimeError(f"facet {i}: expected status 'optimal', got '{problem.status}'")
         offsets[i] = b.value
     return offsets, seconds
 

@@ -66,5 +66,7 @@ class Certificate(AbstractCertificate):
             True
         """
         proposed = self._proposed(multipliers)
-        solution = Solution(self.solver_offsets, proposed, self.moments, self.codes, self.seconds)
-        return accepted_offsets(jax.device_get(self.program), solution)[0]
+        program, back = jax.device_get(self.program), np.linalg.pinv(self.program.transform)
+        moments = back @ np.asarray(self.moments) @ back.T
+        solution = Solution(self.solver_offsets, proposed, moments, self.codes, self.seconds)
+        return accepted_offsets(program, solution)[0]

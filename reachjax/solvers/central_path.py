@@ -57,7 +57,9 @@ def path_end(
         barrier.cost[barrier.count] = price * barrier.unit
         first = start()
         found = None if first is None else follow(barrier, first, weights)
-        if found is None or found.y[barrier.count] <= 2 * found.weight / barrier.price:
+        # it bounds alone the columns that no product does: of each, the moment takes mu / t
+        unit = (1 + barrier.n) * found.weight / barrier.price if found else np.inf
+        if found is None or found.y[barrier.count] <= unit:
             return found
     return None
 

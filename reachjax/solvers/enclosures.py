@@ -79,7 +79,9 @@ def _enclose(
         attempts.append((form, level, optimal, enclosure, frame))
         if optimal and not reduced.is_thinnest(proposed.form):
             return attempts[-1]
-        frame = NormalForm(form.A / level, form.b / level)  # finite: accepted forms are invertible
+        frame = NormalForm(form.A / level, form.b / level)
+        if not all_finite(frame):  # a single point
+            break
     return min(attempts, key=lambda attempt: log_volume(*attempt[:2]))
 
 

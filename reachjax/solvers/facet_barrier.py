@@ -2,7 +2,7 @@
 
     f(y) = b - mu (log det Z + ...),    Z = 2 b e e' - p e' - e p' - sum_k y_k G_k,
 
-in units in which the objective row `p` has 1-norm 1 and no constant (`barrier` has the rest).
+with an objective row `p` of 2-norm 1 at most and without a constant (`barrier` has the rest).
 """
 
 from __future__ import annotations

@@ -152,9 +152,10 @@ class InteriorPoint(AbstractSolver):
         tolerance: of residuals and gap, relative, that counts as solved. Iterations go on to a
             thousandth of it as long as they gain, which most programs reach.
         max_iterations: a facet that needs more is reported with status `LIMIT`.
-        smoothing: a barrier weight, in units of each facet's interval radius. Above 0, offsets are
-            those on the central path there: looser by at most that times the number of basis
-            entries and multipliers, without kinks, and with derivatives of that smooth function.
+        smoothing: a barrier weight, in units of the 2-norm of each facet's row over the scaled
+            basis. Above 0, offsets are those on the central path there: looser by at most that
+            times the number of basis entries and multipliers, without kinks, and with the
+            derivatives of that smooth function.
 
     Raises:
         TypeError: an option is no number.

@@ -14,12 +14,15 @@ from reachjax.solvers.compact import THINNEST, CompactProgram
 
 
 class Multipliers:
-    """The variables `y`, and `sum_k y_k G_k` as a flat expression."""
+    """The variables, of generators of unit size, and `sum_k y_k G_k` as a flat expression."""
 
     def __init__(self, program: CompactProgram):
         import cvxpy as cp
 
         generators = program.generators.columns()
+        sizes = np.sqrt(np.asarray(generators.multiply(generators).sum(axis=0)).ravel())
+        self.sizes = np.where(sizes > 0, sizes, 1.0)
+        generators = sp.csc_array(generators @ sp.diags_array(1 / self.sizes))
         free, signed = generators[:, program.free], generators[:, ~program.free]
         self.program = program
         self.free = cp.Variable(free.shape[1]) if free.shape[1] else None
@@ -37,7 +40,7 @@ class Multipliers:
         y[~self.program.free] = self.signed.value
         if self.free is not None:
             y[self.program.free] = self.free.value
-        return y if np.isfinite(y).all() else None
+        return y / self.sizes if np.isfinite(y).all() else None
 
 
 class FacetModel:

@@ -55,7 +55,7 @@ def smoothed_offsets(program: Program, weight: float) -> tuple[Float[Array, " f"
 
     Args:
         program: the facets of one step.
-        weight: `mu`, in units of each facet's interval radius.
+        weight: `mu`, in units of the 2-norm of each objective row over the scaled basis.
 
     Returns:
         The offsets `(f,)`, and the multipliers and moments (which have no derivative).
@@ -86,8 +86,9 @@ def _backward(weight, residual, cotangents):
 
     def value(facts, objective):
         center, linear = objective[:, -1], objective.at[:, -1].set(0.0)
-        unit = jnp.sum(abs(linear), axis=1)
-        size = jnp.where(unit > 0, unit, 1.0)
+        squares = jnp.sum(linear**2, axis=1)
+        varies = squares > 0
+        size = jnp.where(varies, squares, 1.0) ** 0.5
         rows = program.with_midpoints(facts, linear / size[:, None])
         flat = program.with_midpoints(facts, 0 * linear)
         # of the slope only the derivative counts
@@ -98,7 +99,11 @@ def _backward(weight, residual, cotangents):
         together = slopes.multipliers * slopes.multipliers_slope
         slope -= DAMPING * weight * together @ squared_sizes(program.products, facts)
         held = jax.lax.stop_gradient(size)
-        return center + unit * centred + held * (slope - jax.lax.stop_gradient(slope))
+        return (
+            center
+            + jnp.where(varies, size * centred, 0.0)
+            + held * (slope - jax.lax.stop_gradient(slope))
+        )
 
     pull: Any = jax.vjp(value, program.facts.mid, program.objective.mid)[1]
     return *pull(jnp.where(asked_for(cotangents[2]), jnp.nan, cotangents[0])), None
@@ -116,6 +121,8 @@ def _solve(weight: float, program: Program):
     if not all_finite(program):
         return np.full(facets, np.nan), centres, solution, slopes
     reduced = compact(program)
+    # the 1-norm, in which offsets are sought elsewhere, has kinks of its own
+    reduced = reduced.with_units(reduced.units * np.linalg.norm(reduced.objective, axis=1))
     for i in range(facets):
         began = time.perf_counter()
         centres[i] = _centre(reduced, i, weight, solution, slopes)

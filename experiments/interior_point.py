@@ -22,7 +22,7 @@ import rich
 import tyro
 
 import reachjax as rj
-from experiments.benchmark import RANDOM_BOX, Case, he_network
+from experiments.benchmark_cases import RANDOM_BOX, Case, he_network
 from experiments.command import blank_table
 from experiments.double_integrator import INPUT_BOX, A, B
 from experiments.reference import paper_step

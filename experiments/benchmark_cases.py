@@ -1,0 +1,101 @@
+"""What the benchmark measures: its options, and networks with sets of states."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+import reachjax as rj
+from experiments import double_integrator
+from experiments.double_integrator import INITIAL_BOX, INPUT_BOX, A, B
+from reachjax.witnesses import initial_states
+
+RANDOM_BOX = np.array([[0.25, -0.25], [0.75, 0.25]])  # the size of the paper's X_0, near the kinks
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Time one step of Reach-SDP: cvxpy rebuilt for every facet against this library.
+
+    Trained weights and `benchmark.json` are kept under `output`.
+    """
+
+    widths: tuple[int, ...] = (10, 20, 32)
+    """Neurons in each of the two hidden layers, one network a width."""
+    networks: tuple[Literal["trained", "random"], ...] = ("trained", "random")
+    """Trained on the MPC with the paper's initial set, or He-initialised near its kinks."""
+    reference_facets: int = 8
+    """At most so many are timed with cvxpy rebuilt; fewer are scaled up to 8."""
+    repetitions: int = 3
+    """Warm calls of which the median is taken."""
+    patience: float = 40.0
+    """Seconds after which a method is not called again, and cvxpy rebuilt for no more facets."""
+    clock: Literal["wall", "cpu"] = "wall"
+    """What a second is; with one thread, the processor's own are immune to other jobs."""
+    samples: int = 500
+    """State-input pairs of the MPC that a network is trained on."""
+    training_steps: int = 2000
+    """Steps of Adam."""
+    seed: int = 0
+    """Of samples, weights and simulated states."""
+    output: Path = Path("results/benchmark")
+    """Where everything is written."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A network, and the box of states that it starts from."""
+
+    name: str
+    layers: list[tuple[np.ndarray, np.ndarray]]
+    initial: np.ndarray
+
+    @cached_property
+    def loop(self) -> rj.ClosedLoop:
+        """The double integrator with this controller."""
+        return rj.ClosedLoop(
+            rj.AffinePlant(A, B), rj.MLP.from_layers(self.layers), input_box=rj.Box(*INPUT_BOX)
+        )
+
+    @cached_property
+    def template(self) -> rj.Template:
+        """The paper's eight facets."""
+        return rj.Template.octagonal(2)
+
+    def support(self, seed: int, count: int = 20_000) -> np.ndarray:
+        """The largest simulated value of each facet: no bound can be smaller."""
+        states = initial_states(rj.Box(*self.initial), count, seed)
+        return np.asarray(self.loop.simulate(states, 1)[:, 1] @ self.template.directions.T).max(0)
+
+
+def cases(settings: Settings) -> list[Case]:
+    """The networks, trained ones from their files where they are there."""
+    found = []
+    for width in settings.widths:
+        if "trained" in settings.networks:
+            name = f"trained 2x{width}"
+            training = double_integrator.Settings(
+                hidden=(width, width),
+                samples=settings.samples,
+                training_steps=settings.training_steps,
+                seed=settings.seed,
+                output=settings.output,
+            )
+            fit = double_integrator.controller(name, training.margin, training)
+            found.append(Case(name, fit.layers, INITIAL_BOX))
+        if "random" in settings.networks:
+            layers = he_network((2, width, width, 1), settings.seed)
+            found.append(Case(f"random 2x{width}", layers, RANDOM_BOX))
+    return found
+
+
+def he_network(sizes: tuple[int, ...], seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """He-initialised weights and small biases."""
+    rng = np.random.default_rng(seed)
+    return [
+        (rng.normal(size=(out, into)) * np.sqrt(2 / into), 0.1 * rng.normal(size=out))
+        for into, out in pairwise(sizes)
+    ]

@@ -10,8 +10,7 @@ from reachjax.recheck import interval_offsets, sound_level, sound_offsets
 from reachjax.rounding import gamma
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import ANSWERS, Enclosure, Solution
-from reachjax.solvers.compact import TINY, compact
-from reachjax.solvers.trimming import Trimmed, summed, trimmed
+from reachjax.solvers.compact import TINY, CompactProgram, compact
 
 SHORTFALL = 1e-3
 """A claim counts as the optimum if multipliers and moments bear it out to this part of what is
@@ -51,25 +50,21 @@ def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
 
     The optimal value is no smaller (weak duality), but for what they miss their constraints by.
     """
-    given = trimmed(program)
-    columns = np.flatnonzero(given.columns)
-    values = np.full(len(given.centers), -np.inf)
+    reduced = compact(program)
+    values = np.full(len(reduced.centers), -np.inf)
     for i, whole in enumerate(np.asarray(solution.moments)):
-        X = whole[np.ix_(columns, columns)]
+        X = whole[np.ix_(reduced.columns, reduced.columns)]
         if not np.isfinite(X).all() or abs(X[-1, -1] - 1) > SHORTFALL:
             continue
-        if _missed(given, program, whole) <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL:
-            values[i] = given.centers[i] + given.units[i] * (given.objective[i, columns] @ X[:, -1])
+        if _missed(reduced, X) <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL:
+            values[i] = reduced.centers[i] + reduced.units[i] * (reduced.objective[i] @ X[:, -1])
     return values
 
 
-def _missed(given: Trimmed, program: Program, moments: np.ndarray) -> float:
-    """By how much moments miss the sign of a product that is kept, over its generator's size."""
-    products, kept = program.products, given.kept
-    pairs = (given.facts @ moments)[products.left] * given.facts[products.right]
-    sums = summed(products.sign * pairs.sum(axis=1), products.multiplier, len(kept))
-    values = sums[kept] / given.sizes[kept]
-    return float(np.where(products.free[kept], abs(values), -values).max(initial=0.0))
+def _missed(reduced: CompactProgram, moments: np.ndarray) -> float:
+    """By how much moments over the columns kept miss the sign of a product."""
+    products = reduced.generators.paired(moments)
+    return float(np.where(reduced.free, abs(products), -products).max(initial=0.0))
 
 
 def accepted_enclosure(
@@ -117,8 +112,8 @@ def _largest_factor(program: Program, enclosure: Enclosure) -> float:
     n, X = len(program.transform), np.asarray(enclosure.moments)
     if not np.isfinite(X).all() or X[n - 1, n - 1] <= 0:
         return np.inf
-    X = X / X[n - 1, n - 1]
-    missed = _missed(trimmed(program), program, X[:n, :n])
+    X, reduced = X / X[n - 1, n - 1], compact(program)
+    missed = _missed(reduced, X[np.ix_(reduced.columns, reduced.columns)])
     if max(missed, -np.linalg.eigvalsh((X + X.T) / 2)[0]) > SHORTFALL:
         return np.inf
     slope = -2 * np.sum(X[n:, :n] * form_rows(program, enclosure.form).mid)

@@ -89,10 +89,10 @@ def enclosed(program: Program, given: NormalForm | None = None) -> Enclosure:
     seconds = np.array(time.perf_counter() - began)
     if found is None or found.weight > USEFUL:
         return proposal._replace(seconds=seconds)
-    if given is not None and barrier.is_thinnest(found.y):
+    multipliers, form = barrier.unscaled(found.y, len(proposal.multipliers))
+    if given is not None and reduced.is_thinnest(form):
         unbounded = np.array(int(SolverStatus.UNBOUNDED))
         return proposal._replace(status=unbounded, seconds=seconds)
-    multipliers, form = barrier.unscaled(found.y, len(proposal.multipliers))
     moments = barrier.whole(found.weight * barrier.inverse(found.y), len(program.transform))
     ended = SolverStatus.SOLVED if found.weight == WEIGHTS[-1] else SolverStatus.INACCURATE
     return Enclosure(form, multipliers, moments, np.array(int(ended)), seconds)

@@ -68,10 +68,6 @@ class EllipsoidBarrier(AbstractBarrier):
         """What the determinant is taken of."""
         return np.tensordot(y[self.others], self.sizes, 1)
 
-    def is_thinnest(self, y: np.ndarray) -> bool:
-        """Whether the size is about as small as it may be."""
-        return bool(np.linalg.norm(self._size(y), 2) > 0.5 / THINNEST)
-
     def inside(self) -> np.ndarray:
         """A point inside, wherever the solution is: a large `t`, all else small."""
         y, t = np.zeros(self.others.stop), 1 / (2 * self.n)

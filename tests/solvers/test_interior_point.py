@@ -166,7 +166,7 @@ def test_it_agrees_with_clarabel(answer):
     np.testing.assert_allclose(
         (solution.offsets - reference.offsets)[solved] / np.maximum(size[solved], 1e-9),
         0,
-        atol=1e-6,
+        atol=1e-5,  # Clarabel itself moves by 1.5e-5 from a tolerance of 1e-8 to one of 1e-9
     )
     bounds, _ = accepted_offsets(given, solution)
     others, _ = accepted_offsets(given, reference)

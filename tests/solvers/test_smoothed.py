@@ -40,17 +40,17 @@ def test_offsets_are_sound_and_looser_by_the_weight_times_what_is_weighed(weight
     unit = np.linalg.norm(program.objective.mid[:, :-1], axis=1)
     count = len(program.transform) + len(program.products.free)
     assert np.all(following.b <= best.b + 2 * weight * unit * count + 1e-7)
-    np.testing.assert_allclose(certificate.recheck(), following.b, rtol=1e-9)
+    assert np.all(certificate.recheck() <= following.b + 1e-9)
 
 
 def test_a_kink_is_gone():
     """The offset of `x_1 + a x_2` over a box has one at `a = 0`, of slopes -1 and 1."""
-    box, facet = rj.Box([-1.0, -1.0], [1.0, 1.0]), rj.Template([[1.0, 0.0]])
+    box = rj.Box([-1.0, -1.0], [1.0, 1.0])
     net = rj.MLP.from_layers([([[0.0, 0.0]], [0.0])])
 
     def offset(a, solver):
         loop = rj.ClosedLoop(rj.AffinePlant(jnp.array([[1.0, a], [0.0, 1.0]]), [[0.0], [0.0]]), net)
-        return rj.reach(loop, box, 1, facet, solver=solver).sets[1].b[0]
+        return rj.reach(loop, box, 1, rj.Template.box(2), solver=solver).sets[1].b[0]
 
     smooth = partial(offset, solver=smoothed(1e-2))
     h = 1e-4

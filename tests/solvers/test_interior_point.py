@@ -26,7 +26,7 @@ from reachjax.solvers.accepted import log_volume
 from reachjax.solvers.arrangement import arranged, bucket, cut
 from reachjax.solvers.base import ANSWERS
 from reachjax.solvers.compact import compact
-from reachjax.solvers.generators import inverse_factor
+from reachjax.solvers.factorisations import inverse_factor
 from reachjax.solvers.trimming import trimmed
 from tests.loops import closed_loop, random_loop
 from tests.networks import (

@@ -1,14 +1,17 @@
-"""Seconds of one Reach-SDP step, and the bounds they buy, method by method in one run.
+"""Seconds of Reach-SDP, and the bounds they buy, method by method in one run.
 
-One step of the double integrator with its input box and the paper's eight facets, for networks
-with two hidden layers: some trained on the MPC and started from the paper's small initial set, some
-with random weights and a set of the same size where most of their neurons switch. All methods run
-one after the other in this process, with one BLAS thread and one thread for Clarabel, so their
-ratios mean more than their seconds.
+    python -m experiments.benchmark steps | growth | loops
 
-    python -m experiments.benchmark --help
+`steps`: one step of the double integrator with its input box and the paper's eight facets, for
+networks with two hidden layers: some trained on the MPC and started from the paper's small initial
+set, some with random weights and a set of the same size where most of their neurons switch.
+`growth`: one facet of the paper's program as random networks grow. `loops`: six-step tubes of the
+trained 2-10-5-1 network, and training steps. All methods run one after the other, with one BLAS
+thread and one thread for Clarabel (XLA takes what cores there are), so their ratios mean more than
+their seconds.
 """
 
+import dataclasses
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read once, when numpy is imported
@@ -19,15 +22,30 @@ import jax
 import rich
 
 from experiments.benchmark_cases import Settings, cases
+from experiments.benchmark_growth import (
+    GROWTH_NOTE,
+    exponent,
+    grown,
+    growth_table,
+    in_new_process,
+    jobs,
+    related,
+)
+from experiments.benchmark_loops import (
+    LOOPS_NOTE,
+    controller,
+    step_rows,
+    step_table,
+    tube_rows,
+    tube_table,
+)
 from experiments.benchmark_methods import measure, methods
 from experiments.benchmark_report import NOTE, compare, table, write
 from experiments.command import bar, require_folder, run_experiment
 
 
-def main(settings: Settings) -> None:
-    """Measure every method on every network; each table is printed as soon as it is complete."""
-    require_folder(settings.output)
-    jax.config.update("jax_enable_x64", True)
+def steps(settings: Settings) -> None:
+    """Every method on every network; each table is printed as soon as it is complete."""
     results, networks, named = [], cases(settings), methods(settings)
     with bar() as shown:
         task = shown.add_task("", total=len(networks) * len(named))
@@ -37,11 +55,52 @@ def main(settings: Settings) -> None:
                 shown.update(task, description=f"{case.name}: {name}")
                 rows.append(measure(case, name, method, settings))
                 shown.advance(task)
-            results.append(compare(rows))
-            shown.console.print(table(results[-1]))
-            write(settings, results)
+            results += compare(rows)
+            shown.console.print(table(rows))
+            write(settings, rows=results)
     rich.print(NOTE)
-    rich.print(f"written: {write(settings, results)}")
+
+
+def growth(settings: Settings) -> None:
+    """Every solver on ever larger networks, each in a process of its own."""
+    rows, todo = [], jobs(settings)
+    with bar() as shown:
+        task = shown.add_task("", total=len(todo))
+        for width, name in todo:
+            shown.update(task, description=f"2x{width}: {name}")
+            rows = related([*rows, in_new_process(grown, width, name, settings)])
+            shown.advance(task)
+            write(settings, rows=rows)
+    rich.print(growth_table(rows))
+    rich.print(GROWTH_NOTE)
+    rich.print(f"InteriorPoint's seconds grow like n^{exponent(rows):.2f}")
+
+
+def loops(settings: Settings) -> None:
+    """Tubes and training steps of one trained network."""
+    layers, tubes, trained = controller(settings), [], []
+    with bar() as shown:
+        task = shown.add_task("tubes", total=None)
+        for row in tube_rows(layers, settings):
+            tubes.append(row)
+            shown.advance(task)
+        shown.update(task, description="training steps")
+        for row in step_rows(layers):
+            trained.append(row)
+            shown.advance(task)
+    rich.print(tube_table(tubes))
+    rich.print(LOOPS_NOTE)
+    rich.print(step_table(trained))
+    named = [{"solver": name} | dataclasses.asdict(cost) for name, cost in trained]
+    write(settings, tubes=tubes, training=named)
+
+
+def main(settings: Settings) -> None:
+    """One study: its tables are printed, and its rows written."""
+    require_folder(settings.output)
+    jax.config.update("jax_enable_x64", True)
+    {"steps": steps, "growth": growth, "loops": loops}[settings.study](settings)
+    rich.print(f"written: {settings.output / settings.study}.json")
 
 
 if __name__ == "__main__":

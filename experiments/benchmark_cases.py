@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import tyro
 
 import reachjax as rj
 from experiments import double_integrator
@@ -18,15 +19,22 @@ RANDOM_BOX = np.array([[0.25, -0.25], [0.75, 0.25]])  # the size of the paper's 
 
 @dataclass(frozen=True)
 class Settings:
-    """Time one step of Reach-SDP: cvxpy rebuilt for every facet against this library.
+    """Time Reach-SDP: cvxpy rebuilt for every facet against this library.
 
-    Trained weights and `benchmark.json` are kept under `output`.
+    Trained weights and results are kept under `output`.
     """
 
+    study: tyro.conf.Positional[Literal["steps", "growth", "loops"]] = "steps"
+    """One step of several networks; one facet as networks grow; tubes and training steps."""
+
     widths: tuple[int, ...] = (10, 20, 32)
-    """Neurons in each of the two hidden layers, one network a width."""
+    """`steps`: neurons in each of the two hidden layers, one network a width."""
     networks: tuple[Literal["trained", "random"], ...] = ("trained", "random")
     """Trained on the MPC with the paper's initial set, or He-initialised near its kinks."""
+    growth: tuple[int, ...] = (4, 10, 20, 32, 64, 100, 200)
+    """`growth`: the same; bases have 13 to 405 entries."""
+    reference_width: int = 32
+    """`growth`: cvxpy and Clarabel are timed up to this width."""
     reference_facets: int = 8
     """At most so many are timed with cvxpy rebuilt; fewer are scaled up to 8."""
     repetitions: int = 3
@@ -87,9 +95,13 @@ def cases(settings: Settings) -> list[Case]:
             fit = double_integrator.controller(name, training.margin, training)
             found.append(Case(name, fit.layers, INITIAL_BOX))
         if "random" in settings.networks:
-            layers = he_network((2, width, width, 1), settings.seed)
-            found.append(Case(f"random 2x{width}", layers, RANDOM_BOX))
+            found.append(random_case(width, settings.seed))
     return found
+
+
+def random_case(width: int, seed: int) -> Case:
+    """Random weights, and a set on which most neurons switch."""
+    return Case(f"random 2x{width}", he_network((2, width, width, 1), seed), RANDOM_BOX)
 
 
 def he_network(sizes: tuple[int, ...], seed: int) -> list[tuple[np.ndarray, np.ndarray]]:

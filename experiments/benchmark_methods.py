@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import comb
+from typing import Any
 
 import jax
 import numpy as np
@@ -38,21 +39,33 @@ def reference(case: Case, settings: Settings) -> Answer:
 
     It stops after `reference_facets` of them, or after the first that ends beyond `patience`.
     """
-    directions = np.asarray(case.template.directions)
-    (lower, upper), (u_lower, u_upper) = case.initial, INPUT_BOX
-    set_A, set_b = np.vstack([np.eye(2), -np.eye(2)]), np.r_[upper, -lower]
-    data = (case.layers, A, B, np.zeros(len(A)), u_lower, u_upper, set_A, set_b)
+    directions, data = np.asarray(case.template.directions), paper_data(case)
     bounds = np.full(len(directions), np.nan)
     clock = CLOCKS[settings.clock]
     began = clock()
     for i in range(settings.reference_facets):
-        bounds[i] = paper_step(*data, directions[i : i + 1], repeated=True)[0][0]
+        bounds[i] = paper_step(**data, directions=directions[i : i + 1], repeated=True)[0][0]
         if clock() - began > settings.patience:
             break
     size = sum(basis_sizes(case.layers, boxed=True)) + 1
-    units = size - 1 - len(lower)
-    count = comb(len(set_b), 2) + 3 * units + comb(units, 2)
+    units, facets = size - 1 - len(A), len(data["set_b"])
+    count = comb(facets, 2) + 3 * units + comb(units, 2)
     return Answer(rj.PaperQC(), size, count, bounds)
+
+
+def paper_data(case: Case) -> dict[str, Any]:
+    """What `paper_step` takes beside its directions."""
+    (lower, upper), (u_lower, u_upper) = case.initial, INPUT_BOX
+    return {
+        "layers": case.layers,
+        "A": A,
+        "B": B,
+        "c": np.zeros(len(A)),
+        "u_lower": u_lower,
+        "u_upper": u_upper,
+        "set_A": np.vstack([np.eye(2), -np.eye(2)]),
+        "set_b": np.r_[upper, -lower],
+    }
 
 
 def pipeline(case: Case, relaxation: rj.AbstractRelaxation, solver: rj.AbstractSolver) -> Answer:
@@ -84,10 +97,10 @@ def measure(case: Case, name: str, method: Method, settings: Settings) -> dict:
     """One row: the first call, the median of the warm calls that patience allows, the bounds."""
     jax.clear_caches()
     clock = CLOCKS[settings.clock]
-    first, answer = _timed(method, case, clock)
+    first, answer = timed(partial(method, case), clock)
     calls: list[float] = []
     while first + sum(calls) < settings.patience and len(calls) < settings.repetitions:
-        calls.append(_timed(method, case, clock)[0])
+        calls.append(timed(partial(method, case), clock)[0])
     share = float(np.mean(np.isfinite(answer.bounds)))
     return {
         "case": case.name,
@@ -107,7 +120,8 @@ def measure(case: Case, name: str, method: Method, settings: Settings) -> dict:
     }
 
 
-def _timed(method: Method, case: Case, clock: Callable[[], float]) -> tuple[float, Answer]:
+def timed(call: Callable[[], Any], clock: Callable[[], float]) -> tuple[float, Any]:
+    """Seconds, and what is returned."""
     began = clock()
-    answer = method(case)
-    return clock() - began, answer
+    result = call()
+    return clock() - began, result

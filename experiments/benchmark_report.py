@@ -50,16 +50,13 @@ def table(rows: list[dict]) -> Table:
     return shown
 
 
-def write(settings: Settings, results: list[list[dict]]) -> Path:
-    """Settings, threads and every row, as JSON."""
+def write(settings: Settings, **results: list[dict]) -> Path:
+    """Settings, threads and every row of each table, as JSON."""
     content = {
         "settings": dataclasses.asdict(settings) | {"output": str(settings.output)},
         "threads": {name: os.environ.get(name) for name in THREADS} | {"cores": os.cpu_count()},
-        "rows": [
-            {key: _plain(value) for key, value in row.items()} for rows in results for row in rows
-        ],
-    }
-    path = settings.output / "benchmark.json"
+    } | {name: [_plain(row) for row in rows] for name, rows in results.items()}
+    path = settings.output / f"{settings.study}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1))
     return path
@@ -67,6 +64,8 @@ def write(settings: Settings, results: list[list[dict]]) -> Path:
 
 def _plain(value):
     """JSON has no NaN: a facet that was not asked for is null."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
     if isinstance(value, np.ndarray):
         return [_plain(entry) for entry in value.tolist()]
     return None if isinstance(value, float) and np.isnan(value) else value

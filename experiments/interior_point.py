@@ -1,15 +1,13 @@
-"""What the library's interior-point method is worth: speed, agreement, many products.
+"""What the interior-point method's answers are worth: agreement, and many products.
 
-    python -m experiments.interior_point speed | agreement | products
+    python -m experiments.interior_point agreement | products
 
-`speed`: one facet of the paper's program (every neuron kept, no `lambda_ij`) by cvxpy rebuilt with
-Clarabel and by `InteriorPoint`, and how seconds grow with the size of the basis. `agreement`:
-random loops, degenerate ones among them, against Clarabel and simulated successors. `products`:
-programs that grow by the products of facts which the last moment matrix violates most.
+`agreement`: random loops, degenerate ones among them, against Clarabel and simulated successors.
+`products`: programs that grow by the products of facts which the last moment matrix violates most.
+`benchmark growth` measures its speed.
 """
 
 import os
-import time
 from dataclasses import dataclass
 from itertools import product
 from typing import Literal
@@ -22,10 +20,8 @@ import rich
 import tyro
 
 import reachjax as rj
-from experiments.benchmark_cases import RANDOM_BOX, Case, he_network
-from experiments.command import blank_table
-from experiments.double_integrator import INPUT_BOX, A, B
-from experiments.reference import paper_step
+from experiments.benchmark_cases import he_network
+from experiments.command import run_experiment
 from reachjax.lmi import Program, step_program
 from reachjax.recheck import interval_offsets
 from reachjax.relaxation import Products
@@ -42,14 +38,12 @@ RELAXATIONS = (
 class Settings:
     """Measure the interior-point method."""
 
-    study: tyro.conf.Positional[Literal["speed", "agreement", "products"]]
+    study: tyro.conf.Positional[Literal["agreement", "products"]]
     """What is measured."""
-    widths: tuple[int, ...] = (10, 20, 32, 64, 100)
-    """Neurons in each of two hidden layers: `speed`, and `products` (which wants 20 to 32)."""
-    reference: int = 32
-    """cvxpy is timed up to this width."""
+    widths: tuple[int, ...] = (20, 32)
+    """Neurons in each of two hidden layers in `products`."""
     facets: int = 2
-    """Of each program."""
+    """Of each network there."""
     programs: int = 200
     """How many random programs `agreement` solves."""
     rounds: int = 8
@@ -67,48 +61,7 @@ def program_of(loop: rj.ClosedLoop, box: rj.Box, relaxation, directions) -> Prog
     return jax.device_get(step_program(loop, box, box, directions, 0, relaxation))
 
 
-def speed(settings: Settings) -> None:
-    """Processor seconds per facet; wall time where jobs do not share the machine is no less."""
-    shown = blank_table("PaperQC(repeated=False), processor seconds per facet")
-    for heading in ("hidden", "n", "cvxpy", "first call", "ours", "faster", "difference", "status"):
-        shown.add_column(heading, justify="right")
-    sizes, seconds = [], []
-    for width in settings.widths:
-        case = Case("", he_network((2, width, width, 1), 0), RANDOM_BOX)
-        directions = np.asarray(case.template.directions)[: settings.facets]
-        relaxation = rj.PaperQC(repeated=False)
-        program = program_of(case.loop, rj.Box(*case.initial), relaxation, directions)
-        solver = rj.InteriorPoint()
-        first, _ = _timed(solver.solve, program)
-        ours, solution = min((_timed(solver.solve, program) for _ in range(3)), key=_first)
-        sizes.append(int(program.used.sum()))
-        seconds.append(ours / len(directions))
-        reference, difference = np.nan, np.nan
-        if width <= settings.reference:
-            (lower, upper), limits = case.initial, INPUT_BOX
-            facts = np.vstack([np.eye(2), -np.eye(2)]), np.r_[upper, -lower]
-            data = (case.layers, A, B, np.zeros(2), *limits, *facts)
-            reference, (bounds, _) = _timed(paper_step, *data, directions)
-            difference = abs(bounds - accepted_offsets(program, solution)[0]).max()
-        numbers = (reference / len(directions), first, seconds[-1], reference / ours, difference)
-        statuses = {rj.SolverStatus(int(code)).name for code in solution.statuses}
-        shown.add_row(f"2x{width}", str(sizes[-1]), *map("{:.3g}".format, numbers), str(statuses))
-    rich.print(shown)
-    slope = np.polyfit(np.log(sizes), np.log(seconds), 1)[0]
-    rich.print(f"seconds grow like n^{slope:.2f} from n = {sizes[0]} to {sizes[-1]}")
-
-
-def _timed(function, *arguments):
-    began = time.process_time()
-    result = function(*arguments)
-    return time.process_time() - began, result
-
-
-def _first(pair):
-    return pair[0]
-
-
-def random_case(seed: int) -> tuple[rj.ClosedLoop, rj.Box, np.ndarray, rj.AbstractRelaxation]:
+def random_step(seed: int) -> tuple[rj.ClosedLoop, rj.Box, np.ndarray, rj.AbstractRelaxation]:
     """A small loop, its box (a third of them flat or thin in one direction), facets, relaxation."""
     rng = np.random.default_rng(seed)
     n_x, hidden = int(rng.integers(1, 4)), [(6, 4), (5,), (8, 6)][rng.integers(3)]
@@ -131,7 +84,7 @@ def agreement(settings: Settings) -> None:
     ours, theirs = rj.InteriorPoint(), rj.Clarabel()
     rows = []
     for seed in range(settings.programs):
-        loop, box, directions, relaxation = random_case(seed)
+        loop, box, directions, relaxation = random_step(seed)
         program = program_of(loop, box, relaxation, directions)
         solution, reference = ours.solve(program), theirs.solve(program)
         bounds, optimal = accepted_offsets(program, solution)
@@ -219,8 +172,8 @@ def products(settings: Settings) -> None:
 def main(settings: Settings) -> None:
     """Run one study and print what it found."""
     jax.config.update("jax_enable_x64", True)
-    {"speed": speed, "agreement": agreement, "products": products}[settings.study](settings)
+    {"agreement": agreement, "products": products}[settings.study](settings)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    run_experiment(main, Settings)

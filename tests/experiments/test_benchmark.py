@@ -101,7 +101,7 @@ def test_the_command_prints_its_tables_and_writes_strict_json(tmp_path, capsys, 
     def refuse(constant):
         raise AssertionError(f"{constant} is not JSON")
 
-    written = json.loads((tmp_path / "benchmark.json").read_text(), parse_constant=refuse)
+    written = json.loads((tmp_path / "steps.json").read_text(), parse_constant=refuse)
     assert written["settings"]["widths"] == [3]
     assert [row["method"] for row in written["rows"]] == list(methods(settings))
     assert written["rows"][0]["bounds"][1:] == [None] * 7

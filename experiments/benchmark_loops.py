@@ -102,7 +102,9 @@ def step_table(rows: list[tuple[str, StepCost]]) -> Table:
     for name, cost in rows:
         shown.add_row(
             name,
-            *map("{:.3g}".format, (cost.forward, cost.solver, cost.both)),
+            f"{cost.forward:.3g}",
+            "-" if np.isnan(cost.solver) else f"{cost.solver:.3g}",
+            f"{cost.both:.3g}",
             f"{cost.backward:+.0%}",
             f"{cost.first:.3g}",
         )

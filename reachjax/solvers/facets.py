@@ -2,6 +2,9 @@
 
 **When it stalls.** The iterate with the smallest residuals is kept. It is reported as inaccurate,
 its multipliers are nonnegative and finite, and what they prove is what counts (`recheck`).
+
+**Where it starts.** Always at the same point: 16 to 25 iterations on programs that grew by 60
+products a round. Runs from an iterate of the round before, moved inwards, stalled.
 """
 
 from __future__ import annotations
@@ -113,7 +116,8 @@ def solve_facets(
     """`solve_facet` for several objectives; every array of the result has an axis for them.
 
     Batched on an accelerator. On a CPU one after the other: batches of factorisations inside a
-    `while_loop` were seen to hang there (jaxlib 0.10.2 on two cores).
+    `while_loop` hang there (jaxlib 0.10.2, two cores: two facets of 69 columns did, eight of 25
+    did not).
     """
     if jax.default_backend() == "cpu":
         return jax.lax.map(lambda row: _one(generators, row, tolerance, max_iterations), rows)

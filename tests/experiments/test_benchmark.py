@@ -5,10 +5,20 @@ import re
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import reachjax as rj
-from experiments import benchmark
+from experiments import benchmark, benchmark_loops, step_cost
 from experiments.benchmark_cases import Case, Settings, cases, he_network
+from experiments.benchmark_growth import (
+    GROWTH_NOTE,
+    exponent,
+    grown,
+    growth_table,
+    in_new_process,
+    jobs,
+    related,
+)
 from experiments.benchmark_methods import REFERENCE, measure, methods
 from experiments.benchmark_report import NOTE, compare, table
 from experiments.double_integrator import INITIAL_BOX
@@ -83,27 +93,31 @@ def test_the_table_fits_in_eighty_columns(rows):
     assert all(any(name in line for line in lines) for name in methods(Settings()))
 
 
-def text(rows):
-    from rich.console import Console
-
+def text(rows, table=table):
     console = Console(width=COLUMNS, record=True)
     with console.capture() as capture:
         console.print(table(rows))
     return re.sub(r"\x1b\[[0-9;]*m", "", capture.get())
 
 
-def test_the_command_prints_its_tables_and_writes_strict_json(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(benchmark, "cases", lambda settings: [case()])
-    settings = Settings(**QUICK, reference_facets=1, output=tmp_path)
-    benchmark.main(settings)
-    assert "random 2x3" in capsys.readouterr().out
-
+def strictly(path):
     def refuse(constant):
         raise AssertionError(f"{constant} is not JSON")
 
-    written = json.loads((tmp_path / "steps.json").read_text(), parse_constant=refuse)
+    return json.loads(path.read_text(), parse_constant=refuse)
+
+
+def test_the_command_prints_its_tables_and_writes_strict_json(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(benchmark, "cases", lambda settings: [case()])
+    settings = Settings(**QUICK, reference_facets=1, output=tmp_path)
+    few = dict(list(methods(settings).items())[::5])
+    monkeypatch.setattr(benchmark, "methods", lambda settings: few)
+    benchmark.main(settings)
+    assert "random 2x3" in capsys.readouterr().out
+
+    written = strictly(tmp_path / "steps.json")
     assert written["settings"]["widths"] == [3]
-    assert [row["method"] for row in written["rows"]] == list(methods(settings))
+    assert [row["method"] for row in written["rows"]] == list(few)
     assert written["rows"][0]["bounds"][1:] == [None] * 7
 
 
@@ -112,3 +126,58 @@ def test_random_networks_have_the_widths_asked_for():
     assert [W.shape for W, _ in found.layers] == [(3, 2), (3, 3), (1, 3)]
     assert found.initial.shape == INITIAL_BOX.shape
     assert isinstance(found.loop, rj.ClosedLoop)
+
+
+GROWTH = Settings(growth=(3, 5), reference_width=3, repetitions=1, study="growth")
+
+
+@pytest.fixture(scope="module")
+def growing():
+    return related([grown(width, name, GROWTH) for width, name in jobs(GROWTH)])
+
+
+def test_large_networks_are_left_to_the_interior_point_method():
+    names = [REFERENCE, "Clarabel", "InteriorPoint"]
+    assert jobs(GROWTH) == [*((3, name) for name in names), (5, "InteriorPoint")]
+
+
+def test_one_facet_has_the_same_bounds_by_every_solver(growing):
+    assert [row["n"] for row in growing] == [11, 11, 11, 15]
+    assert all(row["difference"] < 1e-5 for row in growing[:3])
+    assert growing[3]["difference"] is None
+    assert all(row["memory"] >= 0 for row in growing)
+
+
+def test_the_rate_of_arithmetic_is_below_the_machines(growing):
+    for row in (growing[2], growing[3]):
+        assert 0 < row["rate"] < row["best_rate"]
+    slope = np.log(growing[3]["seconds"] / growing[2]["seconds"]) / np.log(15 / 11)
+    assert exponent(growing) == pytest.approx(slope)
+
+
+def test_the_table_of_growth_fits_in_eighty_columns(growing):
+    lines = [*text(growing, growth_table).splitlines(), *GROWTH_NOTE.splitlines()]
+    assert max(map(len, lines)) <= COLUMNS
+    assert sum("InteriorPoint" in line for line in lines) == 2
+
+
+@pytest.mark.slow
+def test_a_new_process_gives_the_same_bounds(growing):
+    row = in_new_process(grown, 3, "Clarabel", GROWTH)
+    np.testing.assert_array_equal(row["bounds"], growing[1]["bounds"])
+
+
+@pytest.mark.slow
+def test_tubes_of_all_ways_agree_and_training_steps_are_timed(tmp_path, capsys, monkeypatch):
+    layers = he_network((2, 3, 1), seed=0)
+    monkeypatch.setattr(benchmark, "controller", lambda settings: layers)
+    monkeypatch.setattr(benchmark_loops, "SOLVERS", {"Clarabel": rj.Clarabel()})
+    monkeypatch.setattr(step_cost, "REPETITIONS", 1)
+    benchmark.main(Settings(study="loops", patience=0.0, output=tmp_path))
+    written = strictly(tmp_path / "loops.json")
+    reference, paper, local = (row["area"] for row in written["tubes"])
+    assert paper == pytest.approx(reference, rel=1e-4)
+    assert 0 < local <= paper * (1 + 1e-6)
+    (cost,) = written["training"]
+    assert 0 < cost["solver"] < cost["both"] < cost["first"]
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= COLUMNS

@@ -24,6 +24,7 @@ import rich
 from experiments.benchmark_cases import Settings, cases
 from experiments.benchmark_growth import (
     GROWTH_NOTE,
+    LEAST,
     exponent,
     grown,
     growth_table,
@@ -73,7 +74,7 @@ def growth(settings: Settings) -> None:
             write(settings, rows=rows)
     rich.print(growth_table(rows))
     rich.print(GROWTH_NOTE)
-    rich.print(f"InteriorPoint's seconds grow like n^{exponent(rows):.2f}")
+    rich.print(f"InteriorPoint's seconds grow like n^{exponent(rows):.2f} from n = {LEAST} on")
 
 
 def loops(settings: Settings) -> None:

@@ -32,7 +32,7 @@ class Settings:
     networks: tuple[Literal["trained", "random"], ...] = ("trained", "random")
     """Trained on the MPC with the paper's initial set, or He-initialised near its kinks."""
     growth: tuple[int, ...] = (4, 10, 20, 32, 64, 100, 200)
-    """`growth`: the same; bases have 13 to 405 entries."""
+    """`growth`: neurons in each of the two hidden layers; bases have 13 to 405 entries."""
     reference_width: int = 32
     """`growth`: cvxpy and Clarabel are timed up to this width."""
     reference_facets: int = 8

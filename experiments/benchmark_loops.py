@@ -7,7 +7,7 @@ from rich.table import Table
 import reachjax as rj
 from experiments import double_integrator
 from experiments.benchmark_cases import Settings
-from experiments.benchmark_methods import CLOCKS, REFERENCE, timed
+from experiments.benchmark_methods import REFERENCE, repeated
 from experiments.command import blank_table
 from experiments.double_integrator import INITIAL_BOX, INPUT_BOX, A, B
 from experiments.fine_tuning import HORIZON, TEMPLATE, certified_tube
@@ -17,8 +17,9 @@ from experiments.step_cost import StepCost, step_cost
 SOLVERS = {"Clarabel": rj.Clarabel(), "InteriorPoint": rj.InteriorPoint(), "Auto": rj.Auto()}
 RELAXATIONS = {"PaperQC": rj.PaperQC(), "LocalBounds": rj.LocalBounds()}
 LOOPS_NOTE = """\
-s/tube, s/step: median of warm calls;  first: compilation included
-faster: seconds of the relaxation's first row over this row's;  area: of the last set"""
+s/tube: median of warm calls;  first: compilation included
+faster: seconds of the relaxation's first row over this row's
+area: of the last set;  * first call, longer than --patience"""
 
 Layers = list[tuple[np.ndarray, np.ndarray]]
 
@@ -43,7 +44,7 @@ def reference_tube(layers: Layers) -> rj.Polytope:
 
 def tube_rows(layers: Layers, settings: Settings):
     """Rows of the table of tubes, one after the other."""
-    net, clock = rj.MLP.from_layers(layers), CLOCKS[settings.clock]
+    net = rj.MLP.from_layers(layers)
     for name, relaxation in RELAXATIONS.items():
         ways = {
             by: lambda r=relaxation, s=solver: certified_tube(net, relaxation=r, solver=s).sets[-1]
@@ -54,19 +55,16 @@ def tube_rows(layers: Layers, settings: Settings):
         base = None
         for by, way in ways.items():
             jax.clear_caches()
-            first, last = timed(way, clock)
-            calls = []
-            while first + sum(calls) < settings.patience and len(calls) < settings.repetitions:
-                calls.append(timed(way, clock)[0])
-            seconds = float(np.median(calls or [first]))
+            timing = repeated(way, settings)
+            seconds, last = timing.seconds, timing.result
             base = base or seconds
             yield {
                 "relaxation": name,
                 "method": by,
                 "clock": settings.clock,
                 "seconds": seconds,
-                "first": first,
-                "calls": calls,
+                "first": timing.first,
+                "calls": timing.calls,
                 "ratio": base / seconds,
                 "area": float(last.volume()),
             }
@@ -88,8 +86,9 @@ def tube_table(rows: list[dict]) -> Table:
     for heading in ("s/tube", "first", "faster", "area"):
         shown.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
-        numbers = (row["seconds"], row["first"], row["ratio"], row["area"])
-        shown.add_row(row["relaxation"], row["method"], *map("{:.3g}".format, numbers))
+        numbers = (row["first"], row["ratio"], row["area"])
+        seconds = "*" * (not row["calls"]) + f"{row['seconds']:.3g}"
+        shown.add_row(row["relaxation"], row["method"], seconds, *map("{:.3g}".format, numbers))
     return shown
 
 

@@ -96,11 +96,8 @@ def methods(settings: Settings) -> dict[str, Method]:
 def measure(case: Case, name: str, method: Method, settings: Settings) -> dict:
     """One row: the first call, the median of the warm calls that patience allows, the bounds."""
     jax.clear_caches()
-    clock = CLOCKS[settings.clock]
-    first, answer = timed(partial(method, case), clock)
-    calls: list[float] = []
-    while first + sum(calls) < settings.patience and len(calls) < settings.repetitions:
-        calls.append(timed(partial(method, case), clock)[0])
+    timing = repeated(partial(method, case), settings)
+    answer = timing.result
     share = float(np.mean(np.isfinite(answer.bounds)))
     return {
         "case": case.name,
@@ -111,13 +108,37 @@ def measure(case: Case, name: str, method: Method, settings: Settings) -> dict:
         "n": answer.size,
         "multipliers": answer.multipliers,
         "facets": int(np.isfinite(answer.bounds).sum()),
-        "seconds": float(np.median(calls or [first])) / share,
-        "first": first / share,
-        "calls": calls,
+        "seconds": timing.seconds / share,
+        "first": timing.first / share,
+        "calls": timing.calls,
         "bounds": answer.bounds,
         "statuses": answer.statuses,
         "slack": float(np.sum(answer.bounds - case.support(settings.seed))),
     }
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """Seconds of the first call, of those after it, and what the last one returned."""
+
+    first: float
+    calls: list[float]
+    result: Any
+
+    @property
+    def seconds(self) -> float:
+        """The median of warm calls; of the first one if there are none."""
+        return float(np.median(self.calls or [self.first]))
+
+
+def repeated(call: Callable[[], Any], settings: Settings) -> Timing:
+    """The first call, and as many warm ones as patience allows."""
+    clock = CLOCKS[settings.clock]
+    first, result = timed(call, clock)
+    calls: list[float] = []
+    while first + sum(calls) < settings.patience and len(calls) < settings.repetitions:
+        calls.append(timed(call, clock)[0])
+    return Timing(first, calls, result)
 
 
 def timed(call: Callable[[], Any], clock: Callable[[], float]) -> tuple[float, Any]:

@@ -18,16 +18,24 @@ import jax
 import numpy as np
 import rich
 import tyro
+from rich.progress import track
 
 import reachjax as rj
 from experiments.benchmark_cases import he_network
-from experiments.command import run_experiment
+from experiments.command import blank_table, run_experiment
 from reachjax.lmi import Program, step_program
 from reachjax.recheck import interval_offsets
 from reachjax.relaxation import Products
 from reachjax.solvers import accepted_offsets
 from reachjax.witnesses import initial_states
 
+THIN = 1e-5
+AGREEMENT_NOTE = """\
+solved, Clarabel: facets that each solves
+optima: largest difference of their optimal values where both do
+looser: most by which our bound exceeds Clarabel's where it solves, and how
+often by more than 1e-5;  both as parts of the interval's radius
+support: least bound less simulated support: negative would be unsound"""
 RELAXATIONS = (
     *(rj.PaperQC(*flags) for flags in product((False, True), repeat=2)),
     *(rj.LocalBounds(*flags) for flags in product((False, True), repeat=2)),
@@ -82,30 +90,45 @@ def random_step(seed: int) -> tuple[rj.ClosedLoop, rj.Box, np.ndarray, rj.Abstra
 def agreement(settings: Settings) -> None:
     """Statuses, differences to Clarabel's solved facets, and bounds less simulated supports."""
     ours, theirs = rj.InteriorPoint(), rj.Clarabel()
-    rows = []
-    for seed in range(settings.programs):
+    rows: dict[str, list] = {"with interior": [], "flat": [], "thin (1e-6)": []}
+    for seed in track(range(settings.programs), "programs"):
         loop, box, directions, relaxation = random_step(seed)
         program = program_of(loop, box, relaxation, directions)
-        solution, reference = ours.solve(program), theirs.solve(program)
-        bounds, optimal = accepted_offsets(program, solution)
+        width = float(box.upper[0] - box.lower[0])
+        kind = "flat" if width == 0 else "thin (1e-6)" if width < THIN else "with interior"
         states = initial_states(box, 2000, seed)
         attained = np.asarray(loop.simulate(states, 1)[:, 1] @ directions.T).max(axis=0)
         size = np.maximum(interval_offsets(program) - program.objective.mid[:, -1], 1e-9)
-        other = accepted_offsets(program, reference)[0]
-        solved = reference.statuses == rj.SolverStatus.SOLVED
-        away = np.where(solved, abs(bounds - other), 0.0)
-        over = bounds - np.fmin(other, bounds)
-        parts = solution.statuses, away, away / size, bounds - attained, optimal, over
-        rows += list(zip(*parts, strict=True))
-    statuses, away, relative, slack, optimal, over = map(np.array, zip(*rows, strict=True))
-    names = {status.name: int((statuses == status).sum()) for status in rj.SolverStatus}
-    rich.print(f"{settings.programs} programs, {len(rows)} facets: {names}")
-    rich.print(f"optimum borne out: {int(optimal.sum())}")
-    rich.print(f"largest difference where Clarabel solved: {away.max():.1e}")
-    rich.print(
-        f"of the interval's radius: {relative.max():.1e}; looser by at most {over.max():.1e}"
+        found, other = ours.solve(program), theirs.solve(program)
+        bounds, reference = (accepted_offsets(program, each)[0] for each in (found, other))
+        parts = (
+            *(each.statuses == rj.SolverStatus.SOLVED for each in (found, other)),
+            abs(found.offsets - other.offsets) / size,
+            (bounds - reference) / size,
+            bounds - attained,
+        )
+        rows[kind] += list(zip(*parts, strict=True))
+    shown = blank_table(f"{settings.programs} programs: InteriorPoint and Clarabel")
+    headings = ("sets", "facets", "solved", "Clarabel", "optima", "looser", "> 1e-5", "support")
+    for i, heading in enumerate(headings):
+        shown.add_column(heading, justify="right" if i else "left", no_wrap=True)
+    for kind, found in rows.items():
+        if found:
+            shown.add_row(kind, *_summary(*map(np.array, zip(*found, strict=True))))
+    rich.print(shown)
+    rich.print(AGREEMENT_NOTE)
+
+
+def _summary(ours, theirs, optima, looser, support) -> tuple[str, ...]:
+    """The cells of one row."""
+    looser = np.where(theirs, looser, 0.0)
+    return (
+        *(str(count) for count in (len(ours), ours.sum(), theirs.sum())),
+        f"{np.where(ours & theirs, optima, 0.0).max():.0e}",
+        f"{looser.max():.0e}",
+        str((looser > 1e-5).sum()),
+        f"{support.min():.0e}",
     )
-    rich.print(f"least bound less simulated support: {slack.min():.1e}")
 
 
 def with_violated(program: Program, moment: np.ndarray, batch: int) -> Program | None:

@@ -12,7 +12,6 @@ from experiments.fine_tuning import certified_tube
 
 HORIZON = 5
 REPETITIONS = 15
-DEFAULT = rj.Auto()
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class StepCost:
         return self.both / self.forward - 1
 
 
-def step_cost(layers, solver: rj.AbstractSolver = DEFAULT) -> StepCost:
+def step_cost(layers, solver: rj.AbstractSolver) -> StepCost:
     """Time the mean log-volume of five certified sets of eight facets, and its gradient."""
     net = rj.MLP.from_layers(layers)
 

@@ -22,9 +22,7 @@ from scipy.linalg import LinAlgError, solve_triangular
 
 from reachjax.solvers.compact import CompactProgram
 from reachjax.solvers.pairs import Pairs
-
-DAMPING = 1e-4
-"""`kappa`, as in `primal_dual`."""
+from reachjax.solvers.primal_dual import DAMPING
 
 
 class AbstractBarrier(abc.ABC):
@@ -66,8 +64,12 @@ class AbstractBarrier(abc.ABC):
 
     @property
     def price(self) -> float:
-        """Of `t`."""
-        return self.cost[self.count]
+        """Of `t`, in units of the trace that the moments may have."""
+        return self.cost[self.count] / self.unit
+
+    @price.setter
+    def price(self, price: float) -> None:
+        self.cost[self.count] = price * self.unit
 
     def weighted(self, y: np.ndarray) -> np.ndarray:
         """What `Z` changes by: linear."""
@@ -79,7 +81,7 @@ class AbstractBarrier(abc.ABC):
 
     def inverse(self, y: np.ndarray) -> np.ndarray:
         """`Z^-1`, positive semidefinite whatever the rounding."""
-        factor = inverse_cholesky(self.schur(y))
+        factor = triangular_inverse(self.schur(y))
         return factor.T @ factor
 
     def multipliers(self, y: np.ndarray, count: int) -> np.ndarray:
@@ -105,7 +107,7 @@ class AbstractBarrier(abc.ABC):
 
     def derivatives(self, y: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and Hessian."""
-        factor = inverse_cholesky(self.schur(y))
+        factor = triangular_inverse(self.schur(y))
         inverse = factor.T @ factor
         moved = inverse @ self.states @ inverse
         gradient = self.cost - weight * self.terms.paired(inverse)
@@ -119,7 +121,7 @@ class AbstractBarrier(abc.ABC):
         gradient[self.signed] -= weight / y[self.signed]
         hessian[self.signed, self.signed] += weight / y[self.signed] ** 2
         for each, block, slopes in self.blocks(y, weight):
-            factor = inverse_cholesky(block)
+            factor = triangular_inverse(block)
             scaled = factor @ slopes @ factor.T
             flat = scaled.reshape(len(scaled), -1)
             gradient[self.others] -= each * np.trace(scaled, axis1=1, axis2=2)
@@ -141,7 +143,7 @@ def _together(generators: Pairs, others: Pairs) -> Pairs:
     )
 
 
-def inverse_cholesky(matrix: np.ndarray) -> np.ndarray:
+def triangular_inverse(matrix: np.ndarray) -> np.ndarray:
     """The inverse of the Cholesky factor."""
     factor = np.linalg.cholesky(matrix)
     return solve_triangular(factor, np.eye(len(matrix)), lower=True, check_finite=False)

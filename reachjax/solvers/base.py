@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from reachjax.checks import real_number
 from reachjax.lmi import Program
 from reachjax.sets import NormalForm
 from reachjax.solvers.host import all_finite, on_host, shapes_of
@@ -117,7 +116,7 @@ class Enclosure(NamedTuple):
 
 
 def require_positive(solver: Any) -> None:
-    """Check that every option of a solver but `smoothing` is a positive number.
+    """Check that every option of a solver is a positive number.
 
     Raises:
         TypeError: one is no number.
@@ -128,21 +127,12 @@ def require_positive(solver: Any) -> None:
         name = f"{type(solver).__name__}.{field.name}"
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
             raise TypeError(f"{name} must be a number, but {value!r} arrived")
-        if field.name == "smoothing":
-            real_number(name, value, 0.0)
-        elif not float(value) > 0:
+        if not float(value) > 0:
             raise ValueError(f"{name} must be positive, but {value!r} arrived")
 
 
 class AbstractSolver(abc.ABC):
-    """Solves the programs of one step. Hashable and immutable: its options are its fields.
-
-    Attributes:
-        smoothing: where it is above 0, offsets are those on the central path at this barrier
-            weight.
-    """
-
-    smoothing: float = 0.0
+    """Solves the programs of one step. Hashable and immutable: its options are its fields."""
 
     @abc.abstractmethod
     def solve(self, program: Program) -> Solution:

@@ -15,8 +15,12 @@ FROM_AFAR = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 1e-
 Newton steps and each of the others about ten; beginning at 0.1 takes 200."""
 
 PRICES = (10.0, 100.0, 1000.0)
-"""Prices of `t` that are tried, in units of the sizes of basis and successor. The trace of moments
-stays below the price; with many neurons kept, 1 was seen to be too low by half."""
+"""Prices of `t` that are tried, in units of the sizes of basis and successor
+(`AbstractBarrier.unit`). The trace of moments stays below the price; with many neurons kept, 1 was
+seen to be too low by half."""
+
+LARGEST = 1500
+"""Multipliers beyond which no path is followed: a step costs their cube."""
 
 STEPS = 200
 """Newton steps after which the centre counts as not found."""
@@ -47,18 +51,21 @@ class Centre(NamedTuple):
 
 
 def path_end(
-    barrier: AbstractBarrier, start: Callable[[], np.ndarray | None], weights: tuple[float, ...]
+    barrier: AbstractBarrier,
+    start: Callable[[], np.ndarray | None],
+    weights: tuple[float, ...],
+    prices: tuple[float, ...] = PRICES,
 ) -> Centre | None:
     """The last centre that is reached.
 
-    At too low a price `t` stays, and the ellipsoid is smaller than the relaxation itself allows.
+    At too low a price `t` stays, and what is found is smaller than the relaxation itself allows.
     """
-    for price in PRICES:
-        barrier.cost[barrier.count] = price * barrier.unit
+    for price in prices:
+        barrier.price = price
         first = start()
         found = None if first is None else follow(barrier, first, weights)
         # it bounds alone the columns that no product does: of each, the moment takes mu / t
-        unit = (1 + barrier.n) * found.weight / barrier.price if found else np.inf
+        unit = (1 + barrier.n) * found.weight / barrier.cost[barrier.count] if found else np.inf
         if found is None or found.y[barrier.count] <= unit:
             return found
     return None

@@ -18,7 +18,7 @@ import numpy as np
 from reachjax.lmi import Program, with_successor
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import Enclosure, SolverStatus
-from reachjax.solvers.central_path import FROM_AFAR, Centre, path_end, solved
+from reachjax.solvers.central_path import FROM_AFAR, LARGEST, Centre, path_end, solved
 from reachjax.solvers.compact import compact
 from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 from reachjax.solvers.host import all_finite
@@ -31,9 +31,6 @@ smaller, one of a thin ellipsoid was off by 7e-4, not by 1e-5."""
 
 USEFUL = 1e-3
 """A path that is lost at a smaller weight still gives an ellipsoid, looser by that as above."""
-
-LARGEST = 1500
-"""Multipliers, beyond which a solver's point is taken as it is: a step costs their cube."""
 
 
 class Sensitivity(NamedTuple):

@@ -19,7 +19,8 @@ width loses them.
 
 **Kinks.** Where a facet only touches, a neuron becomes stable, or an optimal point is not unique,
 an offset has a kink: the derivative is then one of its generalised gradients, and central
-differences see another. Second derivatives and forward mode do not exist; JAX raises an error.
+differences see another. Those of `CentralPath` have none (`smoothing`). Second derivatives and
+forward mode do not exist; JAX raises an error.
 """
 
 from __future__ import annotations
@@ -35,20 +36,21 @@ from jaxtyping import Array, Float
 from reachjax.lmi import Program, lagrangian
 from reachjax.solvers.accepted import accepted_offsets
 from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
-from reachjax.solvers.host import all_finite, asked_for, on_host
-from reachjax.solvers.smoothed import smoothed_offsets
+from reachjax.solvers.cotangents import asked_for
+from reachjax.solvers.host import all_finite, on_host
+from reachjax.solvers.smoothing import CentralPath, smoothed_offsets
 
 
 def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Array, " f"], Solution]:
     """Solve for every facet and prove the offsets; differentiable in the program's rows.
 
-    Optimal offsets, or those of a solver's `smoothing` where it has one.
+    Optimal offsets, or those of the central path where that is asked for.
 
     Returns:
         The proved offsets `(f,)`, and what the solver proposed (which has no derivative).
     """
-    if solver.smoothing > 0:
-        return smoothed_offsets(program, solver.smoothing)
+    if isinstance(solver, CentralPath):
+        return smoothed_offsets(program, solver.weight)
     result: Any = _proved_offsets(solver, program.facts.mid, program.objective.mid, program)
     offsets, _, solution = result
     return offsets, solution

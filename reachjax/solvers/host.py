@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
 
 from reachjax.checks import is_concrete
 
@@ -63,9 +62,3 @@ def on_host(function: Any, shapes: Any, argument: Any) -> Any:
         vmap_method="expand_dims",
     )
     return jax.tree.unflatten(jax.tree.structure(shapes), flat)
-
-
-def asked_for(proposal: Any) -> Bool[Array, ""]:
-    """Whether a derivative of what a solver proposes is asked for; there is none."""
-    parts = [part for part in jax.tree.leaves(proposal) if part.dtype == float]
-    return jnp.array([jnp.any(part != 0) for part in parts]).any()

@@ -41,10 +41,6 @@ class InteriorPoint(AbstractSolver):
         tolerance: of residuals and gap, relative, that counts as solved. Iterations go on to a
             thousandth of it as long as they gain, which most programs reach.
         max_iterations: a facet that needs more is reported with status `LIMIT`.
-        smoothing: a barrier weight, in units of the 2-norm of each facet's row over the scaled
-            basis. Above 0, offsets are those on the central path there: looser by at most that
-            times the number of basis entries and multipliers, without kinks, and with the
-            derivatives of that smooth function.
 
     Raises:
         TypeError: an option is no number.
@@ -61,7 +57,6 @@ class InteriorPoint(AbstractSolver):
 
     tolerance: float = 1e-6
     max_iterations: int = 200
-    smoothing: float = 0.0
 
     def __post_init__(self):
         require_positive(self)

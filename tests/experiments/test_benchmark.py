@@ -3,6 +3,8 @@
 import json
 import re
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
@@ -22,6 +24,7 @@ from experiments.benchmark_growth import (
 from experiments.benchmark_methods import REFERENCE, measure, methods
 from experiments.benchmark_report import NOTE, compare, table
 from experiments.double_integrator import INITIAL_BOX
+from experiments.operations import operations
 
 QUICK = {"networks": ("random",), "widths": (3,), "repetitions": 1, "patience": 1e3}
 COLUMNS = 80
@@ -145,14 +148,15 @@ def test_one_facet_has_the_same_bounds_by_every_solver(growing):
     assert [row["n"] for row in growing] == [11, 11, 11, 15]
     assert all(row["difference"] < 1e-5 for row in growing[:3])
     assert growing[3]["difference"] is None
-    assert all(row["memory"] >= 0 for row in growing)
+    assert growing[2]["memory"] > growing[1]["memory"]  # it compiles
 
 
 def test_the_rate_of_arithmetic_is_below_the_machines(growing):
     for row in (growing[2], growing[3]):
         assert 0 < row["rate"] < row["best_rate"]
     slope = np.log(growing[3]["seconds"] / growing[2]["seconds"]) / np.log(15 / 11)
-    assert exponent(growing) == pytest.approx(slope)
+    assert exponent(growing, least=11) == pytest.approx(slope)
+    assert np.isnan(exponent(growing))
 
 
 def test_the_table_of_growth_fits_in_eighty_columns(growing):
@@ -181,3 +185,17 @@ def test_tubes_of_all_ways_agree_and_training_steps_are_timed(tmp_path, capsys, 
     (cost,) = written["training"]
     assert 0 < cost["solver"] < cost["both"] < cost["first"]
     assert max(map(len, capsys.readouterr().out.splitlines())) <= COLUMNS
+
+
+def test_operations_of_products_and_factorisations_are_counted():
+    a, b = jnp.ones((3, 4)), jnp.ones((4, 5))
+    assert operations(jnp.matmul, a, b) == 2 * 3 * 4 * 5
+    assert operations(jax.vmap(jnp.matmul, (0, None)), jnp.ones((7, 3, 4)), b) == 7 * 120
+    eye = jnp.eye(6)
+    assert operations(jax.lax.linalg.cholesky, eye) == pytest.approx(72)
+    assert operations(jnp.linalg.eigvalsh, eye) == pytest.approx(288)
+
+    def thrice(matrix):
+        return jax.lax.fori_loop(0, 3, lambda _, carry: jax.jit(jnp.matmul)(carry, matrix), matrix)
+
+    assert operations(thrice, eye) == 3 * 2 * 6**3

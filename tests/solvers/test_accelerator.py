@@ -38,3 +38,21 @@ def test_networks_in_one_batch_are_those_one_at_a_time():
     stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *nets)
     together = jax.jit(jax.vmap(offsets))(stack)
     np.testing.assert_allclose(together, [offsets(net) for net in nets], atol=1e-6)
+
+
+def test_gradients_of_a_batch_are_clarabels():
+    loop, box = closed_loop(random_loop(2)), rj.Box([-0.5, -0.5], [0.5, 0.5])
+
+    def size(net, solver):
+        closed = loop.replace(controller=net)
+        tube = rj.reach(closed, box, 2, rj.Template.box(2), solver=solver)
+        return rj.log_widths(tube.sets[-1]).sum()
+
+    stack = jax.tree.map(lambda w: jnp.stack([w, 1.1 * w]), loop.controller)
+    ours, theirs = (
+        jax.tree.leaves(jax.jit(jax.vmap(jax.grad(size), (0, None)), static_argnums=1)(stack, by))
+        for by in (rj.InteriorPoint(), rj.Clarabel())
+    )
+    scale = max(abs(leaf).max() for leaf in theirs)
+    for mine, reference in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(mine, reference, atol=1e-3 * scale)

@@ -11,6 +11,7 @@ import tyro
 
 import reachjax as rj
 from experiments import double_integrator
+from experiments.command import at_least_one
 from experiments.double_integrator import INITIAL_BOX, INPUT_BOX, A, B
 from reachjax.witnesses import initial_states
 
@@ -51,6 +52,17 @@ class Settings:
     """Of samples, weights and simulated states."""
     output: Path = Path("results/benchmark")
     """Where everything is written."""
+
+    def __post_init__(self):
+        at_least_one(
+            **{"--widths": min(self.widths, default=0), "--growth": min(self.growth, default=0)},
+            **{"--networks": len(self.networks), "--reference-facets": self.reference_facets},
+            **{"--samples": self.samples - 1, "--training-steps": self.training_steps},
+        )
+        for name in ("repetitions", "patience", "reference_width", "seed"):
+            if not getattr(self, name) >= 0:
+                option = f"--{name.replace('_', '-')}"
+                raise ValueError(f"{option} must be at least 0, but {getattr(self, name)} arrived")
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from rich.progress import track
 
 import reachjax as rj
 from experiments.benchmark_cases import he_network
-from experiments.command import blank_table, run_experiment
+from experiments.command import at_least_one, blank_table, run_experiment
 from reachjax.lmi import Program, step_program
 from reachjax.recheck import interval_offsets
 from reachjax.relaxation import Products
@@ -62,6 +62,15 @@ class Settings:
     """Networks of each width in `products`."""
     radius: float = 2.0
     """Of their set of states."""
+
+    def __post_init__(self):
+        counts = ("facets", "programs", "rounds", "batch", "seeds")
+        at_least_one(
+            **{f"--{name}": getattr(self, name) for name in counts},
+            **{"--widths": min(self.widths, default=0)},
+        )
+        if not 0 < self.radius < np.inf:
+            raise ValueError(f"--radius must be positive, but {self.radius} arrived")
 
 
 def program_of(loop: rj.ClosedLoop, box: rj.Box, relaxation, directions) -> Program:

@@ -55,10 +55,16 @@ class Settings:
 
     def __post_init__(self):
         at_least_one(
-            **{"--widths": min(self.widths, default=0), "--growth": min(self.growth, default=0)},
-            **{"--networks": len(self.networks), "--reference-facets": self.reference_facets},
-            **{"--samples": self.samples - 1, "--training-steps": self.training_steps},
+            **{
+                "--widths": min(self.widths, default=0),
+                "--growth": min(self.growth, default=0),
+                "--networks": len(self.networks),
+                "--reference-facets": self.reference_facets,
+                "--training-steps": self.training_steps,
+            }
         )
+        if self.samples < 2:
+            raise ValueError(f"--samples must be at least 2, but {self.samples} arrived")
         for name in ("repetitions", "patience", "reference_width", "seed"):
             if not getattr(self, name) >= 0:
                 option = f"--{name.replace('_', '-')}"

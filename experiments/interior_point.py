@@ -65,10 +65,8 @@ class Settings:
 
     def __post_init__(self):
         counts = ("facets", "programs", "rounds", "batch", "seeds")
-        at_least_one(
-            **{f"--{name}": getattr(self, name) for name in counts},
-            **{"--widths": min(self.widths, default=0)},
-        )
+        at_least_one(**{f"--{name}": getattr(self, name) for name in counts})
+        at_least_one(**{"--widths": min(self.widths, default=0)})
         if not 0 < self.radius < np.inf:
             raise ValueError(f"--radius must be positive, but {self.radius} arrived")
 

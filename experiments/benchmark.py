@@ -19,6 +19,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("RAYON_NUM_THREADS", "1")  # Clarabel's
 
 import jax
+import numpy as np
 import rich
 
 from experiments.benchmark_cases import Settings, cases
@@ -74,7 +75,8 @@ def growth(settings: Settings) -> None:
             write(settings, rows=rows)
     rich.print(growth_table(rows))
     rich.print(GROWTH_NOTE)
-    rich.print(f"InteriorPoint's seconds grow like n^{exponent(rows):.2f} from n = {LEAST} on")
+    if np.isfinite(slope := exponent(rows)):
+        rich.print(f"InteriorPoint's seconds grow like n^{slope:.2f} from n = {LEAST} on")
 
 
 def loops(settings: Settings) -> None:
@@ -105,4 +107,5 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    run_experiment(main, Settings)
+    # ratios are of one run: an interrupted one is not continued
+    run_experiment(main, Settings, "rows so far are in the folder of results")

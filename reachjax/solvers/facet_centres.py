@@ -9,6 +9,7 @@ import numpy as np
 
 from reachjax.lmi import Program
 from reachjax.recheck import interval_offsets, sound_offsets
+from reachjax.solvers.accepted import ROUNDING
 from reachjax.solvers.base import Solution, SolverStatus
 from reachjax.solvers.central_path import FROM_AFAR, LARGEST, PRICES, path_end, solved
 from reachjax.solvers.compact import CompactProgram, compact
@@ -96,8 +97,8 @@ def _proved(program: Program, reduced: CompactProgram, found: Centres) -> Centre
     offsets = reduced.centers + reduced.units * found.centres
     by_intervals = interval_offsets(program)
     proved = np.fmin(sound_offsets(program, multipliers), by_intervals)
-    # False where there is no centre
-    borne_out = proved <= offsets + SHORT * (by_intervals - reduced.centers)
+    slack = SHORT * (by_intervals - reduced.centers) + ROUNDING * abs(by_intervals)
+    borne_out = proved <= offsets + slack  # False where there is no centre
     statuses = np.where(
         answered & ~borne_out, int(SolverStatus.INACCURATE), np.asarray(solution.statuses)
     )

@@ -14,6 +14,7 @@ the multipliers in `Gamma` and `Gamma'` being those of `y` and `y'`.
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import partial
 from typing import Any
 
@@ -43,13 +44,16 @@ class CentralPath(AbstractSolver):
 
     Args:
         weight: how much looser, about, in units of the 2-norm of each facet's row over the scaled
-            basis. The barrier weight is this over the number of basis entries and multipliers.
+            basis: a number that does not change inside `jax.jit`. The barrier weight is this over
+            the number of basis entries and multipliers. From 1e-4 to 1 is sensible: at larger ones
+            offsets are looser than interval bounds, at smaller ones some paths are lost (status
+            `INACCURATE`, what is proved, and no derivative).
 
     Programs of more than 1500 multipliers are refused (status `FAILED`, interval bounds).
 
     Raises:
         TypeError: the weight is no number.
-        ValueError: it is not positive.
+        ValueError: it is not positive, or not finite.
 
     Example:
         >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach_step
@@ -64,6 +68,8 @@ class CentralPath(AbstractSolver):
 
     def __post_init__(self):
         require_positive(self)
+        if not math.isfinite(self.weight):
+            raise ValueError(f"CentralPath.weight must be finite, but {self.weight!r} arrived")
 
     def solve(self, program: Program) -> Solution:
         """Propose the multipliers of the centres."""

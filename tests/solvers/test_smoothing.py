@@ -241,6 +241,26 @@ def test_a_centre_that_its_multipliers_do_not_prove_is_none(monkeypatch):
     assert np.isnan(derivative_of(lambda offsets, _: offsets[0])).all()
 
 
+@pytest.mark.parametrize("width", [0.0, 1e-9])
+def test_points_have_their_offsets_and_derivatives(width):
+    loop = closed_loop(random_loop(2))
+
+    def bound(shift):
+        X = rj.Box([0.3 + shift, 0.3], [0.3 + shift + width, 0.3 + width])
+        template = rj.Template.box(2)
+        return rj.reach(loop, X, 1, template, solver=rj.CentralPath(1e-2)).sets[1].b[0]
+
+    h = 1e-4
+    slope = (bound(h) - bound(-h)) / (2 * h)
+    assert float(jax.grad(bound)(0.0)) == pytest.approx(float(slope), abs=1e-5)
+
+
+@pytest.mark.parametrize("part", ["small", "large"])
+def test_auto_does_not_mix_centres_and_optima(part):
+    with pytest.raises(ValueError, match=rf"Auto\.{part} must solve to optimality"):
+        rj.Auto(**{part: rj.CentralPath()})
+
+
 def test_what_is_proposed_has_no_derivative():
     assert np.isnan(derivative_of(lambda _, solution: solution.multipliers.sum())).all()
     assert np.isfinite(derivative_of(lambda offsets, _: offsets[0])).all()
@@ -259,7 +279,13 @@ def test_ellipsoids_are_those_of_the_interior_point_method():
 
 @pytest.mark.parametrize(
     ("weight", "error"),
-    [(-1.0, ValueError), (0, ValueError), ("little", TypeError), (np.nan, ValueError)],
+    [
+        (-1.0, ValueError),
+        (0, ValueError),
+        ("little", TypeError),
+        (np.nan, ValueError),
+        (np.inf, ValueError),
+    ],
 )
 def test_a_weight_that_is_none_is_refused(weight, error):
     with pytest.raises(error, match=r"CentralPath\.weight"):

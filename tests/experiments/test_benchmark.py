@@ -148,7 +148,6 @@ def test_one_facet_has_the_same_bounds_by_every_solver(growing):
     assert [row["n"] for row in growing] == [11, 11, 11, 15]
     assert all(row["difference"] < 1e-5 for row in growing[:3])
     assert growing[3]["difference"] is None
-    assert growing[2]["memory"] > growing[1]["memory"]  # it compiles
 
 
 def test_the_rate_of_arithmetic_is_below_the_machines(growing):
@@ -169,6 +168,7 @@ def test_the_table_of_growth_fits_in_eighty_columns(growing):
 def test_a_new_process_gives_the_same_bounds(growing):
     row = in_new_process(grown, 3, "Clarabel", GROWTH)
     np.testing.assert_array_equal(row["bounds"], growing[1]["bounds"])
+    assert row["memory"] > 2**20  # the program was compiled there, and nothing before it
 
 
 @pytest.mark.slow

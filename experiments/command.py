@@ -10,15 +10,19 @@ from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+CONTINUES = "run again to continue with what is stored"
 
-def run_experiment(main: Callable[[Any], None], settings: type) -> None:
+
+def run_experiment(
+    main: Callable[[Any], None], settings: type, interrupted: str = CONTINUES
+) -> None:
     """`main(settings)` as the command line has them; mistakes end it with one line."""
     try:
         main(tyro.cli(settings))
     except (ValueError, OSError, ImportError) as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
-        raise SystemExit("interrupted: run again to continue with what is stored") from None
+        raise SystemExit(f"interrupted: {interrupted}") from None
 
 
 def require_folder(output: Path) -> None:

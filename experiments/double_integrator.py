@@ -30,6 +30,12 @@ RELAXATIONS = {
     "paper-repeated": rj.PaperQC(repeated=True),
     "paper": rj.PaperQC(repeated=False),
 }
+SOLVERS = {
+    "auto": rj.Auto(),
+    "clarabel": rj.Clarabel(),
+    "interior-point": rj.InteriorPoint(),
+    "scs": rj.SCS(),
+}
 A, B = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
 STATE_BOX = np.array([[-5.0, -1.0], [5.0, 1.0]])
 INPUT_BOX = np.array([[-1.0], [1.0]])
@@ -55,7 +61,7 @@ class Settings:
         "paper",
     )
     """Which relaxations to compare; the figure shows the first. "paper" leaves out lambda_ij."""
-    solver: Literal["clarabel", "scs"] = "clarabel"
+    solver: Literal["auto", "clarabel", "interior-point", "scs"] = "auto"
     """What solves the semidefinite programs."""
     margin: float = 0.2
     """How far the second controller's MPC stays from the state constraint."""
@@ -150,7 +156,7 @@ def certify(name: str, fit: Fit, relaxation: str, settings: Settings) -> report.
         settings.horizon,
         template,
         RELAXATIONS[relaxation],
-        solver={"clarabel": rj.Clarabel(), "scs": rj.SCS()}[settings.solver],
+        solver=SOLVERS[settings.solver],
         samples=settings.simulations,
         seed=settings.seed,
         progress=lambda steps: track(steps, f"{relaxation}, controller {name}"),

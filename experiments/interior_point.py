@@ -1,15 +1,13 @@
-"""What the library's interior-point method is worth: speed, agreement, many products.
+"""What the interior-point method's answers are worth: agreement, and many products.
 
-    python -m experiments.interior_point speed | agreement | products
+    python -m experiments.interior_point agreement | products
 
-`speed`: one facet of the paper's program (every neuron kept, no `lambda_ij`) by cvxpy rebuilt with
-Clarabel and by `InteriorPoint`, and how seconds grow with the size of the basis. `agreement`:
-random loops, degenerate ones among them, against Clarabel and simulated successors. `products`:
-programs that grow by the products of facts which the last moment matrix violates most.
+`agreement`: random loops, degenerate ones among them, against Clarabel and simulated successors.
+`products`: programs that grow by the products of facts which the last moment matrix violates most.
+`benchmark growth` measures its speed.
 """
 
 import os
-import time
 from dataclasses import dataclass
 from itertools import product
 from typing import Literal
@@ -20,18 +18,24 @@ import jax
 import numpy as np
 import rich
 import tyro
+from rich.progress import track
 
 import reachjax as rj
-from experiments.benchmark import RANDOM_BOX, Case, he_network
-from experiments.command import blank_table
-from experiments.double_integrator import INPUT_BOX, A, B
-from experiments.reference import paper_step
+from experiments.benchmark_cases import he_network
+from experiments.command import at_least_one, blank_table, run_experiment
 from reachjax.lmi import Program, step_program
 from reachjax.recheck import interval_offsets
 from reachjax.relaxation import Products
 from reachjax.solvers import accepted_offsets
 from reachjax.witnesses import initial_states
 
+THIN = 1e-5
+AGREEMENT_NOTE = """\
+solved, Clarabel: facets that each solves
+optima: largest difference of their optimal values where both do
+looser: most by which our bound exceeds Clarabel's where it solves, and how
+often by more than 1e-5;  both as parts of the interval's radius
+support: least bound less simulated support: negative would be unsound"""
 RELAXATIONS = (
     *(rj.PaperQC(*flags) for flags in product((False, True), repeat=2)),
     *(rj.LocalBounds(*flags) for flags in product((False, True), repeat=2)),
@@ -42,14 +46,12 @@ RELAXATIONS = (
 class Settings:
     """Measure the interior-point method."""
 
-    study: tyro.conf.Positional[Literal["speed", "agreement", "products"]]
+    study: tyro.conf.Positional[Literal["agreement", "products"]]
     """What is measured."""
-    widths: tuple[int, ...] = (10, 20, 32, 64, 100)
-    """Neurons in each of two hidden layers: `speed`, and `products` (which wants 20 to 32)."""
-    reference: int = 32
-    """cvxpy is timed up to this width."""
+    widths: tuple[int, ...] = (20, 32)
+    """Neurons in each of two hidden layers in `products`."""
     facets: int = 2
-    """Of each program."""
+    """Of each network there."""
     programs: int = 200
     """How many random programs `agreement` solves."""
     rounds: int = 8
@@ -61,54 +63,20 @@ class Settings:
     radius: float = 2.0
     """Of their set of states."""
 
+    def __post_init__(self):
+        counts = ("facets", "programs", "rounds", "batch", "seeds")
+        at_least_one(**{f"--{name}": getattr(self, name) for name in counts})
+        at_least_one(**{"--widths": min(self.widths, default=0)})
+        if not 0 < self.radius < np.inf:
+            raise ValueError(f"--radius must be positive, but {self.radius} arrived")
+
 
 def program_of(loop: rj.ClosedLoop, box: rj.Box, relaxation, directions) -> Program:
     """The program of one step, on the host."""
     return jax.device_get(step_program(loop, box, box, directions, 0, relaxation))
 
 
-def speed(settings: Settings) -> None:
-    """Processor seconds per facet; wall time where jobs do not share the machine is no less."""
-    shown = blank_table("PaperQC(repeated=False), processor seconds per facet")
-    for heading in ("hidden", "n", "cvxpy", "first call", "ours", "faster", "difference", "status"):
-        shown.add_column(heading, justify="right")
-    sizes, seconds = [], []
-    for width in settings.widths:
-        case = Case("", he_network((2, width, width, 1), 0), RANDOM_BOX)
-        directions = np.asarray(case.template.directions)[: settings.facets]
-        relaxation = rj.PaperQC(repeated=False)
-        program = program_of(case.loop, rj.Box(*case.initial), relaxation, directions)
-        solver = rj.InteriorPoint()
-        first, _ = _timed(solver.solve, program)
-        ours, solution = min((_timed(solver.solve, program) for _ in range(3)), key=_first)
-        sizes.append(int(program.used.sum()))
-        seconds.append(ours / len(directions))
-        reference, difference = np.nan, np.nan
-        if width <= settings.reference:
-            (lower, upper), limits = case.initial, INPUT_BOX
-            facts = np.vstack([np.eye(2), -np.eye(2)]), np.r_[upper, -lower]
-            data = (case.layers, A, B, np.zeros(2), *limits, *facts)
-            reference, (bounds, _) = _timed(paper_step, *data, directions)
-            difference = abs(bounds - accepted_offsets(program, solution)[0]).max()
-        numbers = (reference / len(directions), first, seconds[-1], reference / ours, difference)
-        statuses = {rj.SolverStatus(int(code)).name for code in solution.statuses}
-        shown.add_row(f"2x{width}", str(sizes[-1]), *map("{:.3g}".format, numbers), str(statuses))
-    rich.print(shown)
-    slope = np.polyfit(np.log(sizes), np.log(seconds), 1)[0]
-    rich.print(f"seconds grow like n^{slope:.2f} from n = {sizes[0]} to {sizes[-1]}")
-
-
-def _timed(function, *arguments):
-    began = time.process_time()
-    result = function(*arguments)
-    return time.process_time() - began, result
-
-
-def _first(pair):
-    return pair[0]
-
-
-def random_case(seed: int) -> tuple[rj.ClosedLoop, rj.Box, np.ndarray, rj.AbstractRelaxation]:
+def random_step(seed: int) -> tuple[rj.ClosedLoop, rj.Box, np.ndarray, rj.AbstractRelaxation]:
     """A small loop, its box (a third of them flat or thin in one direction), facets, relaxation."""
     rng = np.random.default_rng(seed)
     n_x, hidden = int(rng.integers(1, 4)), [(6, 4), (5,), (8, 6)][rng.integers(3)]
@@ -129,30 +97,45 @@ def random_case(seed: int) -> tuple[rj.ClosedLoop, rj.Box, np.ndarray, rj.Abstra
 def agreement(settings: Settings) -> None:
     """Statuses, differences to Clarabel's solved facets, and bounds less simulated supports."""
     ours, theirs = rj.InteriorPoint(), rj.Clarabel()
-    rows = []
-    for seed in range(settings.programs):
-        loop, box, directions, relaxation = random_case(seed)
+    rows: dict[str, list] = {"with interior": [], "flat": [], "thin (1e-6)": []}
+    for seed in track(range(settings.programs), "programs"):
+        loop, box, directions, relaxation = random_step(seed)
         program = program_of(loop, box, relaxation, directions)
-        solution, reference = ours.solve(program), theirs.solve(program)
-        bounds, optimal = accepted_offsets(program, solution)
+        width = float(box.upper[0] - box.lower[0])
+        kind = "flat" if width == 0 else "thin (1e-6)" if width < THIN else "with interior"
         states = initial_states(box, 2000, seed)
         attained = np.asarray(loop.simulate(states, 1)[:, 1] @ directions.T).max(axis=0)
         size = np.maximum(interval_offsets(program) - program.objective.mid[:, -1], 1e-9)
-        other = accepted_offsets(program, reference)[0]
-        solved = reference.statuses == rj.SolverStatus.SOLVED
-        away = np.where(solved, abs(bounds - other), 0.0)
-        over = bounds - np.fmin(other, bounds)
-        parts = solution.statuses, away, away / size, bounds - attained, optimal, over
-        rows += list(zip(*parts, strict=True))
-    statuses, away, relative, slack, optimal, over = map(np.array, zip(*rows, strict=True))
-    names = {status.name: int((statuses == status).sum()) for status in rj.SolverStatus}
-    rich.print(f"{settings.programs} programs, {len(rows)} facets: {names}")
-    rich.print(f"optimum borne out: {int(optimal.sum())}")
-    rich.print(f"largest difference where Clarabel solved: {away.max():.1e}")
-    rich.print(
-        f"of the interval's radius: {relative.max():.1e}; looser by at most {over.max():.1e}"
+        found, other = ours.solve(program), theirs.solve(program)
+        bounds, reference = (accepted_offsets(program, each)[0] for each in (found, other))
+        parts = (
+            *(each.statuses == rj.SolverStatus.SOLVED for each in (found, other)),
+            abs(found.offsets - other.offsets) / size,
+            (bounds - reference) / size,
+            bounds - attained,
+        )
+        rows[kind] += list(zip(*parts, strict=True))
+    shown = blank_table(f"{settings.programs} programs: InteriorPoint and Clarabel")
+    headings = ("sets", "facets", "solved", "Clarabel", "optima", "looser", "> 1e-5", "support")
+    for i, heading in enumerate(headings):
+        shown.add_column(heading, justify="right" if i else "left", no_wrap=True)
+    for kind, found in rows.items():
+        if found:
+            shown.add_row(kind, *_summary(*map(np.array, zip(*found, strict=True))))
+    rich.print(shown)
+    rich.print(AGREEMENT_NOTE)
+
+
+def _summary(ours, theirs, optima, looser, support) -> tuple[str, ...]:
+    """The cells of one row."""
+    looser = np.where(theirs, looser, 0.0)
+    return (
+        *(str(count) for count in (len(ours), ours.sum(), theirs.sum())),
+        f"{np.where(ours & theirs, optima, 0.0).max():.0e}",
+        f"{looser.max():.0e}",
+        str((looser > 1e-5).sum()),
+        f"{support.min():.0e}",
     )
-    rich.print(f"least bound less simulated support: {slack.min():.1e}")
 
 
 def with_violated(program: Program, moment: np.ndarray, batch: int) -> Program | None:
@@ -219,8 +202,8 @@ def products(settings: Settings) -> None:
 def main(settings: Settings) -> None:
     """Run one study and print what it found."""
     jax.config.update("jax_enable_x64", True)
-    {"speed": speed, "agreement": agreement, "products": products}[settings.study](settings)
+    {"agreement": agreement, "products": products}[settings.study](settings)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings))
+    run_experiment(main, Settings, "nothing is kept")

@@ -36,12 +36,12 @@ class StepCost:
         return self.both / self.forward - 1
 
 
-def step_cost(layers) -> StepCost:
+def step_cost(layers, solver: rj.AbstractSolver) -> StepCost:
     """Time the mean log-volume of five certified sets of eight facets, and its gradient."""
     net = rj.MLP.from_layers(layers)
 
     def size(net):
-        tube = certified_tube(net, HORIZON)
+        tube = certified_tube(net, HORIZON, solver=solver)
         seconds = sum(tube.proof(t).seconds.sum() for t in range(1, HORIZON + 1))
         return rj.log_volume(tube) / HORIZON, seconds
 
@@ -55,9 +55,9 @@ def step_cost(layers) -> StepCost:
 
     first = seconds(gradient)
     seconds(value)
-    forward, both, solver = [], [], []
+    forward, both, solving = [], [], []
     for _ in range(REPETITIONS):
         forward.append(seconds(value))
         both.append(seconds(gradient))
-        solver.append(float(np.asarray(value(net)[1])))
-    return StepCost(first, *map(statistics.median, (forward, both, solver)))
+        solving.append(float(np.asarray(value(net)[1])))
+    return StepCost(first, *map(statistics.median, (forward, both, solving)))

@@ -20,6 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes run side by side
 
 import rich
 
+import reachjax as rj
 from experiments import training_report
 from experiments.command import at_least_one, bar, configure_jax, run_experiment
 from experiments.double_integrator import Settings as Teacher
@@ -162,7 +163,7 @@ def main(settings: Settings) -> None:
     )
     outcomes = train_on([fit.layers for fit in fits], samples, settings)
     rich.print("timing training steps, about a minute ...")
-    cost = step_cost(fits[0].layers)
+    cost = step_cost(fits[0].layers, rj.Auto())
     for table in training_report.tables(outcomes, settings.goals, cost):
         rich.print(table)
     rich.print("drawing ...")

@@ -8,11 +8,13 @@ from reachjax.solvers.enclosures import proved_ellipsoid, proved_size
 from reachjax.solvers.geometry import bounding_box, polytope_volume, separation, support
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import SCS, Clarabel, CvxpySolver
+from reachjax.solvers.smoothing import CentralPath
 
 __all__ = [
     "SCS",
     "AbstractSolver",
     "Auto",
+    "CentralPath",
     "Clarabel",
     "CvxpySolver",
     "Enclosure",

@@ -11,6 +11,7 @@ from reachjax.solvers.base import ANSWERS, AbstractSolver, Enclosure, Solution, 
 from reachjax.solvers.compact import compact
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import Clarabel
+from reachjax.solvers.smoothing import CentralPath
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Auto(AbstractSolver):
 
     Raises:
         TypeError: an option is of another kind.
-        ValueError: the limit is negative.
+        ValueError: the limit is negative, or a solver is `CentralPath`.
 
     Example:
         >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach_step
@@ -50,6 +51,11 @@ class Auto(AbstractSolver):
             if not isinstance(getattr(self, name), AbstractSolver):
                 raise TypeError(
                     f"Auto.{name} must be a solver, but {getattr(self, name)!r} arrived"
+                )
+            if isinstance(getattr(self, name), CentralPath):
+                raise ValueError(
+                    f"Auto.{name} must solve to optimality, but {getattr(self, name)!r} arrived: "
+                    "give that as the solver itself"
                 )
         whole_number("Auto.limit", self.limit, 0)
 

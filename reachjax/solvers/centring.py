@@ -10,7 +10,6 @@ derivative is exact.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -18,10 +17,10 @@ import numpy as np
 
 from reachjax.lmi import Program, with_successor
 from reachjax.sets import NormalForm
-from reachjax.solvers.barrier import Barrier
 from reachjax.solvers.base import Enclosure, SolverStatus
-from reachjax.solvers.central_path import Centre, follow, solved
+from reachjax.solvers.central_path import FROM_AFAR, LARGEST, Centre, path_end, solved
 from reachjax.solvers.compact import compact
+from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 from reachjax.solvers.host import all_finite
 
 WEIGHTS = (1e-6, 1e-7, 1e-8)
@@ -32,17 +31,6 @@ smaller, one of a thin ellipsoid was off by 7e-4, not by 1e-5."""
 
 USEFUL = 1e-3
 """A path that is lost at a smaller weight still gives an ellipsoid, looser by that as above."""
-
-FROM_AFAR = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 1e-5)
-"""Weights to begin with far from the path. Measured with every neuron kept: the first takes some 60
-Newton steps and each of the others about ten; beginning at 0.1 takes 200."""
-
-PRICES = (10.0, 100.0, 1000.0)
-"""Prices of `t` that are tried, in units of the sizes of basis and successor. The trace of moments
-stays below the price; with many neurons kept, 1 was seen to be too low by half."""
-
-LARGEST = 1500
-"""Multipliers, beyond which a solver's point is taken as it is: a step costs their cube."""
 
 
 class Sensitivity(NamedTuple):
@@ -93,8 +81,8 @@ def enclosed(program: Program, given: NormalForm | None = None) -> Enclosure:
     reduced = compact(program)
     if len(reduced.kept) > LARGEST or not len(reduced.columns):
         return proposal
-    barrier = Barrier(reduced, given)
-    found = _end(barrier, barrier.inside, FROM_AFAR + WEIGHTS)
+    barrier = EllipsoidBarrier(reduced, given)
+    found = path_end(barrier, barrier.inside, FROM_AFAR + WEIGHTS)
     seconds = np.array(time.perf_counter() - began)
     if found is None or found.weight > USEFUL:
         return proposal._replace(seconds=seconds)
@@ -117,7 +105,7 @@ def centred(
     reduced = compact(program)
     if len(reduced.kept) > LARGEST or not all_finite((multipliers, form)):
         return None
-    barrier = Barrier(reduced)
+    barrier = EllipsoidBarrier(reduced)
     found = _centre(barrier, multipliers, form)
     return None if found is None else barrier.unscaled(found.y, len(multipliers))
 
@@ -140,7 +128,7 @@ def sensitivity(
     """
     if not all_finite((program, multipliers, form, cotangent, frame)):
         return Sensitivity.unknown(program)
-    barrier = Barrier(compact(with_successor(program, frame)))
+    barrier = EllipsoidBarrier(compact(with_successor(program, frame)))
     found = None
     if barrier.count <= LARGEST:
         found = _centre(barrier, multipliers, form.of(frame.inverse))
@@ -159,29 +147,11 @@ def sensitivity(
     return Sensitivity(*halves)
 
 
-def _centre(barrier: Barrier, multipliers: np.ndarray, form: NormalForm) -> Centre | None:
+def _centre(barrier: EllipsoidBarrier, multipliers: np.ndarray, form: NormalForm) -> Centre | None:
     """The centre at the last weight, from a point near it or not; None where it is not reached."""
     near = partial(barrier.near, multipliers, form, WEIGHTS[0])
     for start, weights in ((near, WEIGHTS), (barrier.inside, FROM_AFAR + WEIGHTS)):
-        found = _end(barrier, start, weights)
+        found = path_end(barrier, start, weights)
         if found is not None and found.weight == WEIGHTS[-1]:
-            return found
-    return None
-
-
-def _end(
-    barrier: Barrier, start: Callable[[], np.ndarray | None], weights: tuple[float, ...]
-) -> Centre | None:
-    """The last centre that is reached.
-
-    At too low a price `t` stays, and the ellipsoid is smaller than the relaxation itself allows.
-    """
-    for price in PRICES:
-        barrier.price = price * barrier.n * barrier.q
-        first = start()
-        found = None if first is None else follow(barrier, first, weights)
-        # it bounds alone the columns that no product does: of each, the moment takes mu / t
-        unit = (1 + barrier.n) * found.weight / barrier.price if found else np.inf
-        if found is None or found.y[barrier.count] <= unit:
             return found
     return None

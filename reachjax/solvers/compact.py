@@ -50,8 +50,9 @@ class CompactProgram(NamedTuple):
         return np.maximum(self.units, 1e-9 * (abs(self.centers) + self.units.max()) + TINY)
 
     def with_units(self, units: np.ndarray) -> CompactProgram:
-        """The same program with other units of the objective."""
-        return self._replace(objective=self.objective * (self.units / units)[:, None], units=units)
+        """The same program with other units of the objective; where it has one value they are 0."""
+        ratios = self.units / np.where(units > 0, units, 1.0)
+        return self._replace(objective=self.objective * ratios[:, None], units=units)
 
     @property
     def is_flat(self) -> bool:

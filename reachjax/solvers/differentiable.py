@@ -19,7 +19,8 @@ width loses them.
 
 **Kinks.** Where a facet only touches, a neuron becomes stable, or an optimal point is not unique,
 an offset has a kink: the derivative is then one of its generalised gradients, and central
-differences see another. Second derivatives and forward mode do not exist; JAX raises an error.
+differences see another. Those of `CentralPath` have none (`smoothing`). Second derivatives and
+forward mode do not exist; JAX raises an error.
 """
 
 from __future__ import annotations
@@ -30,20 +31,26 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from reachjax.lmi import Program, lagrangian
 from reachjax.solvers.accepted import accepted_offsets
 from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
+from reachjax.solvers.cotangents import asked_for
 from reachjax.solvers.host import all_finite, on_host
+from reachjax.solvers.smoothing import CentralPath, smoothed_offsets
 
 
 def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Array, " f"], Solution]:
     """Solve for every facet and prove the offsets; differentiable in the program's rows.
 
+    Optimal offsets, or those of the central path where that is asked for.
+
     Returns:
         The proved offsets `(f,)`, and what the solver proposed (which has no derivative).
     """
+    if isinstance(solver, CentralPath):
+        return smoothed_offsets(program, solver.weight)
     result: Any = _proved_offsets(solver, program.facts.mid, program.objective.mid, program)
     offsets, _, solution = result
     return offsets, solution
@@ -74,12 +81,6 @@ def _backward(solver, residual, cotangents):
     pull: Any = jax.vjp(value, program.facts.mid, program.objective.mid)[1]
     offsets, _, proposal = cotangents
     return *pull(jnp.where(asked_for(proposal), jnp.nan, offsets)), None
-
-
-def asked_for(proposal: Any) -> Bool[Array, ""]:
-    """Whether a derivative of what a solver proposes is asked for; there is none."""
-    parts = [part for part in jax.tree.leaves(proposal) if part.dtype == float]
-    return jnp.array([jnp.any(part != 0) for part in parts]).any()
 
 
 _proved_offsets.defvjp(_forward, _backward)

@@ -26,7 +26,7 @@ from reachjax.solvers.accepted import accepted_enclosure, log_volume
 from reachjax.solvers.base import ANSWERS, AbstractSolver, Enclosure, SolverStatus
 from reachjax.solvers.centring import Sensitivity, centred, sensitivity
 from reachjax.solvers.compact import compact
-from reachjax.solvers.differentiable import asked_for
+from reachjax.solvers.cotangents import asked_for
 from reachjax.solvers.host import all_finite, on_host, shapes_of
 
 ATTEMPTS = 3

@@ -17,9 +17,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-LEAF = 192
-"""Triangular matrices up to this size are inverted in one piece."""
-
 
 class Generators(NamedTuple):
     """The `G_k` of one program: all facets share them.
@@ -111,15 +108,3 @@ class Generators(NamedTuple):
 def symmetric(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The symmetric part."""
     return (matrix + jnp.swapaxes(matrix, -1, -2)) / 2
-
-
-def inverse_factor(factor: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The inverse of a lower triangular matrix, by halves: LAPACK would not see the identity."""
-    size = factor.shape[-1]
-    if size <= LEAF:
-        eye = jnp.eye(size, dtype=factor.dtype)
-        return jax.lax.linalg.triangular_solve(factor, eye, left_side=True, lower=True)
-    half = size // 2
-    first, last = inverse_factor(factor[:half, :half]), inverse_factor(factor[half:, half:])
-    below = -last @ (factor[half:, :half] @ first)
-    return jnp.block([[first, jnp.zeros((half, size - half))], [below, last]])

@@ -30,6 +30,11 @@ class Pairs(NamedTuple):
     right: np.ndarray
     sharing: sp.csr_array
 
+    @property
+    def size(self) -> int:
+        """How many matrices there are."""
+        return self.sharing.indptr.size - 1
+
     def weighted(self, y: np.ndarray) -> np.ndarray:
         """`sum_k y_k G_k` `(n, n)`."""
         weights = self.sharing.T @ y

@@ -22,7 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from reachjax.solvers.generators import Generators, inverse_factor, symmetric
+from reachjax.solvers.factorisations import inverse_cholesky, refined_solver
+from reachjax.solvers.generators import Generators, symmetric
 
 DAMPING = 1e-4
 """`kappa` of this module's docstring. Measured on degenerate programs: at 1e-3 some stall at the
@@ -30,12 +31,6 @@ start, without it some multipliers grow to 1e7 and six digits are lost."""
 
 LEAST = 0.05
 """The target is no smaller a part of `mu`: faster falls cost `X` its last digits."""
-
-REGULAR = 1e-14
-"""What is added to the unit diagonal of the scaled Schur matrix at first."""
-
-REFINEMENTS = 3
-"""Steps of iterative refinement; conjugate gradients in their place blew up flat directions."""
 
 
 class Point(NamedTuple):
@@ -113,7 +108,8 @@ def residuals(
     primal = generators.target - paired + z
     dual = -bordered(generators, row) - generators.weighted(y) - S
     products = jnp.sum(X * S) + y @ z
-    gap = abs(y[-1] - row @ X[:, -1]) / (1 + abs(y[-1]))
+    # the difference of both values alone may vanish before either is optimal
+    gap = jnp.maximum(abs(y[-1] - row @ X[:, -1]), products) / (1 + abs(y[-1]))
     missed = jnp.max(abs(primal)) / jnp.maximum(1.0, jnp.linalg.norm(X))
     merit = jnp.maximum(jnp.maximum(missed, jnp.max(abs(dual))), gap)
     return Residuals(primal, dual, products / (X.shape[0] + jnp.sum(~generators.free)), merit)
@@ -137,7 +133,7 @@ def step(
     # the offset has no part in the damping: its equation holds the corner of X at one
     damping = DAMPING * mu * (jnp.arange(len(y)) < len(y) - 1)
     schur = generators.schur(X, W, A, B) + jnp.diag(ratio + damping)
-    solve = _solver(schur)
+    solve = refined_solver(schur)
     constant = missed.primal + X_paired - damping * y - z
     constant += generators.paired(symmetric(X @ missed.dual @ W))
 
@@ -183,67 +179,6 @@ def step(
         symmetric(X + a * move.X), symmetric(S + b * move.S), y + b * move.y, z + a * move.z
     )
     return following, missed, jnp.minimum(a, b)
-
-
-def inverse_cholesky(
-    matrix: Float[Array, "n n"],
-) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
-    """The inverse of the Cholesky factor, and the matrix, shifted if rounding asks for it."""
-    unit = 1e-16 * jnp.trace(matrix) / len(matrix)
-    factor, shift = _factor(matrix, unit, 0.0)
-    return inverse_factor(factor), matrix + shift * jnp.eye(len(matrix))
-
-
-def _factor(matrix: Array, unit: Array | float, first: float) -> tuple[Array, Array]:
-    """The Cholesky factor of `matrix + shift I`, and the first `shift` for which it exists."""
-    eye = jnp.eye(len(matrix))
-
-    def attempt(shift):
-        return jax.lax.linalg.cholesky(matrix + shift * eye, symmetrize_input=False)
-
-    def failing(state):
-        factor, _, tries = state
-        return ~jnp.isfinite(factor[-1, -1]) & (tries < 12)
-
-    def again(state):
-        _, shift, tries = state
-        shift = jnp.maximum(10 * shift, unit)
-        return attempt(shift), shift, tries + 1
-
-    factor, shift, _ = jax.lax.while_loop(
-        failing, again, (attempt(first), jnp.asarray(first, dtype=float), 0)
-    )
-    return factor, shift
-
-
-def _solver(schur: Float[Array, "K K"]):
-    """Solves with the Schur matrix: scaled to a unit diagonal, regularised, refined."""
-    scale = 1 / jnp.sqrt(jnp.diagonal(schur))
-    matrix = schur * scale[:, None] * scale
-    # products with the inverse cost a tenth of triangular solves, which copy their factor each time
-    inverse = inverse_factor(_factor(matrix, 1e-12, REGULAR)[0])
-
-    def solve(vector):
-        vector = scale * vector
-        enough = 1e-15 * jnp.linalg.norm(vector)
-
-        def improving(state):
-            _, _, least, gained, count = state
-            return gained & (least > enough) & (count <= REFINEMENTS)
-
-        def refine(state):
-            solution, residual, least, _, count = state
-            candidate = solution + inverse.T @ (inverse @ residual)
-            left = vector - matrix @ candidate
-            size = jnp.linalg.norm(left)
-            better = size < least
-            kept = jnp.where(better, candidate, solution), jnp.where(better, left, residual)
-            return *kept, jnp.minimum(size, least), better, count + 1
-
-        none = jnp.zeros_like(vector), vector, jnp.array(jnp.inf), jnp.array(True), 0
-        return scale * jax.lax.while_loop(improving, refine, none)[0]
-
-    return solve
 
 
 def _to_boundary(inverse: Float[Array, "n n"], move: Float[Array, "n n"]) -> Float[Array, ""]:

@@ -68,7 +68,7 @@ def trimmed(program: Program) -> Trimmed:
     facts = xp.where(solid.any(axis=1)[:, None] & columns, program.facts.mid, 0.0)
     products = program.products
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is dropped
-        sizes = _sizes(products, facts)
+        sizes = squared_sizes(products, facts) ** 0.5
     objective = xp.where(columns, program.objective.mid, 0.0)
     centers = objective[:, -1]
     # solvers' tolerances are absolute, objectives come in the size of the set of states
@@ -85,12 +85,12 @@ def trimmed(program: Program) -> Trimmed:
     )
 
 
-def _sizes(products: Products, facts: Any) -> Float[Any, " K"]:
-    """The root of the sum of `|sym(p' q)|^2` over the pairs of each multiplier."""
+def squared_sizes(products: Products, facts: Any) -> Float[Any, " K"]:
+    """The sum of `|sym(p' q)|^2` over the pairs of each multiplier."""
     squares = (facts**2).sum(axis=1)
     inner = (facts[products.left] * facts[products.right]).sum(axis=1)
     of_pairs = (squares[products.left] * squares[products.right] + inner**2) / 2
-    return summed(of_pairs, products.multiplier, len(products.free)) ** 0.5
+    return summed(of_pairs, products.multiplier, len(products.free))
 
 
 def _solid(rows: Ball) -> Bool[Any, "k n"]:

@@ -3,13 +3,28 @@
 import json
 import re
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
 import reachjax as rj
-from experiments import benchmark
-from experiments.benchmark import REFERENCE, Case, Settings, he_network
+from experiments import benchmark, benchmark_loops, step_cost
+from experiments.benchmark_cases import Case, Settings, cases, he_network
+from experiments.benchmark_growth import (
+    GROWTH_NOTE,
+    exponent,
+    grown,
+    growth_table,
+    in_new_process,
+    jobs,
+    related,
+)
+from experiments.benchmark_methods import REFERENCE, measure, methods
+from experiments.benchmark_report import NOTE, compare, table
 from experiments.double_integrator import INITIAL_BOX
+from experiments.operations import operations
 
 QUICK = {"networks": ("random",), "widths": (3,), "repetitions": 1, "patience": 1e3}
 COLUMNS = 80
@@ -21,11 +36,8 @@ def case():
 
 
 def measured(settings):
-    return benchmark.compare(
-        [
-            benchmark.measure(case(), name, method, settings)
-            for name, method in benchmark.methods(settings).items()
-        ]
+    return compare(
+        [measure(case(), name, method, settings) for name, method in methods(settings).items()]
     )
 
 
@@ -35,21 +47,25 @@ def rows():
 
 
 def test_the_reference_comes_first_and_every_method_has_a_row(rows):
-    assert [row["method"] for row in rows] == list(benchmark.methods(Settings(**QUICK)))
+    assert [row["method"] for row in rows] == list(methods(Settings(**QUICK)))
     assert rows[0]["method"] == REFERENCE
 
 
 def test_the_same_program_has_the_same_size_and_bounds(rows):
-    reference, kept, *others = rows
-    assert (kept["n"], kept["multipliers"]) == (reference["n"], reference["multipliers"])
-    assert kept["difference"] < 1e-5
-    assert [row["difference"] for row in others] == [None, None]
+    reference, *same = rows[:3]
+    for row in same:
+        assert (row["n"], row["multipliers"]) == (reference["n"], reference["multipliers"])
+        assert row["difference"] < 1e-5
+    assert [row["difference"] for row in rows[3:]] == [None] * 4
 
 
 def test_no_bound_is_below_what_was_simulated_and_removal_never_loosens(rows):
-    reference, kept, removed, local = (row["slack"] for row in rows)
-    assert 0 < local <= removed + 1e-6 <= kept + 2e-6
-    assert kept == pytest.approx(reference, abs=1e-4)
+    reference, *others = (row["slack"] for row in rows)
+    kept, removed, local = zip(others[::2], others[1::2], strict=True)
+    for pair in (kept, removed, local):
+        assert pair[0] == pytest.approx(pair[1], abs=1e-5)
+    assert 0 < local[0] <= removed[0] + 1e-6 <= kept[0] + 2e-6
+    assert kept[0] == pytest.approx(reference, abs=1e-4)
     support = case().support(seed=0)
     assert all((row["bounds"] >= support - 1e-7).all() for row in rows)
 
@@ -64,48 +80,122 @@ def test_ratios_are_of_the_seconds_of_the_same_run(rows):
 @pytest.mark.parametrize("limit", [{"reference_facets": 1}, {"reference_facets": 8}])
 def test_a_reference_of_few_facets_is_scaled_up_and_says_so(limit):
     settings = Settings(**QUICK | limit | {"patience": 0.0})  # ends after its first facet
-    row = benchmark.measure(case(), REFERENCE, benchmark.methods(settings)[REFERENCE], settings)
+    row = measure(case(), REFERENCE, methods(settings)[REFERENCE], settings)
     assert row["facets"] == 1
     assert row["calls"] == []  # longer than the patience: not called again
     assert row["seconds"] == row["first"]
     assert np.isnan(row["slack"])
     assert np.isnan(row["bounds"][1:]).all()
-    assert "~*" in text(benchmark.compare([row]))
+    assert "~*" in text(compare([row]))
 
 
 def test_the_table_fits_in_eighty_columns(rows):
     lines = text(rows).splitlines()
     assert max(map(len, lines)) <= COLUMNS
-    assert all(len(line) <= COLUMNS for line in benchmark.NOTE.splitlines())
-    assert all(any(name in line for line in lines) for name in benchmark.methods(Settings()))
+    assert all(len(line) <= COLUMNS for line in NOTE.splitlines())
+    assert all(any(name in line for line in lines) for name in methods(Settings()))
 
 
-def text(rows):
-    from rich.console import Console
-
+def text(rows, table=table):
     console = Console(width=COLUMNS, record=True)
     with console.capture() as capture:
-        console.print(benchmark.table(rows))
+        console.print(table(rows))
     return re.sub(r"\x1b\[[0-9;]*m", "", capture.get())
+
+
+def strictly(path):
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(path.read_text(), parse_constant=refuse)
 
 
 def test_the_command_prints_its_tables_and_writes_strict_json(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(benchmark, "cases", lambda settings: [case()])
     settings = Settings(**QUICK, reference_facets=1, output=tmp_path)
+    few = dict(list(methods(settings).items())[::5])
+    monkeypatch.setattr(benchmark, "methods", lambda settings: few)
     benchmark.main(settings)
     assert "random 2x3" in capsys.readouterr().out
 
-    def refuse(constant):
-        raise AssertionError(f"{constant} is not JSON")
-
-    written = json.loads((tmp_path / "benchmark.json").read_text(), parse_constant=refuse)
+    written = strictly(tmp_path / "steps.json")
     assert written["settings"]["widths"] == [3]
-    assert [row["method"] for row in written["rows"]] == list(benchmark.methods(settings))
+    assert [row["method"] for row in written["rows"]] == list(few)
     assert written["rows"][0]["bounds"][1:] == [None] * 7
 
 
 def test_random_networks_have_the_widths_asked_for():
-    (found,) = benchmark.cases(Settings(**QUICK))
+    (found,) = cases(Settings(**QUICK))
     assert [W.shape for W, _ in found.layers] == [(3, 2), (3, 3), (1, 3)]
     assert found.initial.shape == INITIAL_BOX.shape
     assert isinstance(found.loop, rj.ClosedLoop)
+
+
+GROWTH = Settings(growth=(3, 5), reference_width=3, repetitions=1, study="growth")
+
+
+@pytest.fixture(scope="module")
+def growing():
+    return related([grown(width, name, GROWTH) for width, name in jobs(GROWTH)])
+
+
+def test_large_networks_are_left_to_the_interior_point_method():
+    names = [REFERENCE, "Clarabel", "InteriorPoint"]
+    assert jobs(GROWTH) == [*((3, name) for name in names), (5, "InteriorPoint")]
+
+
+def test_one_facet_has_the_same_bounds_by_every_solver(growing):
+    assert [row["n"] for row in growing] == [11, 11, 11, 15]
+    assert all(row["difference"] < 1e-5 for row in growing[:3])
+    assert growing[3]["difference"] is None
+
+
+def test_the_rate_of_arithmetic_is_below_the_machines(growing):
+    for row in (growing[2], growing[3]):
+        assert 0 < row["rate"] < row["best_rate"]
+    slope = np.log(growing[3]["seconds"] / growing[2]["seconds"]) / np.log(15 / 11)
+    assert exponent(growing, least=11) == pytest.approx(slope)
+    assert np.isnan(exponent(growing))
+
+
+def test_the_table_of_growth_fits_in_eighty_columns(growing):
+    lines = [*text(growing, growth_table).splitlines(), *GROWTH_NOTE.splitlines()]
+    assert max(map(len, lines)) <= COLUMNS
+    assert sum("InteriorPoint" in line for line in lines) == 2
+
+
+@pytest.mark.slow
+def test_a_new_process_gives_the_same_bounds(growing):
+    row = in_new_process(grown, 3, "Clarabel", GROWTH)
+    np.testing.assert_array_equal(row["bounds"], growing[1]["bounds"])
+    assert row["memory"] > 2**20  # the program was compiled there, and nothing before it
+
+
+@pytest.mark.slow
+def test_tubes_of_all_ways_agree_and_training_steps_are_timed(tmp_path, capsys, monkeypatch):
+    layers = he_network((2, 3, 1), seed=0)
+    monkeypatch.setattr(benchmark, "controller", lambda settings: layers)
+    monkeypatch.setattr(benchmark_loops, "SOLVERS", {"Clarabel": rj.Clarabel()})
+    monkeypatch.setattr(step_cost, "REPETITIONS", 1)
+    benchmark.main(Settings(study="loops", patience=0.0, output=tmp_path))
+    written = strictly(tmp_path / "loops.json")
+    reference, paper, local = (row["area"] for row in written["tubes"])
+    assert paper == pytest.approx(reference, rel=1e-4)
+    assert 0 < local <= paper * (1 + 1e-6)
+    (cost,) = written["training"]
+    assert 0 < cost["solver"] < cost["both"] < cost["first"]
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= COLUMNS
+
+
+def test_operations_of_products_and_factorisations_are_counted():
+    a, b = jnp.ones((3, 4)), jnp.ones((4, 5))
+    assert operations(jnp.matmul, a, b) == 2 * 3 * 4 * 5
+    assert operations(jax.vmap(jnp.matmul, (0, None)), jnp.ones((7, 3, 4)), b) == 7 * 120
+    eye = jnp.eye(6)
+    assert operations(jax.lax.linalg.cholesky, eye) == pytest.approx(72)
+    assert operations(jnp.linalg.eigvalsh, eye) == pytest.approx(288)
+
+    def thrice(matrix):
+        return jax.lax.fori_loop(0, 3, lambda _, carry: jax.jit(jnp.matmul)(carry, matrix), matrix)
+
+    assert operations(thrice, eye) == 3 * 2 * 6**3

@@ -26,7 +26,8 @@ from reachjax.solvers.accepted import log_volume
 from reachjax.solvers.arrangement import arranged, bucket, cut
 from reachjax.solvers.base import ANSWERS
 from reachjax.solvers.compact import compact
-from reachjax.solvers.generators import inverse_factor
+from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
+from reachjax.solvers.factorisations import inverse_factor
 from reachjax.solvers.trimming import trimmed
 from tests.loops import closed_loop, random_loop
 from tests.networks import (
@@ -488,7 +489,7 @@ def test_gradients_of_ellipsoids_of_weights_that_are_no_numbers_are_none(shape):
 def test_the_barrier_s_derivatives_are_its_differences(shape, monkeypatch):
     monkeypatch.setattr(barrier, "DAMPING", 0.3)
     given = None if shape is None else NormalForm(shape, np.array([0.1, -0.2]))
-    function = barrier.Barrier(compact(program(n_x=2, X=round_of, rows=np.eye(2))), given)
+    function = EllipsoidBarrier(compact(program(n_x=2, X=round_of, rows=np.eye(2))), given)
     function.price, weight, rng = 7.0, 0.1, np.random.default_rng(0)
     y = function.inside()
     for _ in range(5):  # away from the edge

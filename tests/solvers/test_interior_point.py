@@ -167,11 +167,11 @@ def test_it_agrees_with_clarabel(answer):
     np.testing.assert_allclose(
         (solution.offsets - reference.offsets)[solved] / np.maximum(size[solved], 1e-9),
         0,
-        atol=1e-5,  # Clarabel itself moves by 1.5e-5 from a tolerance of 1e-8 to one of 1e-9
+        atol=1e-5,  # Clarabel itself moves by 1.5e-5 from a tolerance of 1e-8 to one of 1e-9;
     )
-    bounds, _ = accepted_offsets(given, solution)
+    bounds, _ = accepted_offsets(given, solution)  # what the recheck proves is never looser
     others, _ = accepted_offsets(given, reference)
-    assert np.all(bounds <= others + 1e-5 * size + 1e-12)
+    assert np.all(bounds <= others + 1e-6 * size + 1e-12)
 
 
 def test_what_it_proposes_is_well_formed(answer):

@@ -22,6 +22,7 @@ from experiments.benchmark_growth import (
     related,
 )
 from experiments.benchmark_methods import REFERENCE, measure, methods
+from experiments.benchmark_parts import PARTS, parts
 from experiments.benchmark_report import NOTE, compare, table
 from experiments.double_integrator import INITIAL_BOX
 from experiments.operations import operations
@@ -199,3 +200,14 @@ def test_operations_of_products_and_factorisations_are_counted():
         return jax.lax.fori_loop(0, 3, lambda _, carry: jax.jit(jnp.matmul)(carry, matrix), matrix)
 
     assert operations(thrice, eye) == 3 * 2 * 6**3
+
+
+def test_every_part_of_a_step_can_be_timed():
+    ready = parts(4, rj.LocalBounds(), rj.Clarabel())
+    assert tuple(ready) == PARTS
+    found = {name: jax.block_until_ready(part()) for name, part in ready.items()}
+    offsets, accepted = found["recheck"]
+    value, gradient = found["offsets and gradient"]
+    assert accepted.all()
+    assert value == pytest.approx(offsets.sum(), abs=1e-6)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))

@@ -16,7 +16,7 @@ from reachjax.certificates import (
     MixedCertificate,
 )
 from reachjax.reach import ReachTube, reach, reach_step
-from reachjax.relaxation import AbstractRelaxation, LocalBounds, PaperQC
+from reachjax.relaxation import AbstractRelaxation, AllProducts, LocalBounds, PaperQC
 from reachjax.requirements import shortfall
 from reachjax.sets import (
     AbstractSet,
@@ -71,6 +71,7 @@ __all__ = [
     "AbstractSolver",
     "AbstractTemplate",
     "AffinePlant",
+    "AllProducts",
     "Auto",
     "Box",
     "CentralPath",

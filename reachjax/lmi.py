@@ -17,24 +17,15 @@ For an ellipsoid `|A x+ + b| <= 1` the last three terms are `V' V - e e'`, `V` b
 
 from __future__ import annotations
 
-from functools import partial
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from reachjax.basis import Rows, columns, loop_rows
-from reachjax.bounds import LoopBounds, loop_bounds
-from reachjax.preactivations import bounds_over, rounded
+from reachjax.basis import Rows
 from reachjax.pytrees import Replaceable, pytree
-from reachjax.relaxation import AbstractRelaxation, FactLayout, Products
+from reachjax.relaxation import Products
 from reachjax.rounding import Ball, gamma
-from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, NormalForm
-from reachjax.systems import ClosedLoop
-
-CONSTANT = 1e-9
-"""An output whose radius is a smaller part than this of its input's size has a single value."""
+from reachjax.sets import NormalForm
 
 
 @pytree
@@ -72,40 +63,6 @@ class Program(Replaceable):
         )
 
 
-def scaling(bounds: LoopBounds, prune: bool, X: Ellipsoid | None) -> Float[Array, "n n"]:
-    """`T` with `xi = T eta`, the entries of `eta` being in `[-1, 1]`, the last one 1."""
-    mid, rad = basis_box(bounds, prune)
-    T = jnp.diag(rad).at[:-1, -1].set(mid[:-1])
-    if X is None:
-        return T
-    n = X.dimension
-    return T.at[:n, :n].set(X.from_ball()).at[:n, -1].set(X.center)
-
-
-def basis_box(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Midpoint and radius of each entry of the basis `[x, z, 1]`.
-
-    A unit that has left the basis gets radius zero. One that stays although its output has a single
-    value (a dead neuron that the paper keeps) is scaled by its input, so that it does stay: a
-    radius at rounding level would tell the solver what the paper's constraints do not.
-    """
-    z = bounds.output
-    if prune:
-        gone = bounds.passing | bounds.blocking
-        mid, rad = jnp.where(gone, 0.0, z.mid), jnp.where(gone, 0.0, z.rad)
-    else:
-        y = bounds.preactivation
-        size = abs(y.mid) + y.rad
-        constant = z.rad <= CONSTANT * size
-        # a tenth of the input's size: measured, solvers lose digits at the whole and at a hundredth
-        mid, rad = z.mid, jnp.where(constant, jnp.where(size > 0, size / 10, 1.0), z.rad)
-    one = jnp.ones(1)
-    return (
-        jnp.concatenate([bounds.state.mid, mid, 0 * one]),
-        jnp.concatenate([bounds.state.rad, rad, one]),
-    )
-
-
 def weighted_products(program: Program, multipliers: Float[Array | np.ndarray, " K"]) -> Ball:
     """`F' Gamma F` `(n, n)` with a bound of its rounding error, for one facet's multipliers.
 
@@ -136,69 +93,6 @@ def form_rows(program: Program, form: NormalForm) -> Ball:
 def with_successor(program: Program, form: NormalForm) -> Program:
     """The same program with `A x+ + b` in the place of the successor `x+`."""
     return program.replace(objective=form_rows(program, form))
-
-
-def step_program(
-    loop: ClosedLoop,
-    X: AbstractSet,
-    box: Box,
-    directions: Float[Array, "f n_x"],
-    t: int,
-    relaxation: AbstractRelaxation,
-) -> Program:
-    """Theorem 1 for every facet of the successors of `X` at time `t`, over the scaled basis.
-
-    Compiled once for a loop's shape, a number of facets and a relaxation. With the identity for
-    directions, the objective rows are the successor: the program of an ellipsoid.
-
-    Args:
-        loop: the closed loop.
-        X: the set of states at time `t`.
-        box: a box around it.
-        directions: one row for each facet.
-        t: the time.
-        relaxation: which products of facts are used.
-    """
-    around = rounded(X, box)
-    set_facts = X.facts(), X.cone_facts()
-    return _step_program(loop, *set_facts, around, box, directions, t, relaxation)
-
-
-@partial(jax.jit, static_argnames="relaxation")
-def _step_program(
-    loop: ClosedLoop,
-    set_facts: Float[Array, "m n_x+1"],
-    cone_facts: Float[Array, "r n_x+1"],
-    around: Ellipsoid | Intersection | None,
-    box: Box,
-    directions: Float[Array, "f n_x"],
-    t: int,
-    relaxation: AbstractRelaxation,
-) -> Program:
-    n, k = loop.states, loop.units
-    size = n + k + 1
-    if around is None or not relaxation.remove_stable:
-        bounds = loop_bounds(loop, box, t)
-    else:
-        bounds = bounds_over(loop, around, box, t)
-    rows = loop_rows(loop, columns(0, n, size), n, t, bounds, relaxation.remove_stable)
-    one = columns(size - 1, 1, size)
-    of_the_set, cone = (
-        given[:, :-1] @ rows.state + given[:, -1] for given in (set_facts, cone_facts)
-    )
-    facts = jax.tree.map(lambda *part: jnp.concatenate(part), one, of_the_set, *rows.facts, cone)
-    # The optimal value does not depend on the scaling, but its derivative at inexact multipliers
-    # does: with the scaling's share, facts of thin sets keep their size and errors cancel.
-    ball = around.ellipsoid if isinstance(around, Intersection) else around
-    T = scaling(bounds, relaxation.remove_stable, ball)
-    # one rounding of it for all rows, whatever the compiler fuses
-    T = jax.lax.optimization_barrier(T)
-    return Program(
-        facts=facts @ T,
-        objective=(directions @ rows.successor) @ T,
-        products=relaxation.products(FactLayout(len(set_facts), k, len(cone_facts))),
-        transform=T,
-    )
 
 
 def lagrangian(

@@ -151,7 +151,8 @@ def reach(
         horizon: the number `N` of steps.
         template: what every set looks like: facet directions, ellipsoids, or both.
         relaxation: which products of facts are used.
-        window: over how many steps each program reaches back; 1 is the paper's recursion.
+        window: over how many steps each program reaches back: 1 is the paper's recursion, and the
+            horizon goes back to `X0` in one shot. Ever tighter, and larger programs.
         solver: what solves the semidefinite programs.
         start: the time of `X0`, for time-varying loops.
         samples: how many trajectories are simulated for witnesses, besides those from corners.
@@ -162,9 +163,9 @@ def reach(
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind.
-        ValueError: dimensions disagree, `X0` is empty or unbounded, the window is not supported,
-            a time-varying loop ends before the horizon, or states overflow. What depends on traced
-            values is NaN instead, inside `jax.jit`.
+        ValueError: dimensions disagree, `X0` is empty or unbounded, the window is no
+            positive number, a time-varying loop ends before the horizon, or states overflow. What
+            depends on traced values is NaN instead, inside `jax.jit`.
 
     The offsets of the sets have first derivatives in everything but facet normals (reverse mode):
     in the loop's weights, plant and input box, and in a box's ends or a polytope's offsets. In the
@@ -190,23 +191,29 @@ def reach(
     steps = range(horizon)
     for k in steps if progress is None else progress(steps):
         name = "X0" if k == 0 else f"the certified set at t = {start + k}"
-        step = Step(loop, sets[-1], start + k, relaxation, solver, name)
+        step = Step(loop, tuple(sets[-window:]), start + k, relaxation, solver, name)
         following, certificate = step.successors(template)
         sets.append(following)
         certificates.append(certificate)
     if is_concrete(loop, X0, certificates):
-        certificates = _with_witnesses(certificates, sets, loop, start, samples, seed)
+        certificates = _with_witnesses(certificates, sets, loop, start, window, samples, seed)
     return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
 
 
 def _with_witnesses(
-    certificates: list[AbstractCertificate], sets: list[AbstractSet], loop, start, samples, seed
+    certificates: list[AbstractCertificate],
+    sets: list[AbstractSet],
+    loop,
+    start,
+    window,
+    samples,
+    seed,
 ) -> list[AbstractCertificate]:
     """Simulate what the certificates bound, from the initial set."""
     states = initial_states(sets[0], samples, seed)
-    states = jnp.concatenate(
-        [states, proposed_states(sets[0], np.asarray(certificates[0].moments))]
-    )
+    from_start = [np.asarray(each.moments) for each in certificates[:window]]
+    proposed = [proposed_states(sets[0], moments) for moments in from_start]
+    states = jnp.concatenate([states, *proposed])
     found = witnesses(loop, states, sets[1:], start)
     return [
         certificate.replace(witnesses=values, witness_states=origins)
@@ -241,5 +248,4 @@ def _check(
         )
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
-    if whole_number("window", window, 1) != 1:
-        raise ValueError(f"window must be 1 (one step at a time), but {window!r} arrived")
+    whole_number("window", window, 1)

@@ -172,6 +172,28 @@ class LocalBounds(AbstractRelaxation):
         return groups, free
 
 
+@dataclasses.dataclass(frozen=True)
+class AllProducts(AbstractRelaxation):
+    """Every product of two facts: the tightest relaxation of this kind, and the largest.
+
+    The doubly nonnegative relaxation (Shor's and the reformulation-linearization technique; Burer,
+    2009). The number of products grows with the square of that of the facts.
+
+    Args:
+        remove_stable: whether neurons that bounds prove to be affine leave the basis.
+    """
+
+    remove_stable: bool = True
+
+    def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
+        """Free complementarities, then every other pair."""
+        free = [[pair] for pair in zip(facts.output, facts.slack, strict=True)]
+        rows = range(facts.cone_rows.start)
+        vanishing = {pair for (pair,) in free}
+        pairs = [[pair] for pair in itertools.combinations(rows, 2) if pair not in vanishing]
+        return free + pairs, len(free)
+
+
 def _crossed(facts: FactLayout) -> list[list[tuple[int, int]]]:
     """`z_i (z_j - y_j)` and `z_j (z_i - y_i)` under one multiplier, for every pair of neurons."""
     z, r = facts.output, facts.slack

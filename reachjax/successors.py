@@ -16,7 +16,7 @@ from reachjax.certificates import (
     MixedCertificate,
 )
 from reachjax.checks import is_concrete
-from reachjax.lmi import Program, step_program
+from reachjax.lmi import Program
 from reachjax.relaxation import AbstractRelaxation
 from reachjax.sets import (
     AbstractSet,
@@ -37,6 +37,7 @@ from reachjax.solvers import (
     proved_size,
 )
 from reachjax.systems import ClosedLoop
+from reachjax.windows import window_program
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,15 +46,15 @@ class Step:
 
     Attributes:
         loop: the closed loop.
-        X: the set of states.
-        t: the time.
+        sets: those of the window, the last being the set of states.
+        t: the time of the last one.
         relaxation: which products of facts are used.
         solver: what solves the semidefinite programs.
-        name: what errors call the set.
+        name: what errors call the last set.
     """
 
     loop: ClosedLoop
-    X: AbstractSet
+    sets: tuple[AbstractSet, ...]
     t: int
     relaxation: AbstractRelaxation
     solver: AbstractSolver
@@ -77,10 +78,10 @@ class Step:
         raise TypeError(f"there is no step for templates of kind {type(template).__name__}")
 
     @functools.cached_property
-    def _box(self) -> Box:
-        """A box around the states; what is too large for numbers may seem empty or unbounded."""
+    def _boxes(self) -> tuple[Box, ...]:
+        """A box around each set; what is too large for numbers may seem empty or unbounded."""
         try:
-            return bounding_box(self.X)
+            return tuple(map(bounding_box, self.sets))
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"{self.name} cannot be used: {error}") from None
 
@@ -93,7 +94,8 @@ class Step:
 
     def _program(self, directions: Float[Array, "f n_x"]) -> Program:
         """Theorem 1 with these directions of the successor for an objective."""
-        return step_program(self.loop, self.X, self._box, directions, self.t, self.relaxation)
+        first = self.t + 1 - len(self.sets)
+        return window_program(self.loop, self.sets, self._boxes, directions, first, self.relaxation)
 
     def _polytope(self, template: Template, program: Program) -> tuple[Polytope, Certificate]:
         """Problem (sdp::poly): the smallest offset for each facet."""
@@ -109,7 +111,8 @@ class Step:
         if template.shape is None:
             region, enclosure = proved_ellipsoid(program, self.solver)
         else:
-            middle = self.X.center if isinstance(self.X, Ellipsoid) else self._box.center
+            X = self.sets[-1]
+            middle = X.center if isinstance(X, Ellipsoid) else self._boxes[-1].center
             given = Ellipsoid(self.loop.step(middle, self.t), template.shape).normal_form
             region, enclosure = proved_size(program, given, self.solver)
         self._require_finite(region.shape)

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.lmi import step_program, weighted_products
+from reachjax.lmi import weighted_products
 from reachjax.recheck import interval_offsets, sound_offsets
 from reachjax.rounding import Ball
+from reachjax.windows import step_program
 from tests.loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, directions, he_network, simulate
 

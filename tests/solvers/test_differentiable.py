@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.lmi import lagrangian, step_program
+from reachjax.lmi import lagrangian
 from reachjax.solvers import bounding_box, proved_offsets
+from reachjax.windows import step_program
 from tests.loops import closed_loop, random_loop
 from tests.networks import box_region, simplex_region
 

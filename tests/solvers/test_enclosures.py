@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.lmi import step_program
 from reachjax.recheck import sound_level
 from reachjax.sets import NormalForm
 from reachjax.solvers import Enclosure, accepted_enclosure
+from reachjax.windows import step_program
 from tests.loops import closed_loop, random_loop
 from tests.solvers.test_differentiable import PARTS, along, central_difference, dot
 

@@ -11,7 +11,6 @@ import pytest
 from scipy.linalg import eigvalsh
 
 import reachjax as rj
-from reachjax.lmi import step_program
 from reachjax.recheck import interval_offsets
 from reachjax.relaxation import AbstractRelaxation
 from reachjax.sets import NormalForm
@@ -29,6 +28,7 @@ from reachjax.solvers.compact import compact
 from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 from reachjax.solvers.factorisations import inverse_factor
 from reachjax.solvers.trimming import trimmed
+from reachjax.windows import step_program
 from tests.loops import closed_loop, random_loop
 from tests.networks import (
     affine_network,

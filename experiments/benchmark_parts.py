@@ -19,7 +19,7 @@ import pytest
 import reachjax as rj
 from experiments.benchmark_cases import random_case
 from reachjax.bounds import loop_bounds
-from reachjax.lmi import step_program
+from reachjax.windows import step_program
 from reachjax.solvers import accepted_offsets
 from reachjax.solvers.arrangement import arranged, cut
 from reachjax.solvers.trimming import trimmed

@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from reachjax.bounds import LoopBounds
 from reachjax.checks import require_double_precision
@@ -73,12 +73,28 @@ def columns(first: int, count: int, size: int) -> Rows:
     return Rows.exact(jnp.eye(count, size, k=first))
 
 
-def loop_rows(
-    loop: ClosedLoop, state: Rows, first: int, t: int | jax.Array, bounds: LoopBounds, prune: bool
-) -> LoopRows:
-    """One step of the loop, from rows of the state, units taking the columns from `first` on.
+def picking(places: Int[Array, " k"], size: int) -> Rows:
+    """The rows that pick these entries of the basis; zero where a place is negative."""
+    return Rows.exact(jax.nn.one_hot(places, size, dtype=float))
 
-    With `prune`, units that the bounds prove to be affine leave their columns empty.
+
+def loop_rows(
+    loop: ClosedLoop,
+    state: Rows,
+    places: Int[Array, " k"],
+    t: int | jax.Array,
+    bounds: LoopBounds,
+    prune: bool,
+) -> LoopRows:
+    """One step of the loop, from rows of the state.
+
+    Args:
+        loop: the closed loop.
+        state: rows of the state at time `t`.
+        places: the column of each unit; negative for those that `prune` does away with.
+        t: the time.
+        bounds: of this step's units.
+        prune: whether units that the bounds prove to be affine leave their columns empty.
     """
     size = state.mid.shape[1]
     units: list[tuple[Rows, Rows, UnitFacts]] = []
@@ -86,7 +102,7 @@ def loop_rows(
     def unit(activation: AbstractActivation, y: Rows) -> Rows:
         done = sum(z.mid.shape[0] for _, z, _ in units)
         here = slice(done, done + y.mid.shape[0])
-        z = columns(first + done, y.mid.shape[0], size)
+        z = picking(places[here], size)
         if prune:
             passing, blocking = bounds.passing[here], bounds.blocking[here]
             z = (z.where(~passing & ~blocking) + y.where(passing)).widened(bounds.excess[here])
@@ -97,7 +113,7 @@ def loop_rows(
         return z
 
     successor = loop.step(state, t, unit)
-    none = columns(first, 0, size)
+    none = columns(0, 0, size)
     units.insert(0, (none, none, UnitFacts(none, none, none, none)))
     y, z, facts = jax.tree.map(lambda *rows: jnp.concatenate(rows), *units)
     return LoopRows(state, y, z, facts, successor)
@@ -148,7 +164,7 @@ def _change_of_basis(loop: ClosedLoop, t: int) -> ChangeOfBasis:
     anything = Ball(jnp.zeros(k), jnp.zeros(k))
     none = jnp.zeros(k)
     bounds = LoopBounds(anything, anything, anything, none, none, none, anything)
-    rows = loop_rows(loop, columns(0, n, size), n, t, bounds, prune=False)
+    rows = loop_rows(loop, columns(0, n, size), n + jnp.arange(k), t, bounds, prune=False)
     one = columns(size - 1, 1, size).mid
     # the paper keeps x^{l+1} = z + u_low and x^{l+2} = u_high - z in place of the last outputs
     S = jnp.eye(size)

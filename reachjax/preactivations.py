@@ -40,9 +40,10 @@ def bounds_over(loop: ClosedLoop, X: AbstractSet, box: Box, t: int | jax.Array) 
     if loop.units == 0:
         return loop_bounds(loop, box, t)
     n, size = loop.states, loop.states + loop.units + 1
+    places = n + jnp.arange(loop.units)
 
     def once(_, bounds: LoopBounds) -> LoopBounds:
-        rows = loop_rows(loop, columns(0, n, size), n, t, bounds, prune=True)
+        rows = loop_rows(loop, columns(0, n, size), places, t, bounds, prune=True)
         return loop_bounds(loop, box, t, _ranges(rows.preactivation, X, bounds))
 
     layers = len(loop.controller.layers) - 1 + 2 * (loop.input_box is not None)

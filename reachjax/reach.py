@@ -7,6 +7,7 @@ recheck. A tube repeats it, each set being the next one's set of states (equatio
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +27,7 @@ from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.successors import Step
 from reachjax.systems import ClosedLoop
+from reachjax.windows import Window
 from reachjax.witnesses import initial_states, proposed_states, witnesses
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
@@ -188,16 +190,32 @@ def reach(
     _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
     sets: list[AbstractSet] = [X0]
     certificates: list[AbstractCertificate] = []
-    steps = range(horizon)
-    for k in steps if progress is None else progress(steps):
+    steps: list[Step] = []
+    numbers = range(horizon)
+    compact = is_concrete(loop, X0) and window != 1
+    for k in numbers if progress is None else progress(numbers):
         name = "X0" if k == 0 else f"the certified set at t = {start + k}"
-        step = Step(loop, tuple(sets[-window:]), start + k, relaxation, solver, name)
-        following, certificate = step.successors(template)
+        earlier = _earlier(steps, window)
+        steps.append(Step(loop, sets[-1], start + k, earlier, compact, relaxation, solver, name))
+        following, certificate = steps[-1].successors(template)
         sets.append(following)
         certificates.append(certificate)
     if is_concrete(loop, X0, certificates):
         certificates = _with_witnesses(certificates, sets, loop, start, window, samples, seed)
     return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
+
+
+def _earlier(steps: list[Step], width: int) -> Window | None:
+    """The window up to the next step, of `width` steps with that one where there are so many."""
+    if not steps or width == 1:
+        return None
+    if len(steps[-1].window) < width:
+        return steps[-1].window
+    first, *others = steps[1 - width :]
+    window = replace(first, earlier=None).window
+    for step in others:
+        window = window.extended(step.loop, step.X, step.box)
+    return window
 
 
 def _with_witnesses(

@@ -1,7 +1,7 @@
 """Which products of facts enter the semidefinite program: that choice is the relaxation.
 
-Facts are stacked as `[1; facets of the set; z; z - y; caps of z; caps of z - y]`. The product of
-two of them is never negative on a trajectory, the product `z (z - y)` is zero there. Weighted by
+Facts are stacked as `[1; facets of the set; z; z - y; caps of z; caps of z - y]`, all but the first
+once for each step of a window. The product of two of them is never negative on a trajectory, the product `z (z - y)` is zero there. Weighted by
 multipliers they form `F' Gamma F` (propositions 1-2 and lemma 1 of the paper, and what others add
 to them). A diagonal entry of `Gamma` would only add a positive semidefinite term, which never
 helps, so there is none; but an ellipsoid's rows come squared, `s^2 - |R x|^2 >= 0`, in every
@@ -25,49 +25,73 @@ from reachjax.pytrees import pytree
 class FactLayout:
     """Where each kind of fact stands among the rows.
 
+    First the constant 1, then for each step of the window the facets of its set and the facts of
+    its units, last the cone.
+
     Attributes:
-        facets: of the set of states.
+        facets: of the set of states at each step of the window.
         units: of the loop.
-        cone: rows of the set's cone fact, the level first; 0 when it has none.
+        cone: rows of the first set's cone fact, the level first; 0 when it has none.
     """
 
-    facets: int
+    facets: tuple[int, ...]
     units: int
     cone: int = 0
 
     @property
-    def set_facets(self) -> range:
-        """Facets of the set of states."""
-        return range(1, 1 + self.facets)
+    def steps(self) -> int:
+        """How many steps the window has."""
+        return len(self.facets)
 
-    def _kind(self, number: int) -> range:
-        first = 1 + self.facets + number * self.units
-        return range(first, first + self.units)
+    def _first(self, step: int) -> int:
+        """The first row of a step."""
+        return 1 + sum(self.facets[:step]) + 4 * self.units * step
+
+    def _kind(self, number: int) -> tuple[int, ...]:
+        """One kind of fact of every unit, step after step."""
+        firsts = [
+            self._first(step) + self.facets[step] + number * self.units
+            for step in range(self.steps)
+        ]
+        return tuple(itertools.chain(*(range(first, first + self.units) for first in firsts)))
 
     @property
-    def output(self) -> range:
+    def set_facets(self) -> tuple[range, ...]:
+        """Facets of each set of states."""
+        firsts = [self._first(step) for step in range(self.steps)]
+        return tuple(
+            range(first, first + count) for first, count in zip(firsts, self.facets, strict=True)
+        )
+
+    @property
+    def output(self) -> tuple[int, ...]:
         """`z >= 0`."""
         return self._kind(0)
 
     @property
-    def slack(self) -> range:
+    def slack(self) -> tuple[int, ...]:
         """`z - y >= 0`."""
         return self._kind(1)
 
     @property
-    def output_cap(self) -> range:
+    def output_cap(self) -> tuple[int, ...]:
         """`max(u, 0) - z >= 0`."""
         return self._kind(2)
 
     @property
-    def slack_cap(self) -> range:
+    def slack_cap(self) -> tuple[int, ...]:
         """`max(-l, 0) - (z - y) >= 0`."""
         return self._kind(3)
 
     @property
+    def linear(self) -> range:
+        """Every fact but the cone."""
+        return range(self._first(self.steps))
+
+    @property
     def cone_rows(self) -> range:
         """The level `s`, then the rows `R` with `|R x| <= s`."""
-        first = self._kind(4).start
+        first = self._first(self.steps)
         return range(first, first + self.cone)
 
 
@@ -137,7 +161,8 @@ class PaperQC(AbstractRelaxation):
     def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
         """Free complementarities, then `Gamma`, `eta`, `nu`, `lambda_ij`."""
         free = [[pair] for pair in zip(facts.output, facts.slack, strict=True)]
-        signed = [[pair] for pair in itertools.combinations(facts.set_facets, 2)]
+        within = (itertools.combinations(facets, 2) for facets in facts.set_facets)
+        signed = [[pair] for pair in itertools.chain(*within)]
         signed += [[(0, i)] for i in (*facts.output, *facts.slack)]
         if self.repeated:
             signed += _crossed(facts)
@@ -188,13 +213,12 @@ class AllProducts(AbstractRelaxation):
     def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
         """Free complementarities, then every other pair."""
         free = [[pair] for pair in zip(facts.output, facts.slack, strict=True)]
-        rows = range(facts.cone_rows.start)
         vanishing = {pair for (pair,) in free}
-        pairs = [[pair] for pair in itertools.combinations(rows, 2) if pair not in vanishing]
+        pairs = [[pair] for pair in itertools.combinations(facts.linear, 2) if pair not in vanishing]
         return free + pairs, len(free)
 
 
 def _crossed(facts: FactLayout) -> list[list[tuple[int, int]]]:
     """`z_i (z_j - y_j)` and `z_j (z_i - y_i)` under one multiplier, for every pair of neurons."""
     z, r = facts.output, facts.slack
-    return [[(z[i], r[j]), (z[j], r[i])] for i, j in itertools.combinations(range(facts.units), 2)]
+    return [[(z[i], r[j]), (z[j], r[i])] for i, j in itertools.combinations(range(len(z)), 2)]

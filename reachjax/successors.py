@@ -37,7 +37,7 @@ from reachjax.solvers import (
     proved_size,
 )
 from reachjax.systems import ClosedLoop
-from reachjax.windows import window_program
+from reachjax.windows import Window
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,16 +46,20 @@ class Step:
 
     Attributes:
         loop: the closed loop.
-        sets: those of the window, the last being the set of states.
-        t: the time of the last one.
+        X: the set of states.
+        t: the time.
+        earlier: the window that ends with this set, if one reaches further back.
+        compact: whether units that are affine take no columns of the basis.
         relaxation: which products of facts are used.
         solver: what solves the semidefinite programs.
-        name: what errors call the last set.
+        name: what errors call the set.
     """
 
     loop: ClosedLoop
-    sets: tuple[AbstractSet, ...]
+    X: AbstractSet
     t: int
+    earlier: Window | None
+    compact: bool
     relaxation: AbstractRelaxation
     solver: AbstractSolver
     name: str
@@ -78,12 +82,25 @@ class Step:
         raise TypeError(f"there is no step for templates of kind {type(template).__name__}")
 
     @functools.cached_property
-    def _boxes(self) -> tuple[Box, ...]:
-        """A box around each set; what is too large for numbers may seem empty or unbounded."""
+    def box(self) -> Box:
+        """A box around the set; one that is too large for numbers may seem empty or unbounded.
+
+        Raises:
+            ValueError: the set is empty or unbounded.
+        """
         try:
-            return tuple(map(bounding_box, self.sets))
+            return bounding_box(self.X)
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"{self.name} cannot be used: {error}") from None
+
+    @functools.cached_property
+    def window(self) -> Window:
+        """The window that this step ends."""
+        before = self.earlier
+        if before is None:
+            prune = self.relaxation.remove_stable
+            before = Window.beginning(self.loop, self.X, self.box, self.t, prune, self.compact)
+        return before.extended(self.loop, self.X, self.box)
 
     def _require_finite(self, numbers) -> None:
         if is_concrete(numbers) and not np.isfinite(numbers).all():
@@ -94,8 +111,7 @@ class Step:
 
     def _program(self, directions: Float[Array, "f n_x"]) -> Program:
         """Theorem 1 with these directions of the successor for an objective."""
-        first = self.t + 1 - len(self.sets)
-        return window_program(self.loop, self.sets, self._boxes, directions, first, self.relaxation)
+        return self.window.program(directions, self.relaxation)
 
     def _polytope(self, template: Template, program: Program) -> tuple[Polytope, Certificate]:
         """Problem (sdp::poly): the smallest offset for each facet."""
@@ -111,8 +127,8 @@ class Step:
         if template.shape is None:
             region, enclosure = proved_ellipsoid(program, self.solver)
         else:
-            X = self.sets[-1]
-            middle = X.center if isinstance(X, Ellipsoid) else self._boxes[-1].center
+            X = self.X
+            middle = X.center if isinstance(X, Ellipsoid) else self.box.center
             given = Ellipsoid(self.loop.step(middle, self.t), template.shape).normal_form
             region, enclosure = proved_size(program, given, self.solver)
         self._require_finite(region.shape)

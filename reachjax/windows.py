@@ -1,8 +1,12 @@
-"""The program of a window: the loop unrolled over its last steps, from a known set of states.
+"""Windows: the loop unrolled over its last steps, from a set of states, over one basis.
 
 The basis is `[x[t], z[t], ..., z[t + w - 1], 1]`: a state and the outputs of the units of `w`
 steps. States after `x[t]` are rows over it, and the sets that are known to hold them add facts. A
 window of one step is the paper's recursion; one that begins at the initial set forgets nothing.
+
+A window grows by one step at a time, by one compiled function. Units that bounds prove to be affine
+leave the basis; outside of `jax.jit` their columns can be left out as well (`compact`), so that a
+window of many steps has as many columns as it has units that switch.
 """
 
 from __future__ import annotations
@@ -11,18 +15,139 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
-from reachjax.basis import Rows, columns, loop_rows
+from reachjax.basis import Rows, columns, loop_rows, picking
 from reachjax.bounds import LoopBounds, loop_bounds
 from reachjax.lmi import Program
 from reachjax.preactivations import bounds_over, rounded
+from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, FactLayout
+from reachjax.rounding import Ball
 from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection
 from reachjax.systems import ClosedLoop
 
 CONSTANT = 1e-9
 """An output whose radius is a smaller part than this of its input's size has a single value."""
+
+COLUMNS = 16
+"""The columns of a compact basis come in multiples of this many."""
+
+
+@pytree
+class Window(Replaceable):
+    """Some steps of the loop from a set of states, as rows over the scaled basis.
+
+    Attributes:
+        facts: those of each step: of its set, then of its units.
+        cone: `(r, n)`, rows of the first set's cone fact.
+        state: `(n_x, n)`, the state after these steps, over the basis itself.
+        transform: `(n, n)`, `T` with `xi = T eta`, the entries of `eta` being in `[-1, 1]`.
+        facets: how many facets the set of each step has.
+        units: of the loop.
+        start: the time of the first set.
+        taken: how many columns are.
+        prune: whether units that bounds prove to be affine leave the basis.
+        compact: whether they take no columns either.
+    """
+
+    facts: tuple[Rows, ...]
+    cone: Rows
+    state: Rows
+    transform: Float[Array, "n n"]
+    facets: tuple[int, ...] = static()
+    units: int = static()
+    start: int = static()
+    taken: int = static()
+    prune: bool = static()
+    compact: bool = static()
+
+    @classmethod
+    def beginning(
+        cls, loop: ClosedLoop, X: AbstractSet, box: Box, t: int, prune: bool, compact: bool = False
+    ) -> Window:
+        """No step yet.
+
+        Args:
+            loop: the closed loop.
+            X: the set of states at time `t`.
+            box: a box around it.
+            t: the time.
+            prune: whether units that bounds prove to be affine leave the basis.
+            compact: whether their columns are left out as well, which needs concrete numbers.
+        """
+        ball = _ball(rounded(X, box))
+        state, cone, T = _first(X.cone_facts(), box, ball)
+        empty, shape = (), (loop.units, int(t), loop.states)
+        return cls(empty, cone, state, T, empty, *shape, prune, compact and prune)
+
+    def __len__(self) -> int:
+        return len(self.facts)
+
+    def extended(self, loop: ClosedLoop, X: AbstractSet, box: Box) -> Window:
+        """One step more.
+
+        Args:
+            loop: the closed loop.
+            X: a set that surely holds the state after the steps so far; the first set at first.
+            box: a box around it.
+        """
+        t = self.start + len(self)
+        bounds = _bounds(loop, rounded(X, box) if self.prune else None, box, t)
+        places, taken = self._places(bounds)
+        grown = self._padded(taken + 1)
+        block, state, T = _extended(
+            loop, X.facts(), grown.state, grown.transform, bounds, t, places, self.prune
+        )
+        return grown.replace(
+            facts=(*grown.facts, block),
+            state=state,
+            transform=T,
+            facets=(*self.facets, len(block.mid) - 4 * self.units),
+            taken=taken,
+        )
+
+    def program(self, directions: Float[Array, "f n_x"], relaxation: AbstractRelaxation) -> Program:
+        """Theorem 1 for every facet of the states after these steps.
+
+        With the identity for directions, the objective rows are the state: the program of an
+        ellipsoid.
+
+        Args:
+            directions: one row for each facet.
+            relaxation: which products of facts are used.
+        """
+        size = len(self.transform)
+        parts = columns(size - 1, 1, size), *self.facts, self.cone
+        return Program(
+            facts=jax.tree.map(lambda *part: jnp.concatenate(part), *parts),
+            objective=_objective(directions, self.state, self.transform),
+            products=relaxation.products(FactLayout(self.facets, self.units, len(self.cone.mid))),
+            transform=self.transform,
+        )
+
+    def _places(self, bounds: LoopBounds) -> tuple[Int[Array, " k"], int]:
+        """The column of each unit of one more step, and how many are taken then."""
+        if not self.compact:
+            return self.taken + jnp.arange(self.units), self.taken + self.units
+        passing, blocking = jax.lax.stop_gradient((bounds.passing, bounds.blocking))
+        stays = ~np.asarray(passing | blocking)
+        places = np.where(stays, self.taken + np.cumsum(stays) - 1, -1)
+        return jnp.asarray(places), self.taken + int(stays.sum())
+
+    def _padded(self, needed: int) -> Window:
+        """The same with at least so many columns; new ones are empty."""
+        more = (-(-needed // COLUMNS) * COLUMNS if self.compact else needed) - len(self.transform)
+        if more <= 0:
+            return self
+
+        def wider(rows: Rows) -> Rows:
+            return jax.tree.map(lambda part: _spread(part, more), rows)
+
+        T = _spread(_spread(self.transform, more).T, more).T
+        facts = tuple(map(wider, self.facts))
+        return self.replace(facts=facts, cone=wider(self.cone), state=wider(self.state), transform=T)
 
 
 def step_program(
@@ -34,121 +159,89 @@ def step_program(
     relaxation: AbstractRelaxation,
 ) -> Program:
     """Theorem 1 for every facet of the successors of `X` at time `t`: a window of one step."""
-    return window_program(loop, (X,), (box,), directions, t, relaxation)
+    window = Window.beginning(loop, X, box, t, relaxation.remove_stable)
+    return window.extended(loop, X, box).program(directions, relaxation)
 
 
-def window_program(
-    loop: ClosedLoop,
-    sets: tuple[AbstractSet, ...],
-    boxes: tuple[Box, ...],
-    directions: Float[Array, "f n_x"],
-    t: int,
-    relaxation: AbstractRelaxation,
-) -> Program:
-    """Theorem 1 for every facet of the states at time `t + w`, over the scaled basis.
-
-    Compiled once for a loop's shape, numbers of steps and facets, and a relaxation. With the
-    identity for directions, the objective rows are the state: the program of an ellipsoid.
-
-    Args:
-        loop: the closed loop.
-        sets: `w` sets that hold the states at times `t, ..., t + w - 1`. Of a round one after the
-            first, only the facets add facts.
-        boxes: a box around each.
-        directions: one row for each facet.
-        t: the time of the first set.
-        relaxation: which products of facts are used.
-    """
-    around = rounded(sets[0], boxes[0])
-    facts = tuple(X.facts() for X in sets)
-    return _window_program(
-        loop, facts, sets[0].cone_facts(), around, boxes, directions, t, relaxation
-    )
+def _ball(around: Ellipsoid | Intersection | None) -> Ellipsoid | None:
+    return around.ellipsoid if isinstance(around, Intersection) else around
 
 
-@partial(jax.jit, static_argnames="relaxation")
-def _window_program(
-    loop: ClosedLoop,
-    set_facts: tuple[Float[Array, "m n_x+1"], ...],
-    cone_facts: Float[Array, "r n_x+1"],
-    around: Ellipsoid | Intersection | None,
-    boxes: tuple[Box, ...],
-    directions: Float[Array, "f n_x"],
-    t: int,
-    relaxation: AbstractRelaxation,
-) -> Program:
-    n, k, prune = loop.states, loop.units, relaxation.remove_stable
-    size = n + k * len(boxes) + 1
-    first = state = columns(0, n, size)
-    bounds, units, known = [], [], []
-    for i, (box, given) in enumerate(zip(boxes, set_facts, strict=True)):
-        of_step = loop_bounds(loop, box, t + i)
-        if i == 0 and around is not None and prune:
-            of_step = bounds_over(loop, around, box, t)
-        rows = loop_rows(loop, state, n + i * k, t + i, of_step, prune)
-        known.append(_holding(given, state))
-        bounds.append(of_step)
-        units.append(rows.facts)
-        state = rows.successor
-    kinds = jax.tree.map(_stacked, *units)
-    one, cone = columns(size - 1, 1, size), _holding(cone_facts, first)
-    facts = jax.tree.map(_stacked, one, *known, *kinds, cone)
+@jax.jit
+def _first(
+    cone_facts: Float[Array, "r n_x+1"], box: Box, ball: Ellipsoid | None
+) -> tuple[Rows, Rows, Float[Array, "n_x+1 n_x+1"]]:
+    """Rows of the state, scaled rows of its cone fact, and the scaling."""
+    n = box.dimension
+    state, around = columns(0, n, n + 1), Ball.between(box.lower, box.upper)
     # The optimal value does not depend on the scaling, but its derivative at inexact multipliers
     # does: with the scaling's share, facts of thin sets keep their size and errors cancel.
-    ball = around.ellipsoid if isinstance(around, Intersection) else around
-    T = scaling(bounds, prune, ball)
+    T = jnp.diag(jnp.append(around.rad, 1.0)).at[:-1, -1].set(around.mid)
+    if ball is not None:
+        T = T.at[:n, :n].set(ball.from_ball()).at[:n, -1].set(ball.center)
+    T = jax.lax.optimization_barrier(T)
+    return state, _holding(cone_facts, state) @ T, T
+
+
+@jax.jit
+def _bounds(
+    loop: ClosedLoop, around: Ellipsoid | Intersection | None, box: Box, t: int
+) -> LoopBounds:
+    """Bounds of one step, from a box of states and the round set in it, if there is one."""
+    return loop_bounds(loop, box, t) if around is None else bounds_over(loop, around, box, t)
+
+
+@partial(jax.jit, static_argnames="prune")
+def _extended(
+    loop: ClosedLoop,
+    set_facts: Float[Array, "m n_x+1"],
+    state: Rows,
+    T: Float[Array, "n n"],
+    bounds: LoopBounds,
+    t: int,
+    places: Int[Array, " k"],
+    prune: bool,
+) -> tuple[Rows, Rows, Float[Array, "n n"]]:
+    """Scaled facts of one step, the state after it, and the scaling with its units."""
+    rows, size = loop_rows(loop, state, places, t, bounds, prune), len(T)
+    here = picking(places, size).mid
+    mid, rad = _scales(bounds, prune)
+    T = T.at[:, -1].add(mid @ here) + jnp.diag(rad @ here)
     # one rounding of it for all rows, whatever the compiler fuses
     T = jax.lax.optimization_barrier(T)
-    layout = FactLayout(sum(len(given) for given in set_facts), k * len(boxes), len(cone_facts))
-    return Program(
-        facts=facts @ T,
-        objective=(directions @ state) @ T,
-        products=relaxation.products(layout),
-        transform=T,
+    facts = jax.tree.map(
+        lambda *part: jnp.concatenate(part), _holding(set_facts, state), *rows.facts
     )
+    return facts @ T, rows.successor, T
 
 
-def _holding(facts: Float[Array, "m n_x+1"], state: Rows) -> Rows:
+@jax.jit
+def _objective(directions: Float[Array, "f n_x"], state: Rows, T: Float[Array, "n n"]) -> Ball:
+    return (directions @ state) @ T
+
+
+def _holding(facts: Float[Array, "m n_x+1"], state: Rows) -> Ball:
     """Facts of states as rows over the basis."""
     return facts[:, :-1] @ state + facts[:, -1]
 
 
-def _stacked(*parts: Array) -> Array:
-    return jnp.concatenate(parts)
-
-
-def scaling(bounds: list[LoopBounds], prune: bool, X: Ellipsoid | None) -> Float[Array, "n n"]:
-    """`T` with `xi = T eta`, the entries of `eta` being in `[-1, 1]`, the last one 1."""
-    mid, rad = basis_box(bounds, prune)
-    T = jnp.diag(rad).at[:-1, -1].set(mid[:-1])
-    if X is None:
-        return T
-    n = X.dimension
-    return T.at[:n, :n].set(X.from_ball()).at[:n, -1].set(X.center)
-
-
-def basis_box(
-    bounds: list[LoopBounds], prune: bool
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Midpoint and radius of each entry of the basis `[x, z, ..., 1]`.
+def _scales(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """Midpoint and radius of the output of each unit.
 
     A unit that has left the basis gets radius zero. One that stays although its output has a single
     value (a dead neuron that the paper keeps) is scaled by its input, so that it does stay: a
     radius at rounding level would tell the solver what the paper's constraints do not.
     """
-    parts = [(bounds[0].state.mid, bounds[0].state.rad)]
-    for of_step in bounds:
-        y, z = of_step.preactivation, of_step.output
-        if prune:
-            gone = of_step.passing | of_step.blocking
-            parts.append((jnp.where(gone, 0.0, z.mid), jnp.where(gone, 0.0, z.rad)))
-        else:
-            size = abs(y.mid) + y.rad
-            constant = z.rad <= CONSTANT * size
-            # a tenth of the input's size: measured, solvers lose digits at the whole and at a
-            # hundredth
-            kept = jnp.where(constant, jnp.where(size > 0, size / 10, 1.0), z.rad)
-            parts.append((z.mid, kept))
-    parts.append((jnp.zeros(1), jnp.ones(1)))
-    mid, rad = (_stacked(*part) for part in zip(*parts, strict=True))
-    return mid, rad
+    y, z = bounds.preactivation, bounds.output
+    if prune:
+        gone = bounds.passing | bounds.blocking
+        return jnp.where(gone, 0.0, z.mid), jnp.where(gone, 0.0, z.rad)
+    size = abs(y.mid) + y.rad
+    constant = z.rad <= CONSTANT * size
+    # a tenth of the input's size: measured, solvers lose digits at the whole and at a hundredth
+    return z.mid, jnp.where(constant, jnp.where(size > 0, size / 10, 1.0), z.rad)
+
+
+def _spread(part: Float[Array, "m n"], more: int) -> Float[Array, "m n+more"]:
+    """With empty columns before the last."""
+    return jnp.concatenate([part[:, :-1], jnp.zeros((len(part), more)), part[:, -1:]], axis=1)

@@ -63,8 +63,8 @@ def layers_of(data, x):
 def bounds_and_rows(loop, box, t):
     """Bounds, and rows without and with pruning."""
     bounds, n = loop_bounds(loop, box, t), loop.states
-    state = columns(0, n, n + loop.units + 1)
-    return bounds, [loop_rows(loop, state, n, t, bounds, prune) for prune in (False, True)]
+    state, places = columns(0, n, n + loop.units + 1), n + jnp.arange(loop.units)
+    return bounds, [loop_rows(loop, state, places, t, bounds, prune) for prune in (False, True)]
 
 
 @pytest.fixture(
@@ -223,7 +223,8 @@ def test_a_traced_time_compiles_once():
         traces.append(t)
         bounds = loop_bounds(loop, box, t)
         state = columns(0, 2, 3 + loop.units)
-        return loop_rows(loop, state, 2, t, bounds, prune=True).successor.mid
+        places = 2 + jnp.arange(loop.units)
+        return loop_rows(loop, state, places, t, bounds, prune=True).successor.mid
 
     box = rj.Box(*state_box(2))
     traced = [successor(loop, box, t) for t in range(STEPS)]

@@ -16,7 +16,7 @@ from reachjax.certificates import (
     MixedCertificate,
 )
 from reachjax.reach import ReachTube, reach, reach_step
-from reachjax.relaxation import AbstractRelaxation, AllProducts, LocalBounds, PaperQC
+from reachjax.relaxation import AbstractRelaxation, AllProducts, CuttingPlanes, LocalBounds, PaperQC
 from reachjax.requirements import shortfall
 from reachjax.sets import (
     AbstractSet,
@@ -80,6 +80,7 @@ __all__ = [
     "Clarabel",
     "ClosedLoop",
     "Counterexample",
+    "CuttingPlanes",
     "CvxpySolver",
     "Ellipsoid",
     "EllipsoidCertificate",

@@ -7,7 +7,7 @@ recheck. A tube repeats it, each set being the next one's set of states (equatio
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,13 +27,15 @@ from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.successors import Step
 from reachjax.systems import ClosedLoop
-from reachjax.windows import Window
-from reachjax.witnesses import initial_states, proposed_states, witnesses
+from reachjax.witnesses import Simulations, initial_states, proposed_states, witnesses
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 """Wraps the iteration over time steps, such as `tqdm.tqdm` or `rich.progress.track`."""
 
 SAMPLES = 1000
+
+LARGEST = 64
+"""The most columns of a window whose length is chosen."""
 
 EXAMPLES = {
     ClosedLoop: "a ClosedLoop",
@@ -137,7 +139,7 @@ def reach(
     horizon: int,
     template: AbstractTemplate,
     relaxation: AbstractRelaxation = LocalBounds(),  # noqa: B008  (immutable)
-    window: int = 1,
+    window: int | None = 1,
     solver: AbstractSolver = Auto(),  # noqa: B008
     *,
     start: int = 0,
@@ -193,11 +195,31 @@ def reach(
     steps: list[Step] = []
     numbers = range(horizon)
     compact = is_concrete(loop, X0) and window != 1
+    simulations = (
+        Simulations(loop, X0, horizon, start, samples, seed) if is_concrete(loop, X0) else None
+    )
     for k in numbers if progress is None else progress(numbers):
         name = "X0" if k == 0 else f"the certified set at t = {start + k}"
-        earlier = _earlier(steps, window)
-        steps.append(Step(loop, sets[-1], start + k, earlier, compact, relaxation, solver, name))
-        following, certificate = steps[-1].successors(template)
+        attained = None
+        if simulations is not None:
+            attained = partial(_attained, simulations, k + 1)
+        before = tuple(steps) if window is None else tuple(steps[max(0, k + 1 - window) :])
+        limit = LARGEST if window is None else None
+        steps.append(
+            Step(
+                loop,
+                sets[-1],
+                start + k,
+                before,
+                limit,
+                compact,
+                relaxation,
+                solver,
+                name,
+                attained,
+            )
+        )
+        following, certificate = steps[-1].successors(template.at(k + 1))
         sets.append(following)
         certificates.append(certificate)
     if is_concrete(loop, X0, certificates):
@@ -205,17 +227,11 @@ def reach(
     return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
 
 
-def _earlier(steps: list[Step], width: int) -> Window | None:
-    """The window up to the next step, of `width` steps with that one where there are so many."""
-    if not steps or width == 1:
-        return None
-    if len(steps[-1].window) < width:
-        return steps[-1].window
-    first, *others = steps[1 - width :]
-    window = replace(first, earlier=None).window
-    for step in others:
-        window = window.extended(step.loop, step.X, step.box)
-    return window
+def _attained(simulations, k, direction, state):
+    value, best = simulations.attained(k, direction)
+    return max(
+        value, simulations.climbed(k, direction, best), simulations.climbed(k, direction, state)
+    )
 
 
 def _with_witnesses(
@@ -260,10 +276,18 @@ def _check(
         (loop.states, template.dimension or loop.states),
     )
     loop.check_horizon(horizon, start)
+    if template.steps is not None and template.steps < horizon:
+        raise ValueError(f"template is given for {template.steps} steps, but horizon is {horizon}")
     if progress is not None and not callable(progress):
         raise TypeError(
             f"progress must wrap an iterable, as tqdm.tqdm does, but {progress!r} arrived"
         )
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
-    whole_number("window", window, 1)
+    if window is not None:
+        whole_number("window", window, 1)
+    elif not is_concrete(loop, X0):
+        raise ValueError(
+            "window=None is chosen from numbers: inside jax.jit, vmap or scan give a number, such "
+            "as window=1"
+        )

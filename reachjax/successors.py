@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -17,7 +19,8 @@ from reachjax.certificates import (
 )
 from reachjax.checks import is_concrete
 from reachjax.lmi import Program
-from reachjax.relaxation import AbstractRelaxation
+from reachjax.relaxation import AbstractRelaxation, CuttingPlanes
+from reachjax.rounding import Ball
 from reachjax.sets import (
     AbstractSet,
     AbstractTemplate,
@@ -32,9 +35,13 @@ from reachjax.sets import (
 from reachjax.solvers import (
     AbstractSolver,
     bounding_box,
+    enveloped,
     proved_ellipsoid,
     proved_offsets,
     proved_size,
+    solved_in_rounds,
+    support,
+    with_cuts,
 )
 from reachjax.systems import ClosedLoop
 from reachjax.windows import Window
@@ -48,8 +55,12 @@ class Step:
         loop: the closed loop.
         X: the set of states.
         t: the time.
-        earlier: the window that ends with this set, if one reaches further back.
+        before: the steps that its window reaches back over, if it may have as many.
+        limit: how many columns a window of more than one step may have; None if any number.
         compact: whether units that are affine take no columns of the basis.
+        attained: what simulations from the window's first set attain, of a direction after this
+            step, one of them beginning at a given state; None if that is not known.
+        offered: products of facts that were of use before.
         relaxation: which products of facts are used.
         solver: what solves the semidefinite programs.
         name: what errors call the set.
@@ -58,11 +69,14 @@ class Step:
     loop: ClosedLoop
     X: AbstractSet
     t: int
-    earlier: Window | None
+    before: tuple[Step, ...]
+    limit: int | None
     compact: bool
     relaxation: AbstractRelaxation
     solver: AbstractSolver
     name: str
+    attained: Callable[[Array, Array], float] | None = None
+    offered: np.ndarray | None = None
 
     def successors(self, template: AbstractTemplate) -> tuple[AbstractSet, AbstractCertificate]:
         """The smallest set of a template that surely holds the successors, and its proof.
@@ -95,12 +109,38 @@ class Step:
 
     @functools.cached_property
     def window(self) -> Window:
-        """The window that this step ends."""
-        before = self.earlier
-        if before is None:
-            prune = self.relaxation.remove_stable
-            before = Window.beginning(self.loop, self.X, self.box, self.t, prune, self.compact)
-        return before.extended(self.loop, self.X, self.box)
+        """The window that this step ends: the longest one that stays in the limit."""
+        first = 0
+        while True:
+            window = self._reaching_back(self.before[first:])
+            if self.limit is None or window.taken <= self.limit or len(window) == 1:
+                return window
+            first += 1
+
+    def _reaching_back(self, before: tuple[Step, ...]) -> Window:
+        """The window over these steps and this one."""
+        if before and len(before[-1].window) == len(before):
+            return self._added_to(before[-1].window)
+        first, *others = (*before, self)
+        window = Window.beginning(
+            self.loop, first.X, first.box, first.t, self.relaxation, self.compact
+        )
+        for step in (first, *others):
+            window = step._added_to(window)
+        return window
+
+    def _added_to(self, window: Window) -> Window:
+        return window.extended(self.loop, self.X, self.box, self.first_inputs)
+
+    @functools.cached_property
+    def first_inputs(self) -> Ball | None:
+        """The ranges of the first layer's inputs over the set; None where its box says as much."""
+        layers = self.loop.controller.layers
+        if not (self.relaxation.linear_bounds and isinstance(self.X, Polytope)) or len(layers) < 2:
+            return None
+        W, b = layers[0]
+        upper, below = support(self.X, W), support(self.X, -W)
+        return Ball.between(-below, jnp.maximum(-below, upper)) + b
 
     def _require_finite(self, numbers) -> None:
         if is_concrete(numbers) and not np.isfinite(numbers).all():
@@ -115,10 +155,32 @@ class Step:
 
     def _polytope(self, template: Template, program: Program) -> tuple[Polytope, Certificate]:
         """Problem (sdp::poly): the smallest offset for each facet."""
-        offsets, solution = proved_offsets(program, self.solver)
+        if isinstance(self.relaxation, CuttingPlanes):
+            program, offsets, solution = self._with_cuts(template, program)
+        else:
+            offsets, solution = proved_offsets(program, self.solver)
         self._require_finite(offsets)
         certificate = Certificate.from_solution(program, offsets, solution)
         return template.polytope(offsets), certificate
+
+    def _with_cuts(self, template: Template, program: Program):
+        """Offsets with products added in rounds, and the program with these products."""
+        fixed = jax.lax.stop_gradient(program)
+        if not is_concrete(fixed):
+            program = with_cuts(program, self.window.layout, self.solver, self.relaxation)
+            return program, *proved_offsets(program, self.solver)
+        witness = None
+        if self.attained is not None:
+
+            def witness(facet: int, column: np.ndarray) -> float:
+                state = jnp.asarray(column[: self.loop.states])
+                return self.attained(template.directions[facet], state)
+
+        rounds = solved_in_rounds(
+            jax.device_get(fixed), self.solver, self.relaxation, witness, self.offered
+        )
+        program = program.replace(products=jax.tree.map(jnp.asarray, rounds.products))
+        return program, *enveloped(program, rounds.judged)
 
     def _ellipsoid(
         self, template: EllipsoidTemplate, program: Program

@@ -49,7 +49,8 @@ class Window(Replaceable):
         start: the time of the first set.
         taken: how many columns are.
         prune: whether units that bounds prove to be affine leave the basis.
-        compact: whether they take no columns either.
+        linear: whether bounds are those of supports and linear relaxations.
+        compact: whether units that left the basis take no columns either.
     """
 
     facts: tuple[Rows, ...]
@@ -61,11 +62,18 @@ class Window(Replaceable):
     start: int = static()
     taken: int = static()
     prune: bool = static()
+    linear: bool = static()
     compact: bool = static()
 
     @classmethod
     def beginning(
-        cls, loop: ClosedLoop, X: AbstractSet, box: Box, t: int, prune: bool, compact: bool = False
+        cls,
+        loop: ClosedLoop,
+        X: AbstractSet,
+        box: Box,
+        t: int,
+        relaxation: AbstractRelaxation,
+        compact: bool = False,
     ) -> Window:
         """No step yet.
 
@@ -74,27 +82,38 @@ class Window(Replaceable):
             X: the set of states at time `t`.
             box: a box around it.
             t: the time.
-            prune: whether units that bounds prove to be affine leave the basis.
+            relaxation: whether units that bounds prove to be affine leave the basis, and by which
+                bounds.
             compact: whether their columns are left out as well, which needs concrete numbers.
         """
+        prune, linear = relaxation.remove_stable, relaxation.linear_bounds
         ball = _ball(rounded(X, box))
         state, cone, T = _first(X.cone_facts(), box, ball)
         empty, shape = (), (loop.units, int(t), loop.states)
-        return cls(empty, cone, state, T, empty, *shape, prune, compact and prune)
+        return cls(empty, cone, state, T, empty, *shape, prune, linear, compact and prune)
 
     def __len__(self) -> int:
         return len(self.facts)
 
-    def extended(self, loop: ClosedLoop, X: AbstractSet, box: Box) -> Window:
+    @property
+    def layout(self) -> FactLayout:
+        """Where each kind of fact stands among those of the program."""
+        return FactLayout(self.facets, self.units, len(self.cone.mid))
+
+    def extended(
+        self, loop: ClosedLoop, X: AbstractSet, box: Box, known: Ball | None = None
+    ) -> Window:
         """One step more.
 
         Args:
             loop: the closed loop.
             X: a set that surely holds the state after the steps so far; the first set at first.
             box: a box around it.
+            known: bounds of the inputs of the first units, if there are any besides these.
         """
-        t = self.start + len(self)
-        bounds = _bounds(loop, rounded(X, box) if self.prune else None, box, t)
+        t, around = self.start + len(self), rounded(X, box)
+        sharp = self.prune and (self.linear or not isinstance(around, Box))
+        bounds = _bounds(loop, around if sharp else None, box, t, known)
         places, taken = self._places(bounds)
         grown = self._padded(taken + 1)
         block, state, T = _extended(
@@ -123,7 +142,7 @@ class Window(Replaceable):
         return Program(
             facts=jax.tree.map(lambda *part: jnp.concatenate(part), *parts),
             objective=_objective(directions, self.state, self.transform),
-            products=relaxation.products(FactLayout(self.facets, self.units, len(self.cone.mid))),
+            products=relaxation.products(self.layout),
             transform=self.transform,
         )
 
@@ -147,7 +166,9 @@ class Window(Replaceable):
 
         T = _spread(_spread(self.transform, more).T, more).T
         facts = tuple(map(wider, self.facts))
-        return self.replace(facts=facts, cone=wider(self.cone), state=wider(self.state), transform=T)
+        return self.replace(
+            facts=facts, cone=wider(self.cone), state=wider(self.state), transform=T
+        )
 
 
 def step_program(
@@ -159,11 +180,13 @@ def step_program(
     relaxation: AbstractRelaxation,
 ) -> Program:
     """Theorem 1 for every facet of the successors of `X` at time `t`: a window of one step."""
-    window = Window.beginning(loop, X, box, t, relaxation.remove_stable)
+    window = Window.beginning(loop, X, box, t, relaxation)
     return window.extended(loop, X, box).program(directions, relaxation)
 
 
-def _ball(around: Ellipsoid | Intersection | None) -> Ellipsoid | None:
+def _ball(around: Box | Ellipsoid | Intersection) -> Ellipsoid | None:
+    if isinstance(around, Box):
+        return None
     return around.ellipsoid if isinstance(around, Intersection) else around
 
 
@@ -185,10 +208,16 @@ def _first(
 
 @jax.jit
 def _bounds(
-    loop: ClosedLoop, around: Ellipsoid | Intersection | None, box: Box, t: int
+    loop: ClosedLoop,
+    around: Box | Ellipsoid | Intersection | None,
+    box: Box,
+    t: int,
+    known: Ball | None,
 ) -> LoopBounds:
-    """Bounds of one step, from a box of states and the round set in it, if there is one."""
-    return loop_bounds(loop, box, t) if around is None else bounds_over(loop, around, box, t)
+    """Bounds of one step: by intervals alone, or by supports of a set and linear relaxations."""
+    if around is None:
+        return loop_bounds(loop, box, t)
+    return bounds_over(loop, around, box, t, known)
 
 
 @partial(jax.jit, static_argnames="prune")

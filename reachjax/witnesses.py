@@ -8,13 +8,14 @@ the dual of a semidefinite program proposes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.sets import AbstractSet, Ellipsoid, Intersection, PolyhedralSet
+from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet
 from reachjax.systems import ClosedLoop
 
 MOST_DIMENSIONS = 12
@@ -83,3 +84,112 @@ def witnesses(
         values = np.asarray(region.bounded_values(trajectories[:, t]))
         found.append((values.max(axis=0), np.asarray(states)[values.argmax(axis=0)]))
     return found
+
+
+CLIMBS = 60
+"""Gradient steps from a proposed state."""
+
+SWEEPS = 20
+"""Rounds of projections onto the facets of a polytope, one after the other."""
+
+
+class Simulations:
+    """Trajectories from an initial set, and the largest values that they attain.
+
+    Args:
+        loop: the closed loop.
+        X0: the set of initial states.
+        horizon: how many steps are simulated.
+        start: the time of the initial set.
+        samples: how many trajectories, besides those from corners.
+        seed: of the samples.
+    """
+
+    def __init__(
+        self, loop: ClosedLoop, X0: AbstractSet, horizon: int, start: int, samples: int, seed: int
+    ):
+        self._loop, self._X0, self._start = loop, X0, start
+        self._box = X0.bounding_box()
+        self.states = initial_states(X0, samples, seed)
+        self.trajectories = loop.simulate(self.states, horizon, start)
+        self._added: list[Array] = []
+
+    def attained(self, k: int, direction: Float[Array, " n_x"]) -> tuple[float, Array]:
+        """The largest value after `k` steps of the trajectories sampled, and its initial state."""
+        values = self.trajectories[:, k] @ direction
+        best = int(jnp.argmax(values))
+        return float(values[best]), self.states[best]
+
+    def climbed(
+        self, k: int, direction: Float[Array, " n_x"], state: Float[Array, " n_x"]
+    ) -> float:
+        """The value after `k` steps that gradient ascent from a state finds; the state is kept."""
+        best = _climb(
+            self._loop,
+            self._X0,
+            self._box,
+            state,
+            direction,
+            k,
+            self.trajectories.shape[1] - 1,
+            self._start,
+        )
+        if not bool(self._X0.contains(best)):
+            return -np.inf
+        self._added.append(best)
+        reached = self._loop.simulate(best, self.trajectories.shape[1] - 1, self._start)
+        return float(reached[k] @ direction)
+
+    @property
+    def all_states(self) -> Float[Array, "c n_x"]:
+        """The initial states of all trajectories."""
+        return jnp.concatenate([self.states, *(state[None] for state in self._added)])
+
+
+@partial(jax.jit, static_argnames=("horizon", "start"))
+def _climb(loop, X0, box, state, direction, k, horizon, start) -> Float[Array, " n_x"]:
+    """Projected gradient ascent on a value after `k` steps, in the coordinates of the box."""
+    widths = (box.upper - box.lower) / 2
+
+    def value(state):
+        return loop.simulate(state, horizon, start)[k] @ direction
+
+    def improve(carry, _):
+        state, best, slope, length = carry
+        uphill = widths * slope
+        size = jnp.linalg.norm(uphill)
+        step = length * widths * uphill / jnp.where(size > 0, size, 1.0)
+        moved = _nearest(X0, box, state + step)
+        new, other = jax.value_and_grad(value)(moved)
+        better = new > best
+        chosen = [
+            jnp.where(better, a, b)
+            for a, b in ((moved, state), (new, best), (other, slope), (2 * length, length / 2))
+        ]
+        return tuple(chosen), None
+
+    first = _nearest(X0, box, state)
+    begun = (first, *jax.value_and_grad(value)(first), jnp.array(0.5))
+    return jax.lax.scan(improve, begun, length=CLIMBS)[0][0]
+
+
+def _nearest(X0: AbstractSet, box: Box, state: Float[Array, " n_x"]) -> Float[Array, " n_x"]:
+    """A point of the set close to a state: the closest one of a box, about that of others."""
+    state = jnp.clip(state, box.lower, box.upper)
+    if isinstance(X0, Box):
+        return state
+    if isinstance(X0, Ellipsoid | Intersection):
+        ball = X0 if isinstance(X0, Ellipsoid) else X0.ellipsoid
+        reached = jnp.linalg.norm(ball.normal_form.A @ state + ball.normal_form.b)
+        state = ball.center + (state - ball.center) * PULL / jnp.maximum(reached, PULL)
+    polytope = X0.polytope if isinstance(X0, Intersection) else X0
+    if isinstance(polytope, PolyhedralSet):
+        A, b = polytope.facets
+        squares = jnp.sum(A**2, axis=1)
+
+        def onto(state, facet):
+            over = jnp.maximum(A[facet] @ state - b[facet], 0.0)
+            return state - over / squares[facet] * A[facet], None
+
+        state = jax.lax.scan(onto, state, jnp.tile(jnp.arange(len(b)), SWEEPS))[0]
+    return state

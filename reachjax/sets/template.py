@@ -4,15 +4,28 @@ from __future__ import annotations
 
 import abc
 import itertools
+from typing import Protocol, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.checks import Numbers, is_concrete, require_kind, same_size, whole_number
 from reachjax.pytrees import Replaceable, converted, pytree
+from reachjax.sets.base import AbstractSet
 from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polytope import Polytope
+
+
+class Simulated(Protocol):
+    """What can be simulated, such as a `ClosedLoop`."""
+
+    def simulate(
+        self, x0: Float[Array, "c n"], horizon: int, start: int = 0
+    ) -> Float[Array, "c horizon+1 n"]:
+        """Trajectories from initial states."""
+        ...
 
 
 class AbstractTemplate(Replaceable, abc.ABC):
@@ -28,13 +41,23 @@ class AbstractTemplate(Replaceable, abc.ABC):
     def summary(self) -> str:
         """A few words for what the sets look like."""
 
+    @property
+    def steps(self) -> int | None:
+        """The number of steps it is given for; None if all sets look alike."""
+        return None
+
+    def at(self, k: int) -> Self:
+        """What the set after `k` steps looks like, `k` being 1 or more."""
+        return self
+
 
 @pytree
 class Template(AbstractTemplate):
     """Facet directions: the matrix `A` of the paper's problem (sdp::poly), whose `b` is sought.
 
     Args:
-        directions: `(m, n)`, one facet normal a row; together they must bound a polytope.
+        directions: `(m, n)`, one facet normal a row; together they must bound a polytope. With a
+            leading time axis, `(N, m, n)`, those of the sets after 1, ..., N steps.
 
     Raises:
         ValueError: a row is zero or not finite, or the directions leave the polytope unbounded.
@@ -44,31 +67,55 @@ class Template(AbstractTemplate):
         (8, 2)
     """
 
-    directions: Float[Array, "m n"] = converted(converter=Numbers("(m, n)"))
+    directions: Float[Array, "*N m n"] = converted(converter=Numbers("(m, n)", "(N, m, n)"))
 
     def __post_init__(self):
         if is_concrete(self.directions):
-            try:
-                self.polytope(jnp.ones(len(self))).bounding_box()
-            except ValueError as error:
-                raise ValueError(f"Template.directions do not bound a set: {error}") from None
+            for rows in self.directions.reshape(-1, *self.directions.shape[-2:]):
+                try:
+                    Polytope(rows, jnp.ones(len(rows))).bounding_box()
+                except ValueError as error:
+                    raise ValueError(f"Template.directions do not bound a set: {error}") from None
 
     @property
     def dimension(self) -> int:
         """The number of coordinates."""
-        return self.directions.shape[1]
+        return self.directions.shape[-1]
 
     @property
     def summary(self) -> str:
         """The number of facets."""
         return f"facets={len(self)}"
 
+    @property
+    def steps(self) -> int | None:
+        """The number of steps it is given for; None if all sets have the same directions."""
+        return len(self.directions) if self.directions.ndim == 3 else None
+
+    def at(self, k: int) -> Self:
+        """The directions of the set after `k` steps, `k` being 1 or more.
+
+        Raises:
+            ValueError: they are given for fewer steps.
+        """
+        if self.steps is None:
+            return self
+        if not 1 <= k <= self.steps:
+            raise ValueError(f"Template.directions are for k = 1 .. {self.steps}, but {k} arrived")
+        return self.replace(directions=self.directions[k - 1])
+
     def __len__(self) -> int:
         """The number of facets."""
-        return self.directions.shape[0]
+        return self.directions.shape[-2]
 
     def polytope(self, offsets: Float[Array, " m"]) -> Polytope:
-        """The polytope `directions x <= offsets`."""
+        """The polytope `directions x <= offsets`.
+
+        Raises:
+            ValueError: the directions depend on the step: those of one are `template.at(k)`.
+        """
+        if self.steps is not None:
+            raise ValueError("Template.directions have a time axis: use template.at(k).polytope")
         return Polytope(self.directions, offsets)
 
     @classmethod
@@ -97,8 +144,51 @@ class Template(AbstractTemplate):
             ValueError: fewer than three facets, which bound no set.
         """
         whole_number("facets", facets, 3)
-        angles = 2 * np.pi * np.arange(facets) / facets
-        return cls(np.stack([np.cos(angles), np.sin(angles)], axis=1))
+        return cls(_plane(facets))
+
+    @classmethod
+    def adapted(
+        cls,
+        loop: Simulated,
+        X0: AbstractSet,
+        horizon: int,
+        facets: int = 12,
+        *,
+        start: int = 0,
+        samples: int = 1000,
+        seed: int = 0,
+    ) -> Template:
+        """Directions that fit the simulated states of each step.
+
+        States are whitened by the root of their covariance. In the plane the normals are at equal
+        angles there; in more dimensions they are the principal axes, then sums and differences of
+        two of them, the widest first.
+
+        Args:
+            loop: the closed loop.
+            X0: the set of initial states.
+            horizon: the number `N` of steps.
+            facets: how many; an even number of at least `2 n` in more than two dimensions.
+            start: the time of `X0`.
+            samples: how many trajectories are simulated.
+            seed: of the samples.
+
+        Raises:
+            ValueError: there are too few facets to bound a set, or more than there are directions.
+
+        Example:
+            >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop
+            >>> net = MLP.from_layers([([[0.0, 0.0]], [0.0])])
+            >>> loop = ClosedLoop(AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.0], [1.0]]), net)
+            >>> Template.adapted(loop, Box([-1.0, -1.0], [1.0, 1.0]), horizon=3).directions.shape
+            (3, 12, 2)
+        """
+        n = X0.dimension
+        count = whole_number("facets", facets, 3 if n == 2 else 2 * n)
+        states = X0.sample(jax.random.key(seed), whole_number("samples", samples, n + 1))
+        trajectories = np.asarray(loop.simulate(states, horizon, start))
+        given = _plane(count) if n == 2 else _principal(n, count)
+        return cls(np.stack([_fitting(trajectories[:, k], given) for k in range(1, horizon + 1)]))
 
 
 @pytree
@@ -181,9 +271,47 @@ class MixedTemplate(AbstractTemplate):
         return self.facets.dimension
 
     @property
+    def steps(self) -> int | None:
+        """The number of steps that the facets are given for."""
+        return self.facets.steps
+
+    def at(self, k: int) -> Self:
+        """What the set after `k` steps looks like, `k` being 1 or more."""
+        return self.replace(facets=self.facets.at(k))
+
+    @property
     def summary(self) -> str:
         """What both parts say."""
         return f"{self.facets.summary}, {self.ellipsoid.summary}"
+
+
+FLAT = 1e-6
+"""States are taken to vary by at least this part of their widest spread in every direction."""
+
+
+def _fitting(states: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Directions of unit length, given in principal axes of unit spread, the widest first."""
+    centered = states - states.mean(axis=0)
+    _, spreads, axes = np.linalg.svd(centered, full_matrices=False)
+    widths = np.maximum(spreads, FLAT * spreads[0]) if spreads[0] > 0 else np.ones(len(axes))
+    rows = (directions / widths) @ axes
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def _plane(facets: int) -> np.ndarray:
+    """Unit vectors at equal angles."""
+    angles = 2 * np.pi * np.arange(facets) / facets
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def _principal(n: int, facets: int) -> np.ndarray:
+    """Axes, then sums and differences of two of them, as many as are asked for."""
+    rows = Template.octagonal(n).directions
+    if facets % 2 or facets > len(rows):
+        raise ValueError(
+            f"facets must be an even number of {2 * n} to {len(rows)}, but {facets} arrived"
+        )
+    return np.asarray(rows[:facets])
 
 
 def _signed(rows: np.ndarray) -> np.ndarray:

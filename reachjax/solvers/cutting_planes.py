@@ -10,17 +10,20 @@ whose multipliers are at zero are dropped before the next facet.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from reachjax.lmi import Program
 from reachjax.recheck import interval_offsets
-from reachjax.relaxation import CuttingPlanes, Products
+from reachjax.relaxation import CuttingPlanes, FactLayout, Products
 from reachjax.solvers.accepted import accepted_offsets
 from reachjax.solvers.base import AbstractSolver, Solution
-from reachjax.solvers.trimming import trimmed
+from reachjax.solvers.differentiable import Judged
+from reachjax.solvers.trimming import namespace, trimmed
 
 VIOLATED = 1e-6
 """Products more negative than this are, rows of facts and the basis being of unit size."""
@@ -37,16 +40,13 @@ class Rounds(NamedTuple):
 
     Attributes:
         products: every facet's.
-        offsets: `(f,)`, proved.
-        optimal: `(f,)`, whether each is the optimal value with its facet's products.
-        solution: what the solver proposed, multipliers being those of `products`.
+        judged: what was proposed, multipliers being those of `products`, and proved; a facet's
+            offset is optimal with its own products.
         pairs: `(p, 2)`, the products added that were in use at last.
     """
 
     products: Products
-    offsets: Float[np.ndarray, " f"]
-    optimal: Bool[np.ndarray, " f"]
-    solution: Solution
+    judged: Judged
     pairs: Int[np.ndarray, "p 2"]
 
 
@@ -67,7 +67,7 @@ def solved_in_rounds(
         offered: products that were of use before.
     """
     candidates = _Candidates(program)
-    facets, size = program.objective.mid.shape
+    facets = len(program.objective.mid)
     found, used = [], candidates.known(offered)
     for facet in range(facets):
         one = program.seeking(slice(facet, facet + 1))
@@ -76,6 +76,52 @@ def solved_in_rounds(
         found.append(result)
         used = candidates.of_use(result)
     return _joined(program, candidates, found, used)
+
+
+def with_cuts(
+    program: Program, layout: FactLayout, solver: AbstractSolver, cuts: CuttingPlanes
+) -> Program:
+    """The program with products added round by round, for all facets at once. Traceable.
+
+    There is room for `rounds` times `batch` products; room that is not needed stays empty.
+
+    Args:
+        program: with the products to begin with.
+        layout: of its facts.
+        solver: of the programs of each round.
+        cuts: how many rounds, and of how many products.
+    """
+    count, empty = len(layout.linear), len(program.facts.mid)
+    facts = jax.tree.map(lambda part: jnp.pad(part, ((0, 1), (0, 0))), program.facts)
+    whole = program.replace(facts=facts)
+    fixed = jax.lax.stop_gradient(whole)
+    norms = jnp.linalg.norm(fixed.facts.mid[:count], axis=1, keepdims=True)
+    rows = fixed.facts.mid[:count] / jnp.where(norms > 0, norms, 1.0)
+    left, right = _linear_pairs(cuts, layout).T
+    above = jnp.triu(jnp.ones((count, count), dtype=bool), 1).at[left, right].set(False)
+
+    def more(number, carry):
+        pairs, missing = carry
+        moments = solver.propose(fixed.replace(products=_joint(program.products, pairs))).moments
+        values = rows @ jnp.where(jnp.isfinite(moments), moments, 0.0) @ rows.T
+        violation = jnp.where(missing, -values.min(axis=0), 0.0)
+        worst, where = jax.lax.top_k(violation.ravel(), batch)
+        ends = jnp.stack(jnp.unravel_index(where, violation.shape), axis=1)
+        added = jnp.where((worst > VIOLATED)[:, None], ends, empty)
+        pairs = jax.lax.dynamic_update_slice(pairs, added, (number * batch, 0))
+        return pairs, missing.at[tuple(ends.T)].min(worst <= VIOLATED)
+
+    batch = min(cuts.batch, count**2)
+    pairs = jnp.full((cuts.rounds * batch, 2), empty)
+    if cuts.rounds:
+        pairs, _ = jax.lax.fori_loop(0, cuts.rounds, more, (pairs, above))
+    return whole.replace(products=_joint(program.products, pairs))
+
+
+def _linear_pairs(cuts: CuttingPlanes, layout: FactLayout) -> Int[np.ndarray, "p 2"]:
+    """The pairs of linear facts that a program begins with, the smaller number first."""
+    groups, _ = cuts.groups(layout)
+    return np.sort(np.array([pair for group in groups for pair in group]).reshape(-1, 2), axis=1)
 
 
 class _Result(NamedTuple):
@@ -179,15 +225,15 @@ def _restricted(products: Products, kept: np.ndarray) -> Products:
     return Products(left, right, sign, number[products.multiplier[there]], products.free[kept])
 
 
-def _joint(core: Products, pairs: np.ndarray) -> Products:
+def _joint(core: Products, pairs: Any) -> Products:
     """Products and pairs of a multiplier each."""
-    count, more = len(core.free), len(pairs)
+    xp, count, more = namespace(pairs), len(core.free), len(pairs)
     return Products(
-        left=np.r_[core.left, pairs[:, 0]],
-        right=np.r_[core.right, pairs[:, 1]],
-        sign=np.r_[core.sign, np.ones(more)],
-        multiplier=np.r_[core.multiplier, count + np.arange(more)],
-        free=np.r_[core.free, np.zeros(more, dtype=bool)],
+        left=xp.concatenate([core.left, pairs[:, 0]]),
+        right=xp.concatenate([core.right, pairs[:, 1]]),
+        sign=xp.concatenate([core.sign, xp.ones(more)]),
+        multiplier=xp.concatenate([core.multiplier, count + xp.arange(more)]),
+        free=xp.concatenate([core.free, xp.zeros(more, dtype=bool)]),
     )
 
 
@@ -205,10 +251,6 @@ def _joined(program, candidates, found: list[_Result], used: np.ndarray) -> Roun
         solution.multipliers[i, core + places] = mine.multipliers[0, core:]
         solution.offsets[i], solution.statuses[i] = mine.offsets[0], mine.statuses[0]
         solution.moments[i], solution.seconds[i] = mine.moments[0], result.seconds
-    return Rounds(
-        products,
-        np.array([result.offset for result in found]),
-        np.array([result.optimal for result in found]),
-        solution,
-        used,
-    )
+    offsets = np.array([result.offset for result in found])
+    optimal = np.array([result.optimal for result in found])
+    return Rounds(products, Judged(offsets, optimal, solution), used)

@@ -25,13 +25,12 @@ forward mode do not exist; JAX raises an error.
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from reachjax.lmi import Program, lagrangian
 from reachjax.solvers.accepted import accepted_offsets
@@ -39,6 +38,20 @@ from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
 from reachjax.solvers.cotangents import asked_for
 from reachjax.solvers.host import all_finite, on_host
 from reachjax.solvers.smoothing import CentralPath, smoothed_offsets
+
+
+class Judged(NamedTuple):
+    """What a solver proposed for the facets of a program, and what that proves.
+
+    Attributes:
+        offsets: `(f,)`, proved.
+        optimal: `(f,)`, which of them are the relaxation's optimal values.
+        solution: what the solver proposed.
+    """
+
+    offsets: Float[Array, " f"]
+    optimal: Bool[Array, " f"]
+    solution: Solution
 
 
 def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Array, " f"], Solution]:
@@ -51,39 +64,48 @@ def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Arra
     """
     if isinstance(solver, CentralPath):
         return smoothed_offsets(program, solver.weight)
-    result: Any = _proved_offsets(solver, program.facts.mid, program.objective.mid, program)
-    offsets, _, solution = result
-    return offsets, solution
+    fixed = jax.lax.stop_gradient(program)
+    solution = solver.propose(fixed)
+    offsets = jax.ShapeDtypeStruct(solution.offsets.shape, float)
+    optimal = jax.ShapeDtypeStruct(solution.offsets.shape, bool)
+    judged = on_host(_judged, (offsets, optimal), (fixed, solution))
+    return enveloped(program, Judged(*judged, solution))
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _proved_offsets(solver, facts, objective, program) -> tuple[Array, Array, Solution]:
-    solution = solver.propose(program)
-    offsets = jax.ShapeDtypeStruct(objective.shape[:1], float)
-    optimal = jax.ShapeDtypeStruct(objective.shape[:1], bool)
-    return *on_host(_judged, (offsets, optimal), (program, solution)), solution
+def enveloped(program: Program, judged: Judged) -> tuple[Float[Array, " f"], Solution]:
+    """Offsets that were proved, with the derivative that the envelope theorem gives them.
+
+    Args:
+        program: whose rows the offsets are differentiated in.
+        judged: what was proposed and proved for it.
+    """
+    return _enveloped(program.facts.mid, program.objective.mid, program, judged)
 
 
-def _forward(solver, facts, objective, program):
-    result: Any = _proved_offsets(solver, facts, objective, program)
-    _, optimal, solution = result
-    trusted = optimal & (solution.statuses == SolverStatus.SOLVED)
+@jax.custom_vjp
+def _enveloped(facts, objective, program, judged) -> tuple[Array, Solution]:
+    return judged.offsets, judged.solution
+
+
+def _forward(facts, objective, program, judged):
+    solution = judged.solution
+    trusted = judged.optimal & (solution.statuses == SolverStatus.SOLVED)
     moments = jnp.where(trusted[:, None, None], solution.moments, jnp.nan)
-    return result, (program, solution.multipliers, moments)
+    return (judged.offsets, solution), (program, solution.multipliers, moments)
 
 
-def _backward(solver, residual, cotangents):
+def _backward(residual, cotangents):
     program, multipliers, moments = residual
 
     def value(facts, objective):
         return lagrangian(program.with_midpoints(facts, objective), multipliers, moments)
 
     pull: Any = jax.vjp(value, program.facts.mid, program.objective.mid)[1]
-    offsets, _, proposal = cotangents
-    return *pull(jnp.where(asked_for(proposal), jnp.nan, offsets)), None
+    offsets, proposal = cotangents
+    return *pull(jnp.where(asked_for(proposal), jnp.nan, offsets)), None, None
 
 
-_proved_offsets.defvjp(_forward, _backward)
+_enveloped.defvjp(_forward, _backward)
 
 
 def _judged(argument: tuple[Program, Solution]) -> tuple[np.ndarray, np.ndarray]:

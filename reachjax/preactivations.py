@@ -37,7 +37,7 @@ def bounds_over(
     X: Box | Ellipsoid | Intersection,
     box: Box,
     t: int | jax.Array,
-    known: Ball | None = None,
+    known: Ball,
 ) -> LoopBounds:
     """Bounds of one step of the loop from a set of states.
 
@@ -46,26 +46,20 @@ def bounds_over(
         X: the set of states at time `t`, as `rounded` gives it.
         box: a box around it.
         t: the time.
-        known: other bounds of the inputs of the first units, if there are any.
+        known: `(k,)`, other bounds of the units' inputs, of infinite radius where there are none.
     """
     if loop.units == 0:
         return loop_bounds(loop, box, t)
     n, size = loop.states, loop.states + loop.units + 1
     places = n + jnp.arange(loop.units)
-    everything = Ball(jnp.zeros(loop.units), jnp.full(loop.units, jnp.inf))
-    if known is not None:
-        count = len(known.mid)
-        everything = Ball(
-            everything.mid.at[:count].set(known.mid), everything.rad.at[:count].set(known.rad)
-        )
 
     def once(_, bounds: LoopBounds) -> LoopBounds:
         rows = loop_rows(loop, columns(0, n, size), places, t, bounds, prune=True)
         ranges = _ranges(rows.preactivation, X, bounds)
-        return loop_bounds(loop, box, t, _meet(ranges, everything))
+        return loop_bounds(loop, box, t, _meet(ranges, known))
 
     layers = len(loop.controller.layers) - 1 + 2 * (loop.input_box is not None)
-    return jax.lax.fori_loop(0, layers, once, loop_bounds(loop, box, t, everything))
+    return jax.lax.fori_loop(0, layers, once, loop_bounds(loop, box, t, known))
 
 
 def _meet(one: Ball, other: Ball) -> Ball:
@@ -76,9 +70,9 @@ def _meet(one: Ball, other: Ball) -> Ball:
 
 def _ranges(rows: Rows, X: AbstractSet, bounds: LoopBounds) -> Ball:
     """Intervals of rows over the basis `[x, z, 1]`, by intervals and by linear bounds of `z`."""
-    direct = _upper(rows, X, bounds), _upper(-rows, X, bounds)
-    linear = (_upper(_relaxed(part, rows, bounds), X, bounds) for part in (rows, -rows))
-    upper, below = (jnp.minimum(*pair) for pair in zip(direct, linear, strict=True))
+    both = jax.tree.map(lambda *part: jnp.concatenate(part), rows, -rows)
+    relaxed = _relaxed(both, rows, bounds)
+    upper, below = jnp.minimum(_upper(both, X, bounds), _upper(relaxed, X, bounds)).reshape(2, -1)
     return Ball.between(-below, jnp.maximum(-below, upper))
 
 

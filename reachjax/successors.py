@@ -60,7 +60,6 @@ class Step:
         compact: whether units that are affine take no columns of the basis.
         attained: what simulations from the window's first set attain, of a direction after this
             step, one of them beginning at a given state; None if that is not known.
-        offered: products of facts that were of use before.
         relaxation: which products of facts are used.
         solver: what solves the semidefinite programs.
         name: what errors call the set.
@@ -76,7 +75,6 @@ class Step:
     solver: AbstractSolver
     name: str
     attained: Callable[[Array, Array], float] | None = None
-    offered: np.ndarray | None = None
 
     def successors(self, template: AbstractTemplate) -> tuple[AbstractSet, AbstractCertificate]:
         """The smallest set of a template that surely holds the successors, and its proof.
@@ -177,7 +175,7 @@ class Step:
                 return self.attained(template.directions[facet], state)
 
         rounds = solved_in_rounds(
-            jax.device_get(fixed), self.solver, self.relaxation, witness, self.offered
+            jax.device_get(fixed), self.window.layout, self.solver, self.relaxation, witness
         )
         program = program.replace(products=jax.tree.map(jnp.asarray, rounds.products))
         return program, *enveloped(program, rounds.judged)

@@ -113,7 +113,7 @@ class Window(Replaceable):
         """
         t, around = self.start + len(self), rounded(X, box)
         sharp = self.prune and (self.linear or not isinstance(around, Box))
-        bounds = _bounds(loop, around if sharp else None, box, t, known)
+        bounds = _bounds(loop, around if sharp else None, box, t, _of_all(self.units, known))
         places, taken = self._places(bounds)
         grown = self._padded(taken + 1)
         block, state, T = _extended(
@@ -190,6 +190,15 @@ def _ball(around: Box | Ellipsoid | Intersection) -> Ellipsoid | None:
     return around.ellipsoid if isinstance(around, Intersection) else around
 
 
+def _of_all(units: int, known: Ball | None) -> Ball:
+    """Bounds of every unit's input, of infinite radius but for those known, the first ones."""
+    mid, rad = jnp.zeros(units), jnp.full(units, jnp.inf)
+    if known is None:
+        return Ball(mid, rad)
+    here = slice(0, len(known.mid))
+    return Ball(mid.at[here].set(known.mid), rad.at[here].set(known.rad))
+
+
 @jax.jit
 def _first(
     cone_facts: Float[Array, "r n_x+1"], box: Box, ball: Ellipsoid | None
@@ -212,7 +221,7 @@ def _bounds(
     around: Box | Ellipsoid | Intersection | None,
     box: Box,
     t: int,
-    known: Ball | None,
+    known: Ball,
 ) -> LoopBounds:
     """Bounds of one step: by intervals alone, or by supports of a set and linear relaxations."""
     if around is None:

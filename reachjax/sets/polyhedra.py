@@ -8,6 +8,7 @@ what is used in a certificate is rebuilt from the dual solution: for any `y >= 0
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 from scipy.optimize import linprog
 
 from reachjax.rounding import gamma
@@ -41,6 +42,24 @@ def maximiser(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> tuple[np.n
     return np.maximum(-result.ineqlin.marginals, 0.0), result.x
 
 
+def maximisers(
+    A: np.ndarray, b: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """`maximiser` for `k` directions: multipliers `(k, m)` and points `(k, n)`.
+
+    One linear program with a copy of the polytope for each takes a fraction of the time of many.
+    """
+    k, (m, n) = len(directions), A.shape
+    blocks = sp.kron(sp.eye_array(k), A, format="csr")
+    result = linprog(
+        -directions.ravel(), blocks, np.tile(b, k), bounds=(None, None), method="highs"
+    )
+    if result.status != 0:  # one by one, to say what is wrong
+        pairs = [maximiser(A, b, direction) for direction in directions]
+        return np.stack([y for y, _ in pairs]), np.stack([x for _, x in pairs])
+    return np.maximum(-result.ineqlin.marginals.reshape(k, m), 0.0), result.x.reshape(k, n)
+
+
 def _is_empty(A: np.ndarray, b: np.ndarray) -> bool:
     zero = np.zeros(A.shape[1])
     return linprog(zero, A_ub=A, b_ub=b, bounds=(None, None), method="highs").status == 2
@@ -66,7 +85,7 @@ def bounding_box_and_multipliers(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarr
     A, b = balanced(A, b)
     n = A.shape[1]
     D = np.vstack([-np.eye(n), np.eye(n)])
-    Y, points = (np.stack(part) for part in zip(*(maximiser(A, b, d) for d in D), strict=True))
+    Y, points = maximisers(A, b, D)
     error = gamma(len(b) + 2)
     residual = np.abs(D - Y @ A) + error * (np.abs(D) + Y @ np.abs(A))
     values = Y @ b + error * (Y @ np.abs(b))
@@ -99,15 +118,11 @@ def support_and_multipliers(
     size = np.maximum(np.abs(lower), np.abs(upper))
     error = gamma(len(b) + len(size) + 4)
     exponents = np.frexp(np.linalg.norm(directions, axis=1))[1]
-    values, Y, points = [], [], []
-    for a in np.ldexp(directions, -exponents[:, None]):
-        y, x = maximiser(A, b, a)
-        residual = np.abs(a - y @ A) + error * (np.abs(a) + y @ np.abs(A))
-        values.append(y @ b + error * (y @ np.abs(b)) + residual @ size * (1 + error))
-        Y.append(y)
-        points.append(x)
-    multipliers = np.ldexp(np.stack(Y), exponents[:, None] - lengths)
-    return np.ldexp(values, exponents), multipliers, np.stack(points)
+    D = np.ldexp(directions, -exponents[:, None])
+    Y, points = maximisers(A, b, D)
+    residual = np.abs(D - Y @ A) + error * (np.abs(D) + Y @ np.abs(A))
+    values = Y @ b + error * (Y @ np.abs(b)) + residual @ size * (1 + error)
+    return np.ldexp(values, exponents), np.ldexp(Y, exponents[:, None] - lengths), points
 
 
 def separation_and_multipliers(

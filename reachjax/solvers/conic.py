@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import time
 import warnings
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -112,13 +113,18 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
         return proposal._replace(form=scaled.from_unit_box(found))
 
 
-def _require_installed(name: str) -> None:
+@cache
+def _installed() -> list[str]:
     import cvxpy as cp
 
-    if name not in cp.installed_solvers():
+    return cp.installed_solvers()
+
+
+def _require_installed(name: str) -> None:
+    if name not in _installed():
         raise ValueError(
             f"the solver {name!r} is not among those that cvxpy finds here: "
-            f"{', '.join(cp.installed_solvers())}"
+            f"{', '.join(_installed())}"
         )
 
 

@@ -9,17 +9,19 @@ whose multipliers are at zero are dropped before the next facet.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from reachjax.lmi import Program
 from reachjax.recheck import interval_offsets
-from reachjax.relaxation import CuttingPlanes, FactLayout, Products
+from reachjax.relaxation import CuttingPlanes, FactLayout, LocalBounds, Products
 from reachjax.solvers.accepted import accepted_offsets
 from reachjax.solvers.base import AbstractSolver, Solution
 from reachjax.solvers.differentiable import Judged
@@ -42,40 +44,36 @@ class Rounds(NamedTuple):
         products: every facet's.
         judged: what was proposed, multipliers being those of `products`, and proved; a facet's
             offset is optimal with its own products.
-        pairs: `(p, 2)`, the products added that were in use at last.
     """
 
     products: Products
     judged: Judged
-    pairs: Int[np.ndarray, "p 2"]
 
 
 def solved_in_rounds(
     program: Program,
+    layout: FactLayout,
     solver: AbstractSolver,
     cuts: CuttingPlanes,
     witness: Witness | None = None,
-    offered: Int[np.ndarray, "p 2"] | None = None,
 ) -> Rounds:
     """Solve for every facet, products being added as they are needed.
 
     Args:
-        program: whose leaves are numpy arrays, with the products to begin with.
+        program: whose leaves are numpy arrays, with the products of `cuts`.
+        layout: of its facts.
         solver: of the programs of each round.
         cuts: how many rounds, and of how many products.
         witness: what simulations attain; rounds do not stop for them if it is None.
-        offered: products that were of use before.
     """
-    candidates = _Candidates(program)
-    facets = len(program.objective.mid)
-    found, used = [], candidates.known(offered)
-    for facet in range(facets):
+    candidates = _Candidates(program, layout)
+    found, used = [], np.zeros((0, 2), dtype=int)
+    for facet in range(len(program.objective.mid)):
         one = program.seeking(slice(facet, facet + 1))
-        attained = None if witness is None else (lambda column, i=facet: witness(i, column))
-        result = _facet(one, candidates, solver, cuts, attained, used)
-        found.append(result)
-        used = candidates.of_use(result)
-    return _joined(program, candidates, found, used)
+        attained = None if witness is None else partial(witness, facet)
+        found.append(_facet(one, candidates, solver, cuts, attained, used))
+        used = found[-1].of_use
+    return _joined(program, candidates, found)
 
 
 def with_cuts(
@@ -125,7 +123,7 @@ def _linear_pairs(cuts: CuttingPlanes, layout: FactLayout) -> Int[np.ndarray, "p
 
 
 class _Result(NamedTuple):
-    """One facet's last round: its added products, and what was proved with them."""
+    """One facet's best round: the products added, and what was proved with them."""
 
     pairs: Int[np.ndarray, "p 2"]
     offset: float
@@ -133,89 +131,120 @@ class _Result(NamedTuple):
     solution: Solution
     seconds: float
 
+    @property
+    def of_use(self) -> Int[np.ndarray, "q 2"]:
+        """The added products whose multipliers are not at zero."""
+        weights = self.solution.multipliers[0]
+        added = weights[len(weights) - len(self.pairs) :]
+        return self.pairs[added > IDLE * max(1e-300, abs(weights).max(initial=0.0))]
+
 
 class _Candidates:
-    """The facts of a program that say something, and the products they have without cuts."""
+    """The facts of a program that say something, and which of their products may be added.
 
-    def __init__(self, program: Program):
-        given = trimmed(program)
+    To begin with there are the products of the first set's facets and of the units that switch.
+    What else `LocalBounds` has may be added like any other product.
+    """
+
+    def __init__(self, program: Program, layout: FactLayout):
+        given, products = trimmed(program), program.products
         norms = np.sqrt((given.facts**2).sum(axis=1))
-        cone = np.zeros(len(norms), dtype=bool)
-        cone[np.r_[program.products.left, program.products.right][_cone(program.products)]] = True
-        self.live = np.flatnonzero((norms > 0) & np.isfinite(norms) & ~cone)
+        linear = np.arange(len(norms)) < len(layout.linear)
+        self.live = np.flatnonzero((norms > 0) & np.isfinite(norms) & linear)
         self.rows = given.facts[self.live] / norms[self.live, None]
-        self.columns = given.columns
-        self.core = _restricted(program.products, given.kept)
-        self.kept = np.flatnonzero(given.kept)
-        place = np.full(len(norms), -1)
-        place[self.live] = np.arange(len(self.live))
-        self.place = place
+        self.place = np.full(len(norms), -1)
+        self.place[self.live] = np.arange(len(self.live))
+        self.core = _restricted(products, given.kept & _of_facts(products, _first(program, layout)))
         self.open = np.triu(np.ones((len(self.live),) * 2, dtype=bool), 1)
-        left, right = place[self.core.left], place[self.core.right]
-        there = (left >= 0) & (right >= 0)
-        self._close(left[there], right[there])
+        self.open[self._entries(np.stack([self.core.left, self.core.right], axis=1))] = False
+        self.layout = layout
 
-    def _close(self, left, right):
-        self.open[np.minimum(left, right), np.maximum(left, right)] = False
+    @cached_property
+    def promised(self) -> Bool[np.ndarray, "m m"]:
+        """What `LocalBounds` has beyond the products to begin with."""
+        groups, _ = LocalBounds(repeated=False).groups(self.layout)
+        pairs = np.array(list(itertools.chain(*groups)), dtype=int).reshape(-1, 2)
+        there = np.zeros_like(self.open)
+        there[self._entries(pairs)] = True
+        crossed = (
+            self.place[np.array(kind, dtype=int)]
+            for kind in (self.layout.output, self.layout.slack)
+        )
+        z, r = (places[places >= 0] for places in crossed)
+        there[np.ix_(z, r)] = there[np.ix_(r, z)] = True
+        return there & self.open
 
-    def known(self, pairs: np.ndarray | None) -> np.ndarray:
-        """Those of the pairs that may be added."""
-        if pairs is None or not len(pairs):
-            return np.zeros((0, 2), dtype=int)
+    def _entries(self, pairs: Int[np.ndarray, "p 2"]) -> tuple[np.ndarray, np.ndarray]:
+        """Where these pairs stand, those of facts that say something."""
         left, right = np.sort(self.place[pairs], axis=1).T
-        return pairs[(left >= 0) & self.open[left, right]]
+        return left[left >= 0], right[left >= 0]
 
-    def violated(self, moment: np.ndarray, pairs: np.ndarray, batch: int) -> np.ndarray:
-        """The most violated pairs that are not there yet, at most so many."""
-        values = np.where(self.open, self.rows @ moment @ self.rows.T, 0.0)
-        left, right = np.sort(self.place[pairs], axis=1).T
-        values[left, right] = 0.0
-        count = min(batch, int((values < -VIOLATED).sum()))
+    def violated(
+        self, moment: Float[np.ndarray, "n n"], pairs: Int[np.ndarray, "p 2"], batch: int | None
+    ) -> Int[np.ndarray, "q 2"]:
+        """The most violated pairs that are not there yet; None for all that `LocalBounds` has."""
+        allowed = (self.promised if batch is None else self.open).copy()
+        allowed[self._entries(pairs)] = False
+        values = np.where(allowed, self.rows @ moment @ self.rows.T, 0.0)
+        count = int((values < -VIOLATED).sum())
+        count = count if batch is None else min(batch, count)
         if not count:
             return np.zeros((0, 2), dtype=int)
         worst = np.argpartition(values, count - 1, axis=None)[:count]
         return self.live[np.stack(np.unravel_index(worst, values.shape), axis=1)]
 
-    def with_pairs(self, program: Program, pairs: np.ndarray) -> Program:
-        """The program with the products to begin with and these."""
-        return program.replace(products=_joint(self.core, pairs))
 
-    def of_use(self, result: _Result) -> np.ndarray:
-        """The added products whose multipliers are not at zero."""
-        weights = result.solution.multipliers[0, len(self.core.free) :]
-        return result.pairs[weights > IDLE * max(1e-300, weights.max(initial=0.0))]
+def _first(program: Program, layout: FactLayout) -> Bool[np.ndarray, " m"]:
+    """The facts whose products a program begins with."""
+    there = (program.facts.mid != 0).any(axis=1)
+    first = np.zeros(len(there), dtype=bool)
+    first[[0, *layout.set_facets[0], *layout.cone_rows]] = True
+    switching = there[list(layout.output)] & there[list(layout.slack)]
+    for kind in (layout.output, layout.slack, layout.output_cap, layout.slack_cap):
+        first[np.array(kind, dtype=int)[switching]] = True
+    return first
 
 
-def _facet(program, candidates, solver, cuts, attained, pairs) -> _Result:
-    """The rounds of one facet."""
+def _of_facts(products: Products, facts: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " K"]:
+    """Which multipliers weigh products of these facts alone."""
+    other = ~(facts[products.left] & facts[products.right])
+    return np.bincount(products.multiplier, other, len(products.free)) == 0
+
+
+def _facet(
+    program: Program,
+    candidates: _Candidates,
+    solver: AbstractSolver,
+    cuts: CuttingPlanes,
+    attained: Callable[[Float[np.ndarray, " n"]], float] | None,
+    pairs: Int[np.ndarray, "p 2"],
+) -> _Result:
+    """The rounds of one facet.
+
+    When they have run out, the products of `LocalBounds` that are violated are added all the same,
+    until none is: no bound is looser than its.
+    """
     size = float(interval_offsets(program)[0] - program.objective.mid[0, -1])
     best, seconds = None, 0.0
-    for round_ in range(cuts.rounds + 1):
-        given = candidates.with_pairs(program, pairs)
+    for number in itertools.count():
+        given = program.replace(products=_joint(candidates.core, pairs))
         solution = solver.solve(given)
         seconds += float(solution.seconds[0])
         (offset,), (optimal,) = accepted_offsets(given, solution)
         if best is None or offset <= best.offset:
             best = _Result(pairs, float(offset), bool(optimal), solution, 0.0)
         moment = solution.moments[0]
-        if round_ == cuts.rounds or not np.isfinite(moment).all():
+        if not np.isfinite(moment).all():
             break
         if attained is not None:
             column = program.transform @ moment[:, -1]
             if best.offset - attained(column) <= cuts.gap * size:
                 break
-        more = candidates.violated(moment, pairs, cuts.batch)
+        more = candidates.violated(moment, pairs, cuts.batch if number < cuts.rounds else None)
         if not len(more):
             break
         pairs = np.concatenate([pairs, more])
     return best._replace(seconds=seconds)
-
-
-def _cone(products: Products) -> np.ndarray:
-    """Which ends of pairs are rows of the cone, left ends first."""
-    cone = products.sign < 0
-    squares = np.isin(products.multiplier, products.multiplier[cone])
-    return np.r_[squares, squares]
 
 
 def _restricted(products: Products, kept: np.ndarray) -> Products:
@@ -237,7 +266,7 @@ def _joint(core: Products, pairs: Any) -> Products:
     )
 
 
-def _joined(program, candidates, found: list[_Result], used: np.ndarray) -> Rounds:
+def _joined(program: Program, candidates: _Candidates, found: list[_Result]) -> Rounds:
     """All facets over the products that any of them has."""
     pairs = np.unique(np.concatenate([result.pairs for result in found]), axis=0)
     number = {tuple(pair): i for i, pair in enumerate(pairs)}
@@ -253,4 +282,4 @@ def _joined(program, candidates, found: list[_Result], used: np.ndarray) -> Roun
         solution.moments[i], solution.seconds[i] = mine.moments[0], result.seconds
     offsets = np.array([result.offset for result in found])
     optimal = np.array([result.optimal for result in found])
-    return Rounds(products, Judged(offsets, optimal, solution), used)
+    return Rounds(products, Judged(offsets, optimal, solution))

@@ -7,9 +7,8 @@ recheck. A tube repeats it, each set being the next one's set of states (equatio
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import partial
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -25,9 +24,9 @@ from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, LocalBounds
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
-from reachjax.successors import Step
+from reachjax.successors import Setting, Step, boxed
 from reachjax.systems import ClosedLoop
-from reachjax.witnesses import Simulations, initial_states, proposed_states, witnesses
+from reachjax.witnesses import Simulations, initial_states
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 """Wraps the iteration over time steps, such as `tqdm.tqdm` or `rich.progress.track`."""
@@ -190,68 +189,48 @@ def reach(
         True
     """
     _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
-    sets: list[AbstractSet] = [X0]
-    certificates: list[AbstractCertificate] = []
-    steps: list[Step] = []
-    numbers = range(horizon)
-    compact = is_concrete(loop, X0) and window != 1
-    simulations = (
-        Simulations(loop, X0, horizon, start, samples, seed) if is_concrete(loop, X0) else None
+    boxed(X0, "X0")
+    fixed = jax.lax.stop_gradient((loop, X0))
+    simulations = None
+    if is_concrete(fixed):
+        simulations = Simulations(*fixed, horizon, start, samples, seed)
+    setting = Setting(
+        loop=loop,
+        start=start,
+        relaxation=relaxation,
+        solver=solver,
+        limit=LARGEST if window is None else None,
+        compact=window != 1 and is_concrete(fixed),
+        simulations=simulations,
     )
+    sets, certificates, steps = [X0], [], []
+    numbers = range(horizon)
     for k in numbers if progress is None else progress(numbers):
-        name = "X0" if k == 0 else f"the certified set at t = {start + k}"
-        attained = None
-        if simulations is not None:
-            attained = partial(_attained, simulations, k + 1)
-        before = tuple(steps) if window is None else tuple(steps[max(0, k + 1 - window) :])
-        limit = LARGEST if window is None else None
-        steps.append(
-            Step(
-                loop,
-                sets[-1],
-                start + k,
-                before,
-                limit,
-                compact,
-                relaxation,
-                solver,
-                name,
-                attained,
-            )
-        )
+        before = steps if window is None else steps[max(0, k + 1 - window) :]
+        steps.append(Step(setting, sets[-1], k, tuple(before)))
         following, certificate = steps[-1].successors(template.at(k + 1))
         sets.append(following)
         certificates.append(certificate)
-    if is_concrete(loop, X0, certificates):
-        certificates = _with_witnesses(certificates, sets, loop, start, window, samples, seed)
+    if simulations is not None and is_concrete(certificates):
+        certificates = _with_witnesses(certificates, sets, simulations, steps)
     return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
-
-
-def _attained(simulations, k, direction, state):
-    value, best = simulations.attained(k, direction)
-    return max(
-        value, simulations.climbed(k, direction, best), simulations.climbed(k, direction, state)
-    )
 
 
 def _with_witnesses(
     certificates: list[AbstractCertificate],
     sets: list[AbstractSet],
-    loop,
-    start,
-    window,
-    samples,
-    seed,
+    simulations: Simulations,
+    steps: list[Step],
 ) -> list[AbstractCertificate]:
     """Simulate what the certificates bound, from the initial set."""
-    states = initial_states(sets[0], samples, seed)
-    from_start = [np.asarray(each.moments) for each in certificates[:window]]
-    proposed = [proposed_states(sets[0], moments) for moments in from_start]
-    states = jnp.concatenate([states, *proposed])
-    found = witnesses(loop, states, sets[1:], start)
+    for k, certificate in enumerate(certificates, start=1):
+        if len(steps[k - 1].window) == k:
+            states = np.asarray(certificate.moments)[:, : sets[0].dimension, -1]
+            simulations.climb(k, sets[k], np.arange(len(states)), states)
+    found = [simulations.attained(k, sets[k]) for k in range(1, len(sets))]
     return [
-        certificate.replace(witnesses=values, witness_states=origins)
-        for certificate, (values, origins) in zip(certificates, found, strict=True)
+        certificate.replace(witnesses=values, witness_states=states)
+        for certificate, (values, states) in zip(certificates, found, strict=True)
     ]
 
 
@@ -286,7 +265,7 @@ def _check(
     whole_number("seed", seed, 0)
     if window is not None:
         whole_number("window", window, 1)
-    elif not is_concrete(loop, X0):
+    elif not is_concrete(jax.lax.stop_gradient((loop, X0))):
         raise ValueError(
             "window=None is chosen from numbers: inside jax.jit, vmap or scan give a number, such "
             "as window=1"

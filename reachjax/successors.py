@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable
+from functools import cached_property, partial
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +33,7 @@ from reachjax.sets import (
 )
 from reachjax.solvers import (
     AbstractSolver,
+    CentralPath,
     bounding_box,
     enveloped,
     proved_ellipsoid,
@@ -45,36 +45,64 @@ from reachjax.solvers import (
 )
 from reachjax.systems import ClosedLoop
 from reachjax.windows import Window
+from reachjax.witnesses import Simulations
+
+
+def boxed(X: AbstractSet, name: str) -> Box:
+    """A box around a set; one that is too large for numbers may seem empty or unbounded.
+
+    Raises:
+        ValueError: the set, which the error calls by this name, is empty or unbounded.
+    """
+    try:
+        return bounding_box(X)
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} cannot be used: {error}") from None
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What all steps of a tube have in common.
+
+    Attributes:
+        loop: the closed loop.
+        start: the time of the initial set.
+        relaxation: which products of facts are used.
+        solver: what solves the semidefinite programs.
+        limit: how many columns a window of more than one step may have; None if any number.
+        compact: whether units that are affine take no columns of the basis.
+        simulations: trajectories from the initial set; None where numbers are traced.
+    """
+
+    loop: ClosedLoop
+    start: int
+    relaxation: AbstractRelaxation
+    solver: AbstractSolver
+    limit: int | None
+    compact: bool
+    simulations: Simulations | None
 
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """One step of the loop, and how it is relaxed and solved.
+    """One step of the loop.
 
     Attributes:
-        loop: the closed loop.
+        setting: the tube's.
         X: the set of states.
-        t: the time.
+        k: how many steps after the initial set.
         before: the steps that its window reaches back over, if it may have as many.
-        limit: how many columns a window of more than one step may have; None if any number.
-        compact: whether units that are affine take no columns of the basis.
-        attained: what simulations from the window's first set attain, of a direction after this
-            step, one of them beginning at a given state; None if that is not known.
-        relaxation: which products of facts are used.
-        solver: what solves the semidefinite programs.
-        name: what errors call the set.
     """
 
-    loop: ClosedLoop
+    setting: Setting
     X: AbstractSet
-    t: int
+    k: int
     before: tuple[Step, ...]
-    limit: int | None
-    compact: bool
-    relaxation: AbstractRelaxation
-    solver: AbstractSolver
-    name: str
-    attained: Callable[[Array, Array], float] | None = None
+
+    @property
+    def t(self) -> int:
+        """The time of the set of states."""
+        return self.setting.start + self.k
 
     def successors(self, template: AbstractTemplate) -> tuple[AbstractSet, AbstractCertificate]:
         """The smallest set of a template that surely holds the successors, and its proof.
@@ -83,7 +111,7 @@ class Step:
             TypeError: the template is of an unknown kind.
             ValueError: the set of states is empty or unbounded, or states overflow.
         """
-        successor = jnp.eye(self.loop.states)
+        successor = jnp.eye(self.setting.loop.states)
         if isinstance(template, Template):
             return self._polytope(template, self._program(template.directions))
         if isinstance(template, EllipsoidTemplate):
@@ -93,25 +121,22 @@ class Step:
             return self._intersection(template, self._program(directions))
         raise TypeError(f"there is no step for templates of kind {type(template).__name__}")
 
-    @functools.cached_property
+    @cached_property
     def box(self) -> Box:
         """A box around the set; one that is too large for numbers may seem empty or unbounded.
 
         Raises:
             ValueError: the set is empty or unbounded.
         """
-        try:
-            return bounding_box(self.X)
-        except (ValueError, RuntimeError) as error:
-            raise ValueError(f"{self.name} cannot be used: {error}") from None
+        return boxed(self.X, f"the certified set at t = {self.t}" if self.k else "X0")
 
-    @functools.cached_property
+    @cached_property
     def window(self) -> Window:
         """The window that this step ends: the longest one that stays in the limit."""
-        first = 0
+        first, limit = 0, self.setting.limit
         while True:
             window = self._reaching_back(self.before[first:])
-            if self.limit is None or window.taken <= self.limit or len(window) == 1:
+            if limit is None or window.taken <= limit or len(window) == 1:
                 return window
             first += 1
 
@@ -120,21 +145,25 @@ class Step:
         if before and len(before[-1].window) == len(before):
             return self._added_to(before[-1].window)
         first, *others = (*before, self)
+        setting = self.setting
         window = Window.beginning(
-            self.loop, first.X, first.box, first.t, self.relaxation, self.compact
+            setting.loop, first.X, first.box, first.t, setting.relaxation, setting.compact
         )
         for step in (first, *others):
             window = step._added_to(window)
         return window
 
     def _added_to(self, window: Window) -> Window:
-        return window.extended(self.loop, self.X, self.box, self.first_inputs)
+        return window.extended(self.setting.loop, self.X, self.box, self.first_inputs)
 
-    @functools.cached_property
+    @cached_property
     def first_inputs(self) -> Ball | None:
         """The ranges of the first layer's inputs over the set; None where its box says as much."""
-        layers = self.loop.controller.layers
-        if not (self.relaxation.linear_bounds and isinstance(self.X, Polytope)) or len(layers) < 2:
+        layers = self.setting.loop.controller.layers
+        if (
+            not (self.setting.relaxation.linear_bounds and isinstance(self.X, Polytope))
+            or len(layers) < 2
+        ):
             return None
         W, b = layers[0]
         upper, below = support(self.X, W), support(self.X, -W)
@@ -149,14 +178,14 @@ class Step:
 
     def _program(self, directions: Float[Array, "f n_x"]) -> Program:
         """Theorem 1 with these directions of the successor for an objective."""
-        return self.window.program(directions, self.relaxation)
+        return self.window.program(directions, self.setting.relaxation)
 
     def _polytope(self, template: Template, program: Program) -> tuple[Polytope, Certificate]:
         """Problem (sdp::poly): the smallest offset for each facet."""
-        if isinstance(self.relaxation, CuttingPlanes):
+        if isinstance(self.setting.relaxation, CuttingPlanes):
             program, offsets, solution = self._with_cuts(template, program)
         else:
-            offsets, solution = proved_offsets(program, self.solver)
+            offsets, solution = proved_offsets(program, self.setting.solver)
         self._require_finite(offsets)
         certificate = Certificate.from_solution(program, offsets, solution)
         return template.polytope(offsets), certificate
@@ -165,32 +194,52 @@ class Step:
         """Offsets with products added in rounds, and the program with these products."""
         fixed = jax.lax.stop_gradient(program)
         if not is_concrete(fixed):
-            program = with_cuts(program, self.window.layout, self.solver, self.relaxation)
-            return program, *proved_offsets(program, self.solver)
+            program = with_cuts(
+                program, self.window.layout, self.setting.solver, self.setting.relaxation
+            )
+            return program, *proved_offsets(program, self.setting.solver)
         witness = None
-        if self.attained is not None:
-
-            def witness(facet: int, column: np.ndarray) -> float:
-                state = jnp.asarray(column[: self.loop.states])
-                return self.attained(template.directions[facet], state)
-
+        if self.setting.simulations is not None:
+            witness = partial(self._attained, self.setting.simulations, template)
         rounds = solved_in_rounds(
-            jax.device_get(fixed), self.window.layout, self.solver, self.relaxation, witness
+            jax.device_get(fixed),
+            self.window.layout,
+            self.setting.solver.for_rounds,
+            self.setting.relaxation,
+            witness,
         )
         program = program.replace(products=jax.tree.map(jnp.asarray, rounds.products))
+        if isinstance(self.setting.solver, CentralPath):
+            return program, *proved_offsets(program, self.setting.solver)
         return program, *enveloped(program, rounds.judged)
+
+    def _attained(
+        self,
+        simulations: Simulations,
+        template: Template,
+        facet: int,
+        column: Float[np.ndarray, " n"],
+    ) -> float:
+        """What simulations attain of a facet, among them ascents from a proposed initial state."""
+        facets, n = len(template), self.setting.loop.states
+        region = template.polytope(jnp.zeros(facets))
+        starts = simulations.best(self.k + 1, region, facet, facets)
+        if len(self.window) == self.k + 1:
+            starts[-1] = column[:n]
+        simulations.climb(self.k + 1, region, np.full(facets, facet), starts)
+        return float(simulations.attained(self.k + 1, region)[0][facet])
 
     def _ellipsoid(
         self, template: EllipsoidTemplate, program: Program
     ) -> tuple[Ellipsoid, EllipsoidCertificate]:
         """Problem (sdp::ellips): the minimum volume, or the smallest size of a given shape."""
         if template.shape is None:
-            region, enclosure = proved_ellipsoid(program, self.solver)
+            region, enclosure = proved_ellipsoid(program, self.setting.solver)
         else:
             X = self.X
             middle = X.center if isinstance(X, Ellipsoid) else self.box.center
-            given = Ellipsoid(self.loop.step(middle, self.t), template.shape).normal_form
-            region, enclosure = proved_size(program, given, self.solver)
+            given = Ellipsoid(self.setting.loop.step(middle, self.t), template.shape).normal_form
+            region, enclosure = proved_size(program, given, self.setting.solver)
         self._require_finite(region.shape)
         return region, EllipsoidCertificate.from_enclosure(program, region, enclosure)
 

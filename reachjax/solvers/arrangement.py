@@ -103,8 +103,8 @@ def cut(whole: Arrangement) -> Arrangement:
     columns, slots = np.flatnonzero(old.idle == 0), len(old.weight)
     there = old.weight[:, :count] != 0
     used = np.union1d(old.left[:, :count][there], old.right[:, :count][there]).astype(int)
-    m, K = bucket(len(used) + 1, 32), bucket(count + 1, 32)
-    n = bucket(len(columns), 16 if len(columns) <= 32 else 8)
+    m, K = bucket(len(used) + 1, 64), bucket(count + 1, 64)
+    n = bucket(len(columns), 16 if len(columns) <= 64 else 8)
     here = slice(n - len(columns), n)
     rows, number = np.zeros((m, n)), np.full(len(old.rows), m - 1)
     rows[: len(used), here] = old.rows[np.ix_(used, columns)]
@@ -125,11 +125,11 @@ def cut(whole: Arrangement) -> Arrangement:
 
 
 def bucket(size: int, least: int) -> int:
-    """The smallest padded size that holds `size`: multiples of `least`, at most 8 a doubling.
+    """The smallest padded size that holds `size`: multiples of `least`, at most 4 a doubling.
 
     Example:
         >>> [bucket(size, 8) for size in (5, 45, 69, 205, 405)]
-        [8, 48, 72, 208, 416]
+        [8, 48, 80, 224, 448]
     """
-    step = max(least, 2 ** (max(size, 1).bit_length() - 1) // 8)
+    step = max(least, 2 ** (max(size, 1).bit_length() - 1) // 4)
     return -(-size // step) * step

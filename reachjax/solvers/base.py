@@ -153,6 +153,11 @@ class AbstractSolver(abc.ABC):
 
         return on_host(solve, shapes_of(blank), program)
 
+    @property
+    def for_rounds(self) -> AbstractSolver:
+        """What solves programs to which products are added round by round."""
+        return self
+
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
         """Propose the smallest ellipsoid around the successors, and its multipliers.
 

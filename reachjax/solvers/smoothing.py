@@ -29,6 +29,7 @@ from reachjax.solvers.centring import enclosed
 from reachjax.solvers.cotangents import asked_for
 from reachjax.solvers.facet_centres import Centres, facet_centres
 from reachjax.solvers.host import on_host, shapes_of
+from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.primal_dual import DAMPING
 from reachjax.solvers.trimming import squared_sizes
 
@@ -70,6 +71,11 @@ class CentralPath(AbstractSolver):
         require_positive(self)
         if not math.isfinite(self.weight):
             raise ValueError(f"CentralPath.weight must be finite, but {self.weight!r} arrived")
+
+    @property
+    def for_rounds(self) -> AbstractSolver:
+        """One that goes to the end of the path, where products that are missing show."""
+        return InteriorPoint()
 
     def solve(self, program: Program) -> Solution:
         """Propose the multipliers of the centres."""

@@ -1,0 +1,294 @@
+"""Partitions: tubes from the cells of an initial set, whose union holds every state.
+
+Smaller sets leave fewer neurons undecided, so each cell's tube is tighter. Cells are independent
+programs, which any executor may run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.checks import (
+    described,
+    is_concrete,
+    require_double_precision,
+    require_kind,
+    whole_number,
+)
+from reachjax.pytrees import Replaceable, pytree
+from reachjax.reach import SAMPLES, ReachTube, reach
+from reachjax.relaxation import AbstractRelaxation, CuttingPlanes
+from reachjax.sets import (
+    AbstractSet,
+    Box,
+    Ellipsoid,
+    Intersection,
+    PolyhedralSet,
+    Polytope,
+    Template,
+)
+from reachjax.solvers import AbstractSolver, Auto, bounding_box
+from reachjax.systems import ClosedLoop
+
+Bar = Callable[[Iterable[Any]], Iterable[Any]]
+"""Wraps an iteration over cells, such as `tqdm.tqdm`."""
+
+
+@pytree
+class PartitionedTube(Replaceable):
+    """Tubes from cells that cover an initial set: each state is surely in one of them.
+
+    Attributes:
+        X0: the initial set.
+        tubes: one for each cell.
+    """
+
+    X0: AbstractSet
+    tubes: tuple[ReachTube, ...]
+
+    def __repr__(self) -> str:
+        return f"PartitionedTube(cells={len(self.tubes)}, horizon={self.horizon})"
+
+    @property
+    def horizon(self) -> int:
+        """The number of steps."""
+        return self.tubes[0].horizon
+
+    def bounds(self, t: int) -> Float[np.ndarray, " m"]:
+        """What every facet's value at time `t` surely does not exceed: the largest of the cells'.
+
+        Raises:
+            ValueError: there is no certificate for this time.
+        """
+        return np.max([tube.proof(t).bounds for tube in self.tubes], axis=0)
+
+    def witnesses(self, t: int) -> Float[np.ndarray, " m"]:
+        """The largest simulated value of every facet at time `t`.
+
+        Raises:
+            ValueError: there is no certificate for this time.
+        """
+        return np.max([tube.proof(t).witnesses for tube in self.tubes], axis=0)
+
+    def gaps(self, t: int) -> Float[np.ndarray, " m"]:
+        """`bounds - witnesses`: how much tightness may be left in the union's facets.
+
+        Raises:
+            ValueError: there is no certificate for this time.
+        """
+        return self.bounds(t) - self.witnesses(t)
+
+
+def halves(X: AbstractSet, axis: int) -> tuple[AbstractSet, AbstractSet]:
+    """The parts of a set on either side of the middle of its bounding box.
+
+    Raises:
+        TypeError: the set is of an unknown kind.
+
+    Example:
+        >>> [cell.upper.tolist() for cell in halves(Box([0.0, 0.0], [1.0, 2.0]), axis=1)]
+        [[1.0, 1.0], [1.0, 2.0]]
+    """
+    box = bounding_box(X)
+    middle = box.center[axis]
+    below = Box(box.lower, box.upper.at[axis].set(middle))
+    above = Box(box.lower.at[axis].set(middle), box.upper)
+    return _within(X, below), _within(X, above)
+
+
+def _within(X: AbstractSet, box: Box) -> AbstractSet:
+    """The points of a set that lie in a box."""
+    if isinstance(X, Box):
+        return box
+    if isinstance(X, Ellipsoid):
+        return Intersection(box, X)
+    if isinstance(X, Intersection):
+        return X.replace(polytope=_within(X.polytope, box))
+    if isinstance(X, PolyhedralSet):
+        (A, b), (C, d) = X.facets, box.facets
+        return Polytope(jnp.concatenate([A, C]), jnp.concatenate([b, d]))
+    raise TypeError(f"X0 must be a set that can be split, but {described(X)} arrived")
+
+
+def reach_partitioned(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    horizon: int,
+    template: Template,
+    relaxation: AbstractRelaxation = CuttingPlanes(),  # noqa: B008  (immutable)
+    window: int | None = None,
+    solver: AbstractSolver = Auto(),  # noqa: B008
+    *,
+    cells: int | Sequence[int],
+    executor: Executor | None = None,
+    start: int = 0,
+    samples: int = SAMPLES,
+    seed: int = 0,
+    progress: Bar | None = None,
+) -> PartitionedTube:
+    """Tubes from cells of an initial set, which together hold every state.
+
+    Args:
+        loop: the closed loop.
+        X0: the set of initial states.
+        horizon: the number `N` of steps.
+        template: the facets of every set.
+        relaxation: which products of facts are used.
+        window: over how many steps each program reaches back; None: as many as the solver bears.
+        solver: what solves the semidefinite programs.
+        cells: a number for each coordinate: equal parts of the box around the initial set. Or how
+            many in all: then those cells are halved at which the union's gap is widest, until there
+            are as many.
+        executor: runs the cells' programs: any with the interface of `concurrent.futures`; threads
+            by default. Arguments are sent as numpy arrays.
+        start: the time of `X0`, for time-varying loops.
+        samples: how many trajectories are simulated in each cell for witnesses.
+        seed: of the samples.
+        progress: wraps the iteration over tubes to show a progress bar, such as `tqdm.tqdm`.
+
+    Raises:
+        RuntimeError: JAX's 64-bit floats are off.
+        TypeError: an argument is of another kind.
+        ValueError: as `reach`; the arguments are traced, or there is no cell.
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> tube = reach_partitioned(loop, Box([-1.0], [2.0]), 2, Template.box(1), cells=(3,))
+        >>> tube.bounds(2).round(6).tolist()
+        [0.72, 0.36]
+    """
+    require_kind("loop", loop, ClosedLoop, "a ClosedLoop")
+    require_kind("X0", X0, AbstractSet, "a set such as Box(lower, upper)")
+    require_kind("template", template, Template, "a template of facets, such as Template.box(n)")
+    require_double_precision(loop=loop, X0=X0, template=template)
+    if not is_concrete(loop, X0, template):
+        raise ValueError("partitions need numbers: call reach_partitioned outside of jax.jit")
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise TypeError(
+            "executor must have a method submit, as those of concurrent.futures have, but "
+            f"{described(executor)} arrived"
+        )
+    options = {
+        "horizon": horizon,
+        "template": template,
+        "relaxation": relaxation,
+        "window": window,
+        "solver": solver,
+        "start": start,
+        "samples": samples,
+        "seed": seed,
+    }
+    own = ThreadPoolExecutor() if executor is None else None
+    try:
+        run = _Run(loop, options, own or executor, progress)
+        if isinstance(cells, Sequence):
+            tubes = run.tubes(_grid(X0, cells))
+        else:
+            tubes = _guided(run, X0, whole_number("cells", cells, 1))
+    finally:
+        if own is not None:
+            own.shutdown(cancel_futures=True)
+    return PartitionedTube(X0, tuple(tubes))
+
+
+class _Run:
+    """Tubes of one loop, computed by an executor, cell by cell."""
+
+    def __init__(self, loop: ClosedLoop, options: dict, executor: Any, progress: Bar | None):
+        self._loop, self._options = loop, options
+        self._executor, self._progress = executor, progress
+
+    def tubes(self, cells: Sequence[AbstractSet]) -> list[ReachTube]:
+        """One for each cell, in their order; the first error ends the run."""
+        arrays = [jax.device_get((self._loop, cell, self._options["template"])) for cell in cells]
+        others = {name: value for name, value in self._options.items() if name != "template"}
+        futures = [self._executor.submit(_tube, *each, others) for each in arrays]
+        try:
+            done = _results(futures)
+            for _ in done if self._progress is None else self._progress(done):
+                pass
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise
+        return [jax.tree.map(jnp.asarray, future.result()) for future in futures]
+
+
+def _results(futures: list[Future]) -> Iterator[Any]:
+    """Each result as it comes."""
+    for future in as_completed(futures):
+        yield future.result()
+
+
+def _tube(loop: ClosedLoop, cell: AbstractSet, template: Template, options: dict) -> ReachTube:
+    """One cell's tube, from numpy arrays to numpy arrays, wherever it runs."""
+    with jax.enable_x64(True):
+        given = jax.tree.map(jnp.asarray, (loop, cell, template))
+        loop, cell, template = given
+        return jax.device_get(reach(loop, cell, template=template, **options))
+
+
+def _grid(X0: AbstractSet, counts: Sequence[int]) -> list[AbstractSet]:
+    """Equal parts of the box around a set, those that the set reaches."""
+    if len(counts) != X0.dimension:
+        raise ValueError(
+            f"cells must be a number for each of {X0.dimension} coordinates, but {counts} arrived"
+        )
+    box, ends = bounding_box(X0), []
+    for i, count in enumerate(counts):
+        parts = whole_number(f"cells[{i}]", count, 1) + 1
+        ends.append(np.linspace(box.lower[i], box.upper[i], parts))
+    cells = []
+    for index in np.ndindex(*counts):
+        lower = [end[i] for end, i in zip(ends, index, strict=True)]
+        upper = [end[i + 1] for end, i in zip(ends, index, strict=True)]
+        cells.append(_within(X0, Box(lower, upper)))
+    return [cell for cell in cells if not _is_empty(cell)]
+
+
+def _is_empty(X: AbstractSet) -> bool:
+    """Whether a cell holds no point of the set that was cut."""
+    if isinstance(X, Box):
+        return False
+    try:
+        bounding_box(X)
+    except ValueError:
+        return True
+    return False
+
+
+def _guided(run: _Run, X0: AbstractSet, count: int) -> list[ReachTube]:
+    """Halve the cells at which the union's gap is widest, along their widest coordinate."""
+    widths = np.asarray(bounding_box(X0).widths)
+    scale = np.where(widths > 0, widths, np.inf)
+    tubes = run.tubes([X0])
+    while len(tubes) < count:
+        worst = _worst(tubes, min(math.ceil(len(tubes) / 4), count - len(tubes)))
+        split = []
+        for i in worst:
+            cell = tubes[i].sets[0]
+            axis = int(np.argmax(np.asarray(bounding_box(cell).widths) / scale))
+            split += [part for part in halves(cell, axis) if not _is_empty(part)]
+        kept = [tube for i, tube in enumerate(tubes) if i not in worst]
+        tubes = kept + run.tubes(split)
+    return tubes
+
+
+def _worst(tubes: list[ReachTube], count: int) -> list[int]:
+    """The cells whose bounds leave the widest gaps in the union, in units of each set's width."""
+    steps = range(1, tubes[0].horizon + 1)
+    bounds = np.array([[tube.proof(t).bounds for t in steps] for tube in tubes])
+    witnesses = np.array([[tube.proof(t).witnesses for t in steps] for tube in tubes]).max(axis=0)
+    extent = np.ptp(np.concatenate([bounds.max(axis=0), witnesses], axis=1), axis=1)
+    beyond = (bounds - witnesses) / np.maximum(extent, 1e-300)[:, None]
+    return np.argsort(-beyond.max(axis=(1, 2)), stable=True)[:count].tolist()

@@ -19,6 +19,9 @@ from reachjax.systems import ClosedLoop
 MOST_DIMENSIONS = 12
 """Corners are listed up to this dimension (a box has 4096 of them there)."""
 
+BLOCK = 1024
+"""Trajectories are evaluated in multiples of so many, for which code is compiled once."""
+
 PULL = 1 - 1e-12
 """How far a rounded point is brought towards the middle of the set."""
 
@@ -102,17 +105,22 @@ class Simulations:
         self._states = np.concatenate([self._states, np.asarray(found)[inside]])
         self._trajectories = np.concatenate([self._trajectories, np.asarray(trajectories)[inside]])
 
+    def _values(self, k: int, region: AbstractSet) -> Float[np.ndarray, "c m"]:
+        """What a set bounds, at each trajectory after `k` steps."""
+        points = self._trajectories[:, k]
+        padded = np.resize(points, (-(-len(points) // BLOCK) * BLOCK, points.shape[1]))
+        return np.asarray(region.bounded_values(padded))[: len(points)]
+
     def attained(
         self, k: int, region: AbstractSet
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n_x"]]:
         """The largest values `(m,)` of what a set bounds, after `k` steps, and initial states."""
-        values = np.asarray(region.bounded_values(self._trajectories[:, k]))
+        values = self._values(k, region)
         return values.max(axis=0), self._states[values.argmax(axis=0)]
 
     def best(
         self, k: int, region: AbstractSet, which: int, count: int
     ) -> Float[np.ndarray, "count n_x"]:
         """The initial states of the largest values of one of the things that a set bounds."""
-        values = np.asarray(region.bounded_values(self._trajectories[:, k]))[:, which]
-        order = np.argsort(-values, stable=True)
+        order = np.argsort(-self._values(k, region)[:, which], stable=True)
         return self._states[np.resize(order[:count], count)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import itertools
 from typing import Protocol, Self
 
 import jax
@@ -13,9 +12,13 @@ from jaxtyping import Array, Float
 
 from reachjax.checks import Numbers, is_concrete, require_kind, same_size, whole_number
 from reachjax.pytrees import Replaceable, converted, pytree
-from reachjax.sets.base import AbstractSet
+from reachjax.sets import fit
+from reachjax.sets.base import AbstractSet, PolyhedralSet
 from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polytope import Polytope
+
+MOST_DIMENSIONS = 12
+"""Corners of the initial set are simulated up to this dimension."""
 
 
 class Simulated(Protocol):
@@ -122,19 +125,13 @@ class Template(AbstractTemplate):
     def box(cls, dimension: int) -> Template:
         """`+-x_i`: axis-aligned boxes, `2 n` facets."""
         whole_number("dimension", dimension, 1)
-        return cls(_signed(np.eye(dimension)))
+        return cls(fit.signed(np.eye(dimension)))
 
     @classmethod
     def octagonal(cls, dimension: int) -> Template:
         """`+-x_i` and `+-x_i +- x_j`: `2 n^2` facets; in two dimensions the paper's eight."""
         whole_number("dimension", dimension, 1)
-        eye = np.eye(dimension)
-        pairs = [
-            row
-            for i, j in itertools.combinations(range(dimension), 2)
-            for row in (eye[i] - eye[j], eye[i] + eye[j])
-        ]
-        return cls(_signed(np.array([*eye, *pairs])))
+        return cls(fit.octagonal(dimension))
 
     @classmethod
     def regular(cls, facets: int) -> Template:
@@ -144,7 +141,7 @@ class Template(AbstractTemplate):
             ValueError: fewer than three facets, which bound no set.
         """
         whole_number("facets", facets, 3)
-        return cls(_plane(facets))
+        return cls(fit.plane(facets))
 
     @classmethod
     def adapted(
@@ -160,9 +157,9 @@ class Template(AbstractTemplate):
     ) -> Template:
         """Directions that fit the simulated states of each step.
 
-        States are whitened by the root of their covariance. In the plane the normals are at equal
-        angles there; in more dimensions they are the principal axes, then sums and differences of
-        two of them, the widest first.
+        In the plane they are normals of edges of the states' convex hull, those without which a
+        polygon around it would be largest. In more dimensions they are the states' principal axes,
+        then sums and differences of two of them, axes being scaled to unit spread.
 
         Args:
             loop: the closed loop.
@@ -186,9 +183,11 @@ class Template(AbstractTemplate):
         n = X0.dimension
         count = whole_number("facets", facets, 3 if n == 2 else 2 * n)
         states = X0.sample(jax.random.key(seed), whole_number("samples", samples, n + 1))
+        if isinstance(X0, PolyhedralSet) and n <= MOST_DIMENSIONS:
+            states = jnp.concatenate([states, X0.vertices()])
         trajectories = np.asarray(loop.simulate(states, horizon, start))
-        given = _plane(count) if n == 2 else _principal(n, count)
-        return cls(np.stack([_fitting(trajectories[:, k], given) for k in range(1, horizon + 1)]))
+        fitting = fit.edges if n == 2 else fit.axes
+        return cls(np.stack([fitting(trajectories[:, k], count) for k in range(1, horizon + 1)]))
 
 
 @pytree
@@ -283,37 +282,3 @@ class MixedTemplate(AbstractTemplate):
     def summary(self) -> str:
         """What both parts say."""
         return f"{self.facets.summary}, {self.ellipsoid.summary}"
-
-
-FLAT = 1e-6
-"""States are taken to vary by at least this part of their widest spread in every direction."""
-
-
-def _fitting(states: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Directions of unit length, given in principal axes of unit spread, the widest first."""
-    centered = states - states.mean(axis=0)
-    _, spreads, axes = np.linalg.svd(centered, full_matrices=False)
-    widths = np.maximum(spreads, FLAT * spreads[0]) if spreads[0] > 0 else np.ones(len(axes))
-    rows = (directions / widths) @ axes
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
-
-
-def _plane(facets: int) -> np.ndarray:
-    """Unit vectors at equal angles."""
-    angles = 2 * np.pi * np.arange(facets) / facets
-    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-
-def _principal(n: int, facets: int) -> np.ndarray:
-    """Axes, then sums and differences of two of them, as many as are asked for."""
-    rows = Template.octagonal(n).directions
-    if facets % 2 or facets > len(rows):
-        raise ValueError(
-            f"facets must be an even number of {2 * n} to {len(rows)}, but {facets} arrived"
-        )
-    return np.asarray(rows[:facets])
-
-
-def _signed(rows: np.ndarray) -> np.ndarray:
-    """Each row followed by its negative."""
-    return np.stack([rows, 0.0 - rows], axis=1).reshape(-1, rows.shape[1])  # 0, not -0

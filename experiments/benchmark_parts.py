@@ -19,10 +19,10 @@ import pytest
 import reachjax as rj
 from experiments.benchmark_cases import random_case
 from reachjax.bounds import loop_bounds
-from reachjax.windows import step_program
 from reachjax.solvers import accepted_offsets
 from reachjax.solvers.arrangement import arranged, cut
 from reachjax.solvers.trimming import trimmed
+from reachjax.windows import step_program
 
 jax.config.update("jax_enable_x64", True)
 

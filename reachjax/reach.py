@@ -24,7 +24,8 @@ from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, LocalBounds
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
-from reachjax.successors import Setting, Step, boxed
+from reachjax.steps import Setting, Step, boxed
+from reachjax.successors import successors
 from reachjax.systems import ClosedLoop
 from reachjax.witnesses import Simulations, initial_states
 
@@ -208,7 +209,7 @@ def reach(
     for k in numbers if progress is None else progress(numbers):
         before = steps if window is None else steps[max(0, k + 1 - window) :]
         steps.append(Step(setting, sets[-1], k, tuple(before)))
-        following, certificate = steps[-1].successors(template.at(k + 1))
+        following, certificate = successors(steps[-1], template.at(k + 1))
         sets.append(following)
         certificates.append(certificate)
     if simulations is not None and is_concrete(certificates):

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.checks import real_number, whole_number
-from reachjax.pytrees import pytree
+from reachjax.pytrees import Replaceable, pytree
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +98,7 @@ class FactLayout:
 
 
 @pytree
-class Products:
+class Products(Replaceable):
     """Pairs of facts and the multiplier that weighs each.
 
     Attributes:

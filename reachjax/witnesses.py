@@ -77,8 +77,9 @@ class Simulations:
     ):
         self._loop, self._X0, self._start, self._horizon = loop, X0, start, horizon
         self._box = X0.bounding_box()
-        self._states = np.asarray(initial_states(X0, samples, seed))
-        self._trajectories = np.asarray(loop.simulate(self._states, horizon, start))
+        states = initial_states(X0, samples, seed)
+        self._states = np.asarray(states)
+        self._trajectories = np.asarray(loop.simulate(states, horizon, start))
 
     def climb(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -38,7 +39,16 @@ class MixedCertificate(AbstractCertificate):
     def joining(
         cls, program: Program, facets: Certificate, ellipsoid: EllipsoidCertificate
     ) -> MixedCertificate:
-        """The proofs of both parts as one; the program is that of all objective rows."""
+        """The proofs of both parts as one.
+
+        Args:
+            program: that of all objective rows; where the parts have other products than its own,
+                it gets theirs, the facets' first.
+            facets: the proof of the facets.
+            ellipsoid: that of the ellipsoid.
+        """
+        if facets.program.products is not ellipsoid.program.products:
+            program, facets, ellipsoid = _with_all_products(program, facets, ellipsoid)
         stacked: dict[str, Any] = {
             name: jnp.concatenate([getattr(facets, name), getattr(ellipsoid, name)])
             for name in STACKED
@@ -87,3 +97,18 @@ class MixedCertificate(AbstractCertificate):
         proposed, m = self._proposed(multipliers), len(self.solver_offsets)
         facets, ellipsoid = self.parts
         return np.concatenate([facets.recheck(proposed[:m]), ellipsoid.recheck(proposed[m:])])
+
+
+def _with_all_products(
+    program: Program, facets: Certificate, ellipsoid: EllipsoidCertificate
+) -> tuple[Program, Certificate, EllipsoidCertificate]:
+    """The program with the products of both parts, and the parts with multipliers for all."""
+    first, second = facets.program.products, ellipsoid.program.products
+    counts = len(first.free), len(second.free)
+    moved = second.replace(multiplier=counts[0] + second.multiplier)
+    products = jax.tree.map(lambda *part: jnp.concatenate(part), first, moved)
+    return (
+        program.replace(facts=facets.program.facts, products=products),
+        facets.replace(multipliers=jnp.pad(facets.multipliers, ((0, 0), (0, counts[1])))),
+        ellipsoid.replace(multipliers=jnp.pad(ellipsoid.multipliers, ((0, 0), (counts[0], 0)))),
+    )

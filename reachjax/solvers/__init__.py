@@ -3,8 +3,8 @@
 from reachjax.solvers.accepted import accepted_enclosure, accepted_offsets
 from reachjax.solvers.auto import Auto
 from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, SolverStatus
-from reachjax.solvers.cutting_planes import solved_in_rounds, with_cuts
-from reachjax.solvers.differentiable import enveloped, proved_offsets
+from reachjax.solvers.cutting_planes import proved_with_cuts, with_cuts_around
+from reachjax.solvers.differentiable import proved_offsets
 from reachjax.solvers.enclosures import proved_ellipsoid, proved_size
 from reachjax.solvers.geometry import bounding_box, polytope_volume, separation, support
 from reachjax.solvers.interior_point import InteriorPoint
@@ -25,13 +25,12 @@ __all__ = [
     "accepted_enclosure",
     "accepted_offsets",
     "bounding_box",
-    "enveloped",
     "polytope_volume",
     "proved_ellipsoid",
     "proved_offsets",
     "proved_size",
+    "proved_with_cuts",
     "separation",
-    "solved_in_rounds",
     "support",
-    "with_cuts",
+    "with_cuts_around",
 ]

@@ -49,8 +49,8 @@ class Judged(NamedTuple):
         solution: what the solver proposed.
     """
 
-    offsets: Float[Array, " f"]
-    optimal: Bool[Array, " f"]
+    offsets: Float[Array | np.ndarray, " f"]
+    optimal: Bool[Array | np.ndarray, " f"]
     solution: Solution
 
 
@@ -68,8 +68,8 @@ def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Arra
     solution = solver.propose(fixed)
     offsets = jax.ShapeDtypeStruct(solution.offsets.shape, float)
     optimal = jax.ShapeDtypeStruct(solution.offsets.shape, bool)
-    judged = on_host(_judged, (offsets, optimal), (fixed, solution))
-    return enveloped(program, Judged(*judged, solution))
+    proved, optimal = on_host(_judged, (offsets, optimal), (fixed, solution))
+    return enveloped(program, Judged(proved, optimal, solution))
 
 
 def enveloped(program: Program, judged: Judged) -> tuple[Float[Array, " f"], Solution]:

@@ -1,0 +1,111 @@
+"""Which products of a program's facts may be added to it, and which of them a moment violates."""
+
+from __future__ import annotations
+
+import itertools
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from reachjax.lmi import Program
+from reachjax.relaxation import FactLayout, LocalBounds, Products
+from reachjax.solvers.trimming import namespace, trimmed
+
+VIOLATED = 1e-6
+"""Products more negative than this are, rows of facts and the basis being of unit size."""
+
+NONE = np.zeros((0, 2), dtype=int)
+"""No pairs."""
+
+
+class Candidates:
+    """The facts of a program that say something, and which of their products may be added.
+
+    To begin with there are the products of the first set's facets and of the units that switch.
+    What else `LocalBounds` has may be added like any other product.
+    """
+
+    def __init__(self, program: Program, layout: FactLayout):
+        given, products = trimmed(program), program.products
+        norms = np.sqrt((given.facts**2).sum(axis=1))
+        linear = np.arange(len(norms)) < len(layout.linear)
+        self.live = np.flatnonzero((norms > 0) & np.isfinite(norms) & linear)
+        self.rows = given.facts[self.live] / norms[self.live, None]
+        self.place = np.full(len(norms), -1)
+        self.place[self.live] = np.arange(len(self.live))
+        self.core = restricted(products, given.kept & _of_facts(products, _first(program, layout)))
+        self.open = np.triu(np.ones((len(self.live),) * 2, dtype=bool), 1)
+        self.open[self._entries(np.stack([self.core.left, self.core.right], axis=1))] = False
+        self.layout = layout
+
+    @cached_property
+    def promised(self) -> Bool[np.ndarray, "m m"]:
+        """What `LocalBounds` has beyond the products to begin with."""
+        groups, _ = LocalBounds(repeated=False).groups(self.layout)
+        pairs = np.array(list(itertools.chain(*groups)), dtype=int).reshape(-1, 2)
+        there = np.zeros_like(self.open)
+        there[self._entries(pairs)] = True
+        crossed = (
+            self.place[np.array(kind, dtype=int)]
+            for kind in (self.layout.output, self.layout.slack)
+        )
+        z, r = (places[places >= 0] for places in crossed)
+        there[np.ix_(z, r)] = there[np.ix_(r, z)] = True
+        return there & self.open
+
+    def _entries(self, pairs: Int[np.ndarray, "p 2"]) -> tuple[np.ndarray, np.ndarray]:
+        """Where these pairs stand, those of facts that say something."""
+        left, right = np.sort(self.place[pairs], axis=1).T
+        return left[left >= 0], right[left >= 0]
+
+    def violated(
+        self, moment: Float[np.ndarray, "n n"], pairs: Int[np.ndarray, "p 2"], batch: int | None
+    ) -> Int[np.ndarray, "q 2"]:
+        """The most violated pairs that are not there yet; None for all that `LocalBounds` has."""
+        allowed = (self.promised if batch is None else self.open).copy()
+        allowed[self._entries(pairs)] = False
+        values = np.where(allowed, self.rows @ moment @ self.rows.T, 0.0)
+        count = int((values < -VIOLATED).sum())
+        count = count if batch is None else min(batch, count)
+        if not count:
+            return NONE
+        worst = np.argpartition(values, count - 1, axis=None)[:count]
+        return self.live[np.stack(np.unravel_index(worst, values.shape), axis=1)]
+
+
+def _first(program: Program, layout: FactLayout) -> Bool[np.ndarray, " m"]:
+    """The facts whose products a program begins with."""
+    there = (program.facts.mid != 0).any(axis=1)
+    first = np.zeros(len(there), dtype=bool)
+    first[[0, *layout.set_facets[0], *layout.cone_rows]] = True
+    switching = there[list(layout.output)] & there[list(layout.slack)]
+    for kind in (layout.output, layout.slack, layout.output_cap, layout.slack_cap):
+        first[np.array(kind, dtype=int)[switching]] = True
+    return first
+
+
+def _of_facts(products: Products, facts: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " K"]:
+    """Which multipliers weigh products of these facts alone."""
+    other = ~(facts[products.left] & facts[products.right])
+    return np.bincount(products.multiplier, other, len(products.free)) == 0
+
+
+def restricted(products: Products, kept: np.ndarray) -> Products:
+    """The products of these multipliers."""
+    number, there = np.cumsum(kept) - 1, kept[products.multiplier]
+    left, right, sign = (part[there] for part in (products.left, products.right, products.sign))
+    return Products(left, right, sign, number[products.multiplier[there]], products.free[kept])
+
+
+def joint(core: Products, pairs: Any) -> Products:
+    """Products and pairs of a multiplier each."""
+    xp, count, more = namespace(pairs), len(core.free), len(pairs)
+    return Products(
+        left=xp.concatenate([core.left, pairs[:, 0]]),
+        right=xp.concatenate([core.right, pairs[:, 1]]),
+        sign=xp.concatenate([core.sign, xp.ones(more)]),
+        multiplier=xp.concatenate([core.multiplier, count + xp.arange(more)]),
+        free=xp.concatenate([core.free, xp.zeros(more, dtype=bool)]),
+    )

@@ -1,0 +1,187 @@
+"""Products added round by round, on the host: solve, see what the moments violate, solve again.
+
+Each facet has its own products: those whose multipliers are at zero are dropped before the next.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from reachjax.lmi import Program
+from reachjax.recheck import interval_offsets
+from reachjax.relaxation import CuttingPlanes, FactLayout, Products
+from reachjax.sets import NormalForm
+from reachjax.solvers.accepted import accepted_offsets
+from reachjax.solvers.base import AbstractSolver, Solution
+from reachjax.solvers.candidates import NONE, Candidates, joint
+from reachjax.solvers.differentiable import Judged
+
+IDLE = 1e-7
+"""Multipliers below this part of the largest are at zero."""
+
+Witness = Callable[[int, Float[np.ndarray, " n"]], float]
+"""The value of a facet that a simulation attains, given its number and a moment's last column."""
+
+
+class Rounds(NamedTuple):
+    """What the rounds of all facets ended with.
+
+    Attributes:
+        products: every facet's.
+        judged: what was proposed, multipliers being those of `products`, and proved; a facet's
+            offset is optimal with its own products.
+    """
+
+    products: Products
+    judged: Judged
+
+
+def solved_in_rounds(
+    program: Program,
+    layout: FactLayout,
+    solver: AbstractSolver,
+    cuts: CuttingPlanes,
+    witness: Witness | None = None,
+) -> Rounds:
+    """Solve for every facet, products being added as they are needed.
+
+    Args:
+        program: whose leaves are numpy arrays, with the products of `cuts`.
+        layout: of its facts.
+        solver: of the programs of each round.
+        cuts: how many rounds, and of how many products.
+        witness: what simulations attain; rounds do not stop for them if it is None.
+    """
+    candidates = Candidates(program, layout)
+    found, used = [], NONE
+    for facet in range(len(program.objective.mid)):
+        one = program.seeking(slice(facet, facet + 1))
+        attained = None if witness is None else partial(witness, facet)
+        found.append(_facet(one, candidates, solver, cuts, attained, used))
+        used = found[-1].of_use
+    return _joined(program, candidates, found)
+
+
+def products_around(
+    program: Program,
+    layout: FactLayout,
+    solver: AbstractSolver,
+    cuts: CuttingPlanes,
+    form: NormalForm | None = None,
+) -> Products:
+    """The products of the smallest ellipsoid, found round by round.
+
+    Args:
+        program: whose leaves are numpy arrays, with the products of `cuts`.
+        layout: of its facts.
+        solver: of the programs of each round.
+        cuts: how many rounds, and of how many products.
+        form: the ellipsoid up to a factor on `A` and `b`; free if it is None.
+    """
+    candidates, n = Candidates(program, layout), len(program.transform)
+
+    def solve(pairs: np.ndarray) -> np.ndarray:
+        given = program.replace(products=joint(candidates.core, pairs))
+        moments = np.asarray(solver.enclose(given, form).moments)
+        return moments[:n, :n] / moments[n - 1, n - 1]
+
+    return joint(candidates.core, _in_rounds(candidates, cuts, NONE, solve))
+
+
+class _Result(NamedTuple):
+    """One facet's best round: the products added, and what was proved with them."""
+
+    pairs: Int[np.ndarray, "p 2"]
+    offset: float
+    optimal: bool
+    solution: Solution
+
+    @property
+    def of_use(self) -> Int[np.ndarray, "q 2"]:
+        """The added products whose multipliers are not at zero."""
+        weights = np.asarray(self.solution.multipliers[0])
+        added = weights[len(weights) - len(self.pairs) :]
+        return self.pairs[added > IDLE * max(1e-300, abs(weights).max(initial=0.0))]
+
+
+def _in_rounds(
+    candidates: Candidates,
+    cuts: CuttingPlanes,
+    pairs: Int[np.ndarray, "p 2"],
+    solve: Callable[[Int[np.ndarray, "q 2"]], Float[np.ndarray, "n n"] | None],
+) -> Int[np.ndarray, "q 2"]:
+    """Solve and add what is violated, by turns; returns what was added.
+
+    When the rounds have run out, the products of `LocalBounds` that are violated are added all the
+    same, until none is: no bound is looser than its.
+
+    Args:
+        candidates: what may be added.
+        cuts: how many rounds, and of how many products.
+        pairs: what is added from the beginning.
+        solve: the moments with these products added; None when that is enough.
+    """
+    for number in itertools.count():
+        moment = solve(pairs)
+        if moment is None or not np.isfinite(moment).all():
+            break
+        more = candidates.violated(moment, pairs, cuts.batch if number < cuts.rounds else None)
+        if not len(more):
+            break
+        pairs = np.concatenate([pairs, more])
+    return pairs
+
+
+def _facet(
+    program: Program,
+    candidates: Candidates,
+    solver: AbstractSolver,
+    cuts: CuttingPlanes,
+    attained: Callable[[Float[np.ndarray, " n"]], float] | None,
+    pairs: Int[np.ndarray, "p 2"],
+) -> _Result:
+    """The rounds of one facet."""
+    size = float(interval_offsets(program)[0] - program.objective.mid[0, -1])
+    results: list[_Result] = []
+
+    def solve(pairs: np.ndarray) -> np.ndarray | None:
+        given = program.replace(products=joint(candidates.core, pairs))
+        solution = solver.solve(given)
+        (offset,), (optimal,) = accepted_offsets(given, solution)
+        results.append(_Result(pairs, float(offset), bool(optimal), solution))
+        moment = np.asarray(solution.moments[0])
+        if attained is not None:
+            least = min(result.offset for result in results)
+            if least - attained(program.transform @ moment[:, -1]) <= cuts.gap * size:
+                return None
+        return moment
+
+    _in_rounds(candidates, cuts, pairs, solve)
+    best = min(reversed(results), key=lambda result: result.offset)
+    seconds = np.sum([result.solution.seconds for result in results], axis=0)
+    return best._replace(solution=best.solution._replace(seconds=seconds))
+
+
+def _joined(program: Program, candidates: Candidates, found: list[_Result]) -> Rounds:
+    """All facets over the products that any of them has."""
+    pairs = np.unique(np.concatenate([result.pairs for result in found]), axis=0)
+    number = {tuple(pair): i for i, pair in enumerate(pairs)}
+    products, core = joint(candidates.core, pairs), len(candidates.core.free)
+    size = len(program.transform)
+    solution = Solution.blank(len(found), len(products.free), size)
+    for i, result in enumerate(found):
+        mine = result.solution
+        places = np.array([number[tuple(pair)] for pair in result.pairs], dtype=int)
+        solution.multipliers[i, :core] = mine.multipliers[0, :core]
+        solution.multipliers[i, core + places] = mine.multipliers[0, core:]
+        solution.offsets[i], solution.statuses[i] = mine.offsets[0], mine.statuses[0]
+        solution.moments[i], solution.seconds[i] = mine.moments[0], mine.seconds[0]
+    offsets = np.array([result.offset for result in found])
+    optimal = np.array([result.optimal for result in found])
+    return Rounds(products, Judged(offsets, optimal, solution))

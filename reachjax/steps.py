@@ -1,0 +1,144 @@
+"""One step of the loop: its set of states, and the window of earlier steps that it ends."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.lmi import Program
+from reachjax.relaxation import AbstractRelaxation
+from reachjax.rounding import Ball
+from reachjax.sets import AbstractSet, Box, Polytope, Template
+from reachjax.solvers import AbstractSolver, bounding_box, support
+from reachjax.systems import ClosedLoop
+from reachjax.windows import Window
+from reachjax.witnesses import Simulations
+
+
+def boxed(X: AbstractSet, name: str) -> Box:
+    """A box around a set; one that is too large for numbers may seem empty or unbounded.
+
+    Raises:
+        ValueError: the set, which the error calls by this name, is empty or unbounded.
+    """
+    try:
+        return bounding_box(X)
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} cannot be used: {error}") from None
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What all steps of a tube have in common.
+
+    Attributes:
+        loop: the closed loop.
+        start: the time of the initial set.
+        relaxation: which products of facts are used.
+        solver: what solves the semidefinite programs.
+        limit: how many columns a window of more than one step may have; None if any number.
+        compact: whether units that are affine take no columns of the basis.
+        simulations: trajectories from the initial set; None where numbers are traced.
+    """
+
+    loop: ClosedLoop
+    start: int
+    relaxation: AbstractRelaxation
+    solver: AbstractSolver
+    limit: int | None
+    compact: bool
+    simulations: Simulations | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One step of the loop.
+
+    Attributes:
+        setting: the tube's.
+        X: the set of states.
+        k: how many steps after the initial set.
+        before: the steps that its window reaches back over, if it may have as many.
+    """
+
+    setting: Setting
+    X: AbstractSet
+    k: int
+    before: tuple[Step, ...]
+
+    @property
+    def t(self) -> int:
+        """The time of the set of states."""
+        return self.setting.start + self.k
+
+    @cached_property
+    def box(self) -> Box:
+        """A box around the set; one that is too large for numbers may seem empty or unbounded.
+
+        Raises:
+            ValueError: the set is empty or unbounded.
+        """
+        return boxed(self.X, f"the certified set at t = {self.t}" if self.k else "X0")
+
+    @cached_property
+    def window(self) -> Window:
+        """The window that this step ends: the longest one that stays in the limit."""
+        first, limit = 0, self.setting.limit
+        while True:
+            window = self._reaching_back(self.before[first:])
+            if limit is None or window.taken <= limit or len(window) == 1:
+                return window
+            first += 1
+
+    def _reaching_back(self, before: tuple[Step, ...]) -> Window:
+        """The window over these steps and this one."""
+        if before and len(before[-1].window) == len(before):
+            return self._added_to(before[-1].window)
+        first, *others = (*before, self)
+        setting = self.setting
+        window = Window.beginning(
+            setting.loop, first.X, first.box, first.t, setting.relaxation, setting.compact
+        )
+        for step in (first, *others):
+            window = step._added_to(window)
+        return window
+
+    def _added_to(self, window: Window) -> Window:
+        return window.extended(self.setting.loop, self.X, self.box, self.first_inputs)
+
+    @cached_property
+    def first_inputs(self) -> Ball | None:
+        """The ranges of the first layer's inputs over the set; None where its box says as much."""
+        layers = self.setting.loop.controller.layers
+        if (
+            not (self.setting.relaxation.linear_bounds and isinstance(self.X, Polytope))
+            or len(layers) < 2
+        ):
+            return None
+        W, b = layers[0]
+        upper, below = support(self.X, W), support(self.X, -W)
+        return Ball.between(-below, jnp.maximum(-below, upper)) + b
+
+    def program(self, directions: Float[Array, "f n_x"]) -> Program:
+        """Theorem 1 with these directions of the successor for an objective."""
+        return self.window.program(directions, self.setting.relaxation)
+
+    def attained(self, template: Template, facet: int, column: Float[np.ndarray, " n"]) -> float:
+        """What simulations attain of a facet of the successors.
+
+        Among them are ascents from the best ones and, where the window begins at the initial set,
+        from the state that a moment's last column holds.
+        """
+        simulations = self.setting.simulations
+        assert simulations is not None
+        facets, n, k = len(template), self.setting.loop.states, self.k + 1
+        region = template.polytope(jnp.zeros(facets))
+        starts = simulations.best(k, region, facet, facets)
+        if len(self.window) == k:
+            starts[-1] = column[:n]
+        simulations.climb(k, region, np.full(facets, facet), starts)
+        return float(simulations.attained(k, region)[0][facet])

@@ -109,12 +109,12 @@ def with_cuts(
         violation = jnp.where(missing, -values.min(axis=0), 0.0)
         worst, where = jax.lax.top_k(violation.ravel(), batch)
         ends = jnp.stack(jnp.unravel_index(where, violation.shape), axis=1)
-        added = jnp.where((worst > VIOLATED)[:, None], ends, empty)
+        added = jnp.where((worst > VIOLATED)[:, None], ends, empty).astype(pairs.dtype)
         pairs = jax.lax.dynamic_update_slice(pairs, added, (number * batch, 0))
         return pairs, missing.at[tuple(ends.T)].min(worst <= VIOLATED)
 
     batch = min(cuts.batch, count**2)
-    pairs = jnp.full((cuts.rounds * batch, 2), empty)
+    pairs = jnp.full((cuts.rounds * batch, 2), empty, dtype=jnp.int32)
     if cuts.rounds:
         pairs, _ = jax.lax.fori_loop(0, cuts.rounds, more, (pairs, above))
     return whole.replace(products=joint(program.products, pairs))

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from reachjax.lmi import Program
-from reachjax.recheck import interval_offsets
+from reachjax.recheck import interval_offsets, sound_offsets
 from reachjax.relaxation import CuttingPlanes, FactLayout, Products
 from reachjax.sets import NormalForm
 from reachjax.solvers.accepted import accepted_offsets
@@ -182,6 +182,9 @@ def _joined(program: Program, candidates: Candidates, found: list[_Result]) -> R
         solution.multipliers[i, core + places] = mine.multipliers[0, core:]
         solution.offsets[i], solution.statuses[i] = mine.offsets[0], mine.statuses[0]
         solution.moments[i], solution.seconds[i] = mine.moments[0], mine.seconds[0]
-    offsets = np.array([result.offset for result in found])
+    # proved with all products, whose sums round a little more
+    whole = program.replace(products=products)
+    again = np.fmin(sound_offsets(whole, solution.multipliers), interval_offsets(whole))
+    offsets = np.fmax(np.array([result.offset for result in found]), again)
     optimal = np.array([result.optimal for result in found])
     return Rounds(products, Judged(offsets, optimal, solution))

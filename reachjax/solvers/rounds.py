@@ -86,10 +86,10 @@ def products_around(
     """
     candidates, n = Candidates(program, layout), len(program.transform)
 
-    def solve(pairs: np.ndarray) -> np.ndarray:
+    def solve(pairs: np.ndarray) -> tuple[np.ndarray, bool]:
         given = program.replace(products=joint(candidates.core, pairs))
         moments = np.asarray(solver.enclose(given, form).moments)
-        return moments[:n, :n] / moments[n - 1, n - 1]
+        return moments[:n, :n] / moments[n - 1, n - 1], False
 
     return joint(candidates.core, _in_rounds(candidates, cuts, NONE, solve))
 
@@ -114,24 +114,25 @@ def _in_rounds(
     candidates: Candidates,
     cuts: CuttingPlanes,
     pairs: Int[np.ndarray, "p 2"],
-    solve: Callable[[Int[np.ndarray, "q 2"]], Float[np.ndarray, "n n"] | None],
+    solve: Callable[[Int[np.ndarray, "q 2"]], tuple[Float[np.ndarray, "n n"], bool]],
 ) -> Int[np.ndarray, "q 2"]:
     """Solve and add what is violated, by turns; returns what was added.
 
-    When the rounds have run out, the products of `LocalBounds` that are violated are added all the
-    same, until none is: no bound is looser than its.
+    When that is enough or the rounds have run out, the products of `LocalBounds` that are violated
+    are added all the same, until none is: no bound is looser than its.
 
     Args:
         candidates: what may be added.
         cuts: how many rounds, and of how many products.
         pairs: what is added from the beginning.
-        solve: the moments with these products added; None when that is enough.
+        solve: the moments with these products added, and whether that is enough.
     """
     for number in itertools.count():
-        moment = solve(pairs)
-        if moment is None or not np.isfinite(moment).all():
+        moment, enough = solve(pairs)
+        if not np.isfinite(moment).all():
             break
-        more = candidates.violated(moment, pairs, cuts.batch if number < cuts.rounds else None)
+        batch = None if enough or number >= cuts.rounds else cuts.batch
+        more = candidates.violated(moment, pairs, batch)
         if not len(more):
             break
         pairs = np.concatenate([pairs, more])
@@ -150,17 +151,16 @@ def _facet(
     size = float(interval_offsets(program)[0] - program.objective.mid[0, -1])
     results: list[_Result] = []
 
-    def solve(pairs: np.ndarray) -> np.ndarray | None:
+    def solve(pairs: np.ndarray) -> tuple[np.ndarray, bool]:
         given = program.replace(products=joint(candidates.core, pairs))
         solution = solver.solve(given)
         (offset,), (optimal,) = accepted_offsets(given, solution)
         results.append(_Result(pairs, float(offset), bool(optimal), solution))
         moment = np.asarray(solution.moments[0])
-        if attained is not None:
-            least = min(result.offset for result in results)
-            if least - attained(program.transform @ moment[:, -1]) <= cuts.gap * size:
-                return None
-        return moment
+        if attained is None:
+            return moment, False
+        least = min(result.offset for result in results)
+        return moment, least - attained(program.transform @ moment[:, -1]) <= cuts.gap * size
 
     _in_rounds(candidates, cuts, pairs, solve)
     best = min(reversed(results), key=lambda result: result.offset)

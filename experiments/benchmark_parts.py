@@ -48,7 +48,7 @@ def parts(
     solution = solver.solve(program)
 
     def size(loop):
-        return rj.log_volume(rj.reach(loop, box, 1, template, relaxation, solver=solver))
+        return rj.log_volume(rj.reach(loop, box, 1, template, relaxation, 1, solver))
 
     gradient = jax.jit(jax.value_and_grad(size))
     ready = (

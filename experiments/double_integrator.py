@@ -26,9 +26,10 @@ from experiments.mpc import LinearMPC
 from experiments.sampling import sample_policy
 
 RELAXATIONS = {
-    "local-bounds": rj.LocalBounds(),
-    "paper-repeated": rj.PaperQC(repeated=True),
-    "paper": rj.PaperQC(repeated=False),
+    "cutting-planes": {"relaxation": rj.CuttingPlanes(), "window": None},
+    "local-bounds": {"relaxation": rj.LocalBounds(), "window": 1},
+    "paper-repeated": {"relaxation": rj.PaperQC(repeated=True), "window": 1},
+    "paper": {"relaxation": rj.PaperQC(repeated=False), "window": 1},
 }
 SOLVERS = {
     "auto": rj.Auto(),
@@ -55,12 +56,14 @@ class Settings:
     """Steps N after which the goal must be reached."""
     facets: int = 8
     """Facets of every set: 8 are the paper's, another number gives equal angles."""
-    relaxation: tuple[Literal["local-bounds", "paper-repeated", "paper"], ...] = (
+    relaxation: tuple[Literal["cutting-planes", "local-bounds", "paper-repeated", "paper"], ...] = (
+        "cutting-planes",
         "local-bounds",
         "paper-repeated",
         "paper",
     )
-    """Which relaxations to compare; the figure shows the first. "paper" leaves out lambda_ij."""
+    """Which relaxations to compare; the figure shows the first. Cutting planes reach back to the
+    initial set, the others one step; "paper" leaves out lambda_ij."""
     solver: Literal["auto", "clarabel", "interior-point", "scs"] = "auto"
     """What solves the semidefinite programs."""
     margin: float = 0.2
@@ -155,7 +158,7 @@ def certify(name: str, fit: Fit, relaxation: str, settings: Settings) -> report.
         rj.Box(*INITIAL_BOX),
         settings.horizon,
         template,
-        RELAXATIONS[relaxation],
+        **RELAXATIONS[relaxation],
         solver=SOLVERS[settings.solver],
         samples=settings.simulations,
         seed=settings.seed,

@@ -143,7 +143,7 @@ def certify(loop: rj.ClosedLoop, states, settings: Settings) -> quadrotor_report
         initial_set(),
         STEPS,
         rj.EllipsoidTemplate(),
-        RELAXATIONS[settings.relaxation],
+        **RELAXATIONS[settings.relaxation],
         seed=settings.seed,
         progress=lambda steps: track(steps, f"certifying, {settings.relaxation}"),
     )

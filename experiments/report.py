@@ -58,7 +58,7 @@ def _hull_area(points: np.ndarray) -> float:
 
 def step_table(analyses: list[Analysis]) -> Table:
     """Controllers side by side, a row a step."""
-    table = blank_table(f"{analyses[0].relaxation}, window 1")
+    table = blank_table(analyses[0].relaxation)
     table.add_column("\nt", justify="right")
     for analysis in analyses:
         for k, column in enumerate(("area", "hull", "gap", "solver")):

@@ -21,7 +21,7 @@ from reachjax.checks import (
     whole_number,
 )
 from reachjax.pytrees import Replaceable, pytree, static
-from reachjax.relaxation import AbstractRelaxation, LocalBounds
+from reachjax.relaxation import AbstractRelaxation, CuttingPlanes
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.steps import Setting, Step, boxed
@@ -41,7 +41,7 @@ EXAMPLES = {
     ClosedLoop: "a ClosedLoop",
     AbstractSet: "a set such as Box(lower, upper) or Polytope(A, b)",
     AbstractTemplate: "a template, such as Template.box(n) or EllipsoidTemplate()",
-    AbstractRelaxation: "a relaxation object, such as LocalBounds()",
+    AbstractRelaxation: "a relaxation object, such as CuttingPlanes()",
     AbstractSolver: "a solver object, such as Auto()",
 }
 
@@ -96,7 +96,7 @@ def reach_step(
     template: AbstractTemplate,
     *,
     t: int = 0,
-    relaxation: AbstractRelaxation = LocalBounds(),  # noqa: B008  (immutable)
+    relaxation: AbstractRelaxation = CuttingPlanes(),  # noqa: B008  (immutable)
     solver: AbstractSolver = Auto(),  # noqa: B008
     samples: int = SAMPLES,
     seed: int = 0,
@@ -138,8 +138,8 @@ def reach(
     X0: AbstractSet,
     horizon: int,
     template: AbstractTemplate,
-    relaxation: AbstractRelaxation = LocalBounds(),  # noqa: B008  (immutable)
-    window: int | None = 1,
+    relaxation: AbstractRelaxation = CuttingPlanes(),  # noqa: B008  (immutable)
+    window: int | None = None,
     solver: AbstractSolver = Auto(),  # noqa: B008
     *,
     start: int = 0,

@@ -19,3 +19,13 @@ def random_loop(n_x, hidden=(6, 4), seed=0, boxed=True, steps=None, network=he_n
     box = input_box(n_u, seed, steps) if boxed else (None, None)
     layers = network((n_x, *hidden, n_u), seed)
     return LoopData(layers, *plant(n_x, n_u, seed, steps), *box)
+
+
+def recursion(loop, X0, horizon, template, relaxation=rj.LocalBounds(), **options):  # noqa: B008
+    """The paper's recursion with local bounds: one small program a facet, also inside `jax.jit`."""
+    return rj.reach(loop, X0, horizon, template, relaxation, 1, **options)
+
+
+def one_step(loop, X, template, relaxation=rj.LocalBounds(), **options):  # noqa: B008
+    """A step of `recursion`."""
+    return rj.reach_step(loop, X, template, relaxation=relaxation, **options)

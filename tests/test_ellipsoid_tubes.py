@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import box_region, simplex_region
 from tests.solvers.test_enclosures import case, ellipsoid
 
@@ -24,7 +24,7 @@ def holds(tube, count=20_000):
 @pytest.mark.parametrize("relaxation", RELAXATIONS, ids=str)
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_no_state_is_outside_an_ellipsoid(n, relaxation):
-    tube = rj.reach(*case(n, seed=n, hidden=(4, 3)), 3, rj.EllipsoidTemplate(), relaxation)
+    tube = recursion(*case(n, seed=n, hidden=(4, 3)), 3, rj.EllipsoidTemplate(), relaxation)
     assert all(holds(tube))
     assert all((tube.proof(t).gaps >= -1e-9).all() for t in (1, 2, 3))
     assert all(tube.proof(t).recheck() <= 1 + 1e-9 for t in (1, 2, 3))
@@ -33,7 +33,7 @@ def test_no_state_is_outside_an_ellipsoid(n, relaxation):
 @pytest.mark.slow
 def test_no_state_of_six_is_outside_an_ellipsoid_of_a_varying_loop():
     loop = closed_loop(random_loop(6, hidden=(4, 4), seed=3, steps=2))
-    tube = rj.reach(loop, ellipsoid(6, 3), 2, rj.EllipsoidTemplate())
+    tube = recursion(loop, ellipsoid(6, 3), 2, rj.EllipsoidTemplate())
     assert all(holds(tube))
 
 
@@ -51,7 +51,7 @@ def test_any_set_starts_a_tube_of_any_template(X0, template):
         "minimum volume": rj.EllipsoidTemplate(),
         "given shape": rj.EllipsoidTemplate(shape=[[2.0, 0.5], [0.5, 1.0]]),
     }[template]
-    tube = rj.reach(case(2, 1)[0], start, 2, sets)
+    tube = recursion(case(2, 1)[0], start, 2, sets)
     assert all(holds(tube))
     solved = rj.SolverStatus.SOLVED
     assert all(s is solved for t in (1, 2) for s in tube.proof(t).statuses)
@@ -63,13 +63,11 @@ def test_the_image_of_an_affine_loop_is_exact(n):
     A, B, K, c = (rng.normal(size=s) for s in ((n, n), (n, 1), (1, n), n))
     net = rj.MLP.from_layers([(0.3 * K, [0.1])])
     X0, closed = ellipsoid(n, n), A + 0.3 * B @ K
-    following, _ = rj.reach_step(
-        rj.ClosedLoop(rj.AffinePlant(A, B, c), net), X0, rj.EllipsoidTemplate()
-    )
+    following, _ = one_step(rj.ClosedLoop(rj.AffinePlant(A, B, c), net), X0, rj.EllipsoidTemplate())
     np.testing.assert_allclose(following.center, closed @ X0.center + 0.1 * B[:, 0] + c, atol=1e-5)
     expected = closed @ X0.shape @ closed.T
     np.testing.assert_allclose(following.shape, expected, atol=1e-5 * abs(expected).max())
-    facets, _ = rj.reach_step(rj.ClosedLoop(rj.AffinePlant(A, B, c), net), X0, rj.Template.box(n))
+    facets, _ = one_step(rj.ClosedLoop(rj.AffinePlant(A, B, c), net), X0, rj.Template.box(n))
     widths = np.sqrt(np.diag(expected))
     middle = closed @ X0.center + 0.1 * B[:, 0] + c
     ends = np.stack([middle + widths, widths - middle], axis=1).ravel()
@@ -79,8 +77,8 @@ def test_the_image_of_an_affine_loop_is_exact(n):
 def test_a_given_shape_is_kept_and_larger_than_the_minimum_volume():
     loop, X0 = case(2, 0)
     shape = np.array([[2.0, 0.5], [0.5, 1.0]])
-    given = rj.reach(loop, X0, 3, rj.EllipsoidTemplate(shape=shape))
-    least = rj.reach(loop, X0, 3, rj.EllipsoidTemplate())
+    given = recursion(loop, X0, 3, rj.EllipsoidTemplate(shape=shape))
+    least = recursion(loop, X0, 3, rj.EllipsoidTemplate())
     for t in (1, 2, 3):
         size = given.sets[t].shape[0, 0] / shape[0, 0]
         np.testing.assert_allclose(given.sets[t].shape, size * shape, rtol=1e-6)
@@ -107,7 +105,7 @@ def affine(A, c=None):
 
 
 def test_a_flat_image_has_an_ellipsoid_that_is_nearly_flat():
-    tube = rj.reach(
+    tube = recursion(
         affine([[1.0, 1.0], [2.0, 2.0]]),
         rj.Ellipsoid([0.0, 0.0], np.eye(2)),
         2,
@@ -121,14 +119,14 @@ def test_a_flat_image_has_an_ellipsoid_that_is_nearly_flat():
 @pytest.mark.parametrize("point", [[0.0, 0.0], [1.0, 2.0], [1e-9, 1e9]])
 def test_the_image_of_a_constant_loop_is_nearly_a_point(point, shape):
     loop = affine(np.zeros((2, 2)), point)
-    tube = rj.reach(loop, rj.Box([1.0, 1.0], [3.0, 2.0]), 2, rj.EllipsoidTemplate(shape))
+    tube = recursion(loop, rj.Box([1.0, 1.0], [3.0, 2.0]), 2, rj.EllipsoidTemplate(shape))
     assert all(holds(tube))
     assert tube.sets[2].volume() <= 1e-12 * np.dot(point, point) + 1e-150  # rounding
 
 
 def test_a_nilpotent_loop_comes_to_rest():
     loop = affine([[0.0, 1.0], [0.0, 0.0]])
-    tube = rj.reach(loop, rj.Box([1.0, 1.0], [3.0, 2.0]), 4, rj.EllipsoidTemplate())
+    tube = recursion(loop, rj.Box([1.0, 1.0], [3.0, 2.0]), 4, rj.EllipsoidTemplate())
     assert all(holds(tube))
     assert tube.sets[2].volume() < 1e-12
 
@@ -137,7 +135,7 @@ def test_a_nilpotent_loop_comes_to_rest():
 def test_a_deadbeat_loop_comes_to_rest(shape):
     net = rj.MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-1.0, 1.0]], [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net)  # x+ = 0
-    tube = rj.reach(loop, rj.Box([1.0], [3.0]), 2, rj.EllipsoidTemplate(shape))
+    tube = recursion(loop, rj.Box([1.0], [3.0]), 2, rj.EllipsoidTemplate(shape))
     assert all(holds(tube))
     assert tube.sets[1].volume() < 1e-12
 
@@ -145,7 +143,7 @@ def test_a_deadbeat_loop_comes_to_rest(shape):
 @pytest.mark.parametrize("thinness", [1e-2, 1e-4])
 def test_thin_images_keep_their_volume(thinness):
     loop = affine([[1.0, 1.0], [1.0, 1.0 + thinness]])
-    region, _ = rj.reach_step(loop, rj.Ellipsoid([0.0, 0.0], np.eye(2)), rj.EllipsoidTemplate())
+    region, _ = one_step(loop, rj.Ellipsoid([0.0, 0.0], np.eye(2)), rj.EllipsoidTemplate())
     np.testing.assert_allclose(region.volume(), np.pi * thinness, rtol=1e-4)
 
 
@@ -153,7 +151,7 @@ def test_volumes_do_not_depend_on_units():
     """Half-axes of 1e8 and 1e-8: the coordinates are those of the ellipsoids themselves."""
     units = np.diag([1e8, 1e-8])
     loop = affine(units @ [[0.9, 0.3], [-0.2, 0.8]] @ np.linalg.inv(units))
-    tube = rj.reach(loop, rj.Ellipsoid([0.0, 0.0], units @ units), 2, rj.EllipsoidTemplate())
+    tube = recursion(loop, rj.Ellipsoid([0.0, 0.0], units @ units), 2, rj.EllipsoidTemplate())
     volumes = np.array([region.volume() for region in tube.sets]) / np.pi
     np.testing.assert_allclose(volumes, [1.0, 0.78, 0.78**2], rtol=1e-4)
 
@@ -161,7 +159,7 @@ def test_volumes_do_not_depend_on_units():
 def test_specifications_are_decided_from_ellipsoids():
     net = rj.MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net)  # x+ = 0.6 x
-    tube = rj.reach(loop, rj.Ellipsoid([1.5], [[0.25]]), 2, rj.EllipsoidTemplate())  # [1, 2]
+    tube = recursion(loop, rj.Ellipsoid([1.5], [[0.25]]), 2, rj.EllipsoidTemplate())  # [1, 2]
     proved = rj.verify(tube, goal=rj.Box([0.3], [0.8]), safe=rj.Box([0.0], [2.1]))
     assert proved.status is rj.VerdictStatus.PROVED
     assert proved.margins["goal"][2] == pytest.approx(0.06, abs=1e-4)
@@ -195,7 +193,7 @@ def test_only_a_solved_program_has_a_number_for_a_gradient(status, shape):
 
     def size(loop, factor=1.0):
         solver = Claiming(status, factor)
-        tube = rj.reach(loop, X0, 1, rj.EllipsoidTemplate(shape), solver=solver)
+        tube = recursion(loop, X0, 1, rj.EllipsoidTemplate(shape), solver=solver)
         return rj.log_volume(tube)
 
     def is_finite(tree):
@@ -205,7 +203,7 @@ def test_only_a_solved_program_has_a_number_for_a_gradient(status, shape):
     wrong = jax.grad(lambda loop: size(loop, 0.5))(loop)
     if shape is None and status in (rj.SolverStatus.SOLVED, rj.SolverStatus.INACCURATE):
         # the central path is reached from what was proposed, and what is there is right
-        right = jax.grad(lambda loop: rj.log_volume(rj.reach(loop, X0, 1, rj.EllipsoidTemplate())))
+        right = jax.grad(lambda loop: rj.log_volume(recursion(loop, X0, 1, rj.EllipsoidTemplate())))
         for found in (gradient, wrong):
             jax.tree.map(
                 lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6),
@@ -226,7 +224,7 @@ def test_a_failed_solver_still_gives_a_sound_ellipsoid(monkeypatch):
     loop, X0 = case(3, 1)
     monkeypatch.setattr(cp.Problem, "solve", fail)
     for shape in (None, np.eye(3)):
-        tube = rj.reach(loop, X0, 2, rj.EllipsoidTemplate(shape), solver=rj.Clarabel())
+        tube = recursion(loop, X0, 2, rj.EllipsoidTemplate(shape), solver=rj.Clarabel())
         assert all(holds(tube))
         assert tube.proof(1).statuses == (rj.SolverStatus.FAILED,)
 
@@ -236,7 +234,7 @@ def test_compiled_batched_and_plain_ellipsoids_agree(shape):
     loop, X0 = case(2, 0, hidden=(3,))
 
     def size(net):
-        tube = rj.reach(loop.replace(controller=net), X0, 2, rj.EllipsoidTemplate(shape))
+        tube = recursion(loop.replace(controller=net), X0, 2, rj.EllipsoidTemplate(shape))
         return rj.log_volume(tube)
 
     nets = [jax.tree.map(lambda w, s=s: w * s, loop.controller) for s in (0.9, 1.1)]
@@ -281,16 +279,16 @@ def test_bad_shapes_are_named(shape, message):
 def test_mismatches_are_named():
     loop, X0 = case(2, 0)
     with pytest.raises(ValueError, match=r"template is 3, but the loop's number of states is 2"):
-        rj.reach(loop, X0, 1, rj.EllipsoidTemplate(np.eye(3)))
+        recursion(loop, X0, 1, rj.EllipsoidTemplate(np.eye(3)))
     with pytest.raises(TypeError, match="template must be a template, such as"):
-        rj.reach(loop, X0, 1, rj.EllipsoidTemplate)
+        recursion(loop, X0, 1, rj.EllipsoidTemplate)
 
     class Facets(rj.AbstractSolver):
         def solve(self, program):
             return rj.Clarabel().solve(program)
 
     with pytest.raises(NotImplementedError, match="Facets solves for facets, not for ellipsoids"):
-        rj.reach(loop, X0, 1, rj.EllipsoidTemplate(), solver=Facets())
-    certificate = rj.reach_step(loop, X0, rj.EllipsoidTemplate())[1]
+        recursion(loop, X0, 1, rj.EllipsoidTemplate(), solver=Facets())
+    certificate = one_step(loop, X0, rj.EllipsoidTemplate())[1]
     with pytest.raises(ValueError, match=r"multipliers must have shape \(1, \d+\)"):
         certificate.recheck(certificate.multipliers[0])

@@ -29,7 +29,7 @@ def layer(W, b):
 
 
 def reach(**changes):
-    arguments = {"loop": LOOP, "X0": X0, "horizon": 1, "template": TEMPLATE}
+    arguments = {"loop": LOOP, "X0": X0, "horizon": 1, "template": TEMPLATE, "window": 1}
     return rj.reach(**(arguments | changes))
 
 
@@ -94,7 +94,6 @@ BAD_VALUES = {
     r"Clarabel\.tolerance must be positive": lambda: rj.Clarabel(tolerance=-1.0),
     r"SCS\.max_iterations must be positive": lambda: rj.SCS(max_iterations=0),
     "'OSQP' cannot solve semidefinite programs": lambda: reach(solver=rj.CvxpySolver("OSQP")),
-    "window must be 1 .*, but 2 arrived": lambda: reach(window=2),
     "3 time steps .*, but start 0 and horizon 4": lambda: reach(loop=LTV, horizon=4),
     "3 time steps .*, but start 2 and horizon 2": lambda: reach(loop=LTV, horizon=2, start=2),
     "3 time steps .*, but start 3 and horizon 1": lambda: rj.change_of_basis(LTV, t=3),

@@ -175,13 +175,13 @@ def test_the_rounding_bound_of_the_products_covers_exact_arithmetic():
 
 
 def test_a_program_compiles_once_for_new_weights_sets_and_times():
-    from reachjax.windows import _window_program
+    from reachjax.windows import _extended
 
     data = random_loop(2, hidden=(4,), steps=3)
     template, relaxation = rj.Template.octagonal(2), rj.LocalBounds()
     loop = closed_loop(data)
     step_program(loop, X := rj.Box([0, 0], [1, 1]), X, template.directions, 0, relaxation)
-    before = _window_program._cache_size()
+    before = _extended._cache_size()
     other = loop.replace(controller=jax.tree.map(lambda w: 2 * w, loop.controller))
     step_program(other, X := rj.Box([0, 0], [1e-3, 1e-3]), X, template.directions, 1, relaxation)
-    assert _window_program._cache_size() == before
+    assert _extended._cache_size() == before

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.loops import one_step, recursion
 from tests.networks import box_region, simplex_region
 from tests.sets.test_intersection import intersection
 from tests.solvers.test_enclosures import PROMISED, case, errors
@@ -38,7 +39,7 @@ def starts(n):
 )
 def test_no_state_is_outside_and_every_bound_is_proved_anew(n, X0):
     region = starts(n)[X0]
-    tube = rj.reach(case(n, 1, hidden=(4, 3))[0], region, 2, rj.MixedTemplate(FACETS[n]))
+    tube = recursion(case(n, 1, hidden=(4, 3))[0], region, 2, rj.MixedTemplate(FACETS[n]))
     assert all(holds(tube))
     if X0 == "intersection":
         surface = region.sample_boundary(jax.random.key(0), 1000)
@@ -58,9 +59,9 @@ def test_no_state_is_outside_and_every_bound_is_proved_anew(n, X0):
 @pytest.mark.parametrize("X0", ["box", "polytope", "ellipsoid", "intersection"])
 def test_a_step_has_what_either_template_alone_has(X0):
     loop, region = case(2, 1, hidden=(3,))[0], starts(2)[X0]
-    both, _ = rj.reach_step(loop, region, rj.MixedTemplate(FACETS[2]))
-    polytope, _ = rj.reach_step(loop, region, FACETS[2])
-    ellipsoid, _ = rj.reach_step(loop, region, rj.EllipsoidTemplate())
+    both, _ = one_step(loop, region, rj.MixedTemplate(FACETS[2]))
+    polytope, _ = one_step(loop, region, FACETS[2])
+    ellipsoid, _ = one_step(loop, region, rj.EllipsoidTemplate())
     np.testing.assert_allclose(both.polytope.b, polytope.b, atol=1e-7)
     np.testing.assert_allclose(both.ellipsoid.shape, ellipsoid.shape, atol=1e-7)
     D = np.random.default_rng(0).normal(size=(8, 2))
@@ -70,9 +71,9 @@ def test_a_step_has_what_either_template_alone_has(X0):
 
 def test_later_sets_are_smaller_than_those_of_either_template_alone():
     loop, X0 = case(3, 1)
-    both = rj.reach(loop, X0, 3, rj.MixedTemplate(FACETS[3]))
+    both = recursion(loop, X0, 3, rj.MixedTemplate(FACETS[3]))
     for alone in (FACETS[3], rj.EllipsoidTemplate()):
-        tube = rj.reach(loop, X0, 3, alone)
+        tube = recursion(loop, X0, 3, alone)
         for t in (1, 2, 3):
             assert both.sets[t].volume() <= tube.sets[t].volume() * (1 + 1e-6)
 
@@ -82,7 +83,7 @@ def test_facets_tell_a_program_what_the_ellipsoid_does_not():
     net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2) / 2, np.zeros((2, 1))), net)
     half = rj.Intersection(rj.Box([-1.0, -1.0], [0.0, 1.0]), rj.Ellipsoid([0.0, 0.0], np.eye(2)))
-    following, _ = rj.reach_step(loop, half, rj.MixedTemplate(rj.Template.box(2)))
+    following, _ = one_step(loop, half, rj.MixedTemplate(rj.Template.box(2)))
     np.testing.assert_allclose(following.polytope.b, [0.0, 0.5, 0.5, 0.5], atol=1e-6)
     # the ellipse of least area around half of a disk has sqrt(16 / 27) times the disk's area
     least = np.sqrt(16 / 27) * np.pi / 4
@@ -92,7 +93,7 @@ def test_facets_tell_a_program_what_the_ellipsoid_does_not():
 @pytest.mark.parametrize("relaxation", [rj.PaperQC(), rj.LocalBounds(remove_stable=False)], ids=str)
 def test_other_relaxations_hold_too(relaxation):
     loop, X0 = case(2, 1, hidden=(3,))
-    assert all(holds(rj.reach(loop, X0, 2, rj.MixedTemplate(FACETS[2]), relaxation)))
+    assert all(holds(recursion(loop, X0, 2, rj.MixedTemplate(FACETS[2]), relaxation)))
 
 
 def test_flat_images_and_flat_parts_hold():
@@ -100,7 +101,7 @@ def test_flat_images_and_flat_parts_hold():
     loop = rj.ClosedLoop(plant, rj.MLP.from_layers([([[0.0, 0.0]], [0.0])]))
     ball, template = rj.Ellipsoid([0.0, 0.0], np.eye(2)), rj.MixedTemplate(FACETS[2])
     for X0 in (ball, rj.Intersection(rj.Box([0.1, -0.5], [0.1, 0.5]), ball)):
-        tube = rj.reach(loop, X0, 2, template)
+        tube = recursion(loop, X0, 2, template)
         reached = tube.simulate(200)
         for t in (1, 2):
             assert bool(tube.sets[t].contains(reached[:, t], 1e-9).all())
@@ -112,7 +113,7 @@ def final(template, horizon):
     """A number that depends on both parts of the last set, and on all volumes."""
 
     def f(loop, X0):
-        tube, n = rj.reach(loop, X0, horizon, template), loop.states
+        tube, n = recursion(loop, X0, horizon, template), loop.states
         last, weights = tube.sets[-1], np.random.default_rng(n).normal(size=(n, n))
         offsets = last.polytope.b @ jnp.linspace(0.5, 2.0, len(last.polytope.b))
         shape = last.ellipsoid.center @ jnp.arange(1.0, n + 1) + jnp.sum(
@@ -158,7 +159,7 @@ def test_compiled_and_plain_steps_agree():
     loop, X0 = case(1, 0, hidden=(3,))[0], intersection(1)
 
     def size(X0):
-        return rj.log_volume(rj.reach(loop, X0, 1, rj.MixedTemplate(rj.Template.box(1))))
+        return rj.log_volume(recursion(loop, X0, 1, rj.MixedTemplate(rj.Template.box(1))))
 
     assert float(jax.jit(size)(X0)) == pytest.approx(float(size(X0)), abs=1e-6)
 
@@ -167,7 +168,7 @@ def test_specifications_are_decided_by_the_better_part():
     net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2) / 2, np.zeros((2, 1))), net)
     half = rj.Intersection(rj.Box([-2.0, -2.0], [0.0, 2.0]), rj.Ellipsoid([0.0, 0.0], np.eye(2)))
-    tube = rj.reach(loop, half, 1, rj.MixedTemplate(rj.Template.box(2)))
+    tube = recursion(loop, half, 1, rj.MixedTemplate(rj.Template.box(2)))
     diagonal = rj.Polytope([[-1.0, -1.0]], [-0.78])  # beyond the disk, not beyond its box
     proved = rj.verify(tube, safe=rj.Box([-1.1, -1.1], [0.1, 1.1]), avoid={1: [diagonal]})
     assert proved.status is rj.VerdictStatus.PROVED
@@ -179,7 +180,7 @@ def test_specifications_are_decided_by_the_better_part():
 
 def test_parts_and_mismatches_are_named():
     loop, X0 = case(2, 0)
-    tube = rj.reach(loop, X0, 1, rj.MixedTemplate(rj.Template.box(2)))
+    tube = recursion(loop, X0, 1, rj.MixedTemplate(rj.Template.box(2)))
     assert repr(tube) == "ReachTube(horizon=1, facets=4, ellipsoids, states=2)"
     proof = tube.proof(1)
     facets, ellipsoid = proof.parts
@@ -194,7 +195,7 @@ def test_parts_and_mismatches_are_named():
     with pytest.raises(ValueError, match=r"MixedTemplate\.ellipsoid has dimension 3"):
         rj.MixedTemplate(rj.Template.box(2), rj.EllipsoidTemplate(np.eye(3)))
     with pytest.raises(ValueError, match="template is 3, but the loop's number of states is 2"):
-        rj.reach(loop, X0, 1, rj.MixedTemplate(rj.Template.box(3)))
+        recursion(loop, X0, 1, rj.MixedTemplate(rj.Template.box(3)))
     apart = rj.Intersection(rj.Box([9.0, 9.0], [10.0, 10.0]), X0)
     with pytest.raises(ValueError, match="X0 cannot be used: the polytope and the ellipsoid have"):
-        rj.reach(loop, apart, 1, rj.Template.box(2))
+        recursion(loop, apart, 1, rj.Template.box(2))

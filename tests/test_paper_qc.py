@@ -13,6 +13,7 @@ import pytest
 
 import reachjax as rj
 from experiments.reference import paper_E_in, paper_E_mid, paper_E_out, paper_step
+from tests.loops import recursion
 from tests.networks import (
     LoopData,
     Region,
@@ -91,7 +92,7 @@ CASES = {
 def tube_of(request):
     """(case, tube)."""
     case = request.param
-    tube = rj.reach(
+    tube = recursion(
         closed_loop(case.loop),
         rj.Polytope(case.region.A, case.region.b),
         horizon=STEPS,
@@ -162,7 +163,7 @@ def test_a_box_and_the_polytope_of_its_facets_give_the_same_bounds(n_x):
     loop, region = closed_loop(loop_data(n_x, True, False)), box_region(n_x, seed=n_x)
     box = rj.Box(region.corners.min(axis=0), region.corners.max(axis=0))
     bounds = [
-        rj.reach(
+        recursion(
             loop,
             initial,
             horizon=1,

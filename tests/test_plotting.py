@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.loops import recursion
 
 mpl.use("Agg")
 
@@ -34,7 +35,7 @@ def test_a_tube_is_drawn_on_the_axes_given():
 
     net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2) / 2, np.zeros((2, 1))), net)
-    tube = rj.reach(loop, rj.Box([0.5, 0.5], [1, 1]), 2, rj.Template.box(2))
+    tube = recursion(loop, rj.Box([0.5, 0.5], [1, 1]), 2, rj.Template.box(2))
     _, ax = plt.subplots()
     assert plot_tube(tube, ax, samples=50) is ax
     assert len(ax.patches) == 3
@@ -122,7 +123,7 @@ def test_a_tube_of_three_states_is_drawn_on_the_coordinates_given(template):
     from reachjax.plotting import plot_tube
 
     X0 = rj.Ellipsoid([1.0, 2.0, 3.0], np.diag([0.25, 1.0, 4.0]))
-    ax = plot_tube(rj.reach(loop_of(3), X0, 1, template), samples=50, coordinates=(2, 0))
+    ax = plot_tube(recursion(loop_of(3), X0, 1, template), samples=50, coordinates=(2, 0))
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("$x_{3}$", "$x_{1}$")
     lower, upper = ax.patches[1].get_xy().min(axis=0), ax.patches[1].get_xy().max(axis=0)
     np.testing.assert_allclose([lower, upper], [[0.5, 0.25], [2.5, 0.75]], atol=1e-3)
@@ -141,7 +142,7 @@ def test_what_cannot_be_drawn_is_refused():
             plot_set(cube, coordinates=wrong)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="two or more dimensions can be drawn, but 1 arrived"):
         plot_set(rj.Box([0], [1]))
-    tube = rj.reach(loop_of(1), rj.Box([0], [1]), 1, rj.Template.box(1))
+    tube = recursion(loop_of(1), rj.Box([0], [1]), 1, rj.Template.box(1))
     with pytest.raises(ValueError, match="two or more dimensions can be drawn, but 1 arrived"):
         plot_tube(tube)
     with pytest.raises(ValueError, match="unbounded"):

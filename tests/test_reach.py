@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import box_region, he_network, simplex_region, simulate
 
 RELAXATIONS = [rj.PaperQC(repeated=False), rj.PaperQC(), rj.LocalBounds()]
@@ -18,7 +18,7 @@ def tube_of(n_x, relaxation=RELAXATIONS[-1], horizon=3, scale=1.0, **options):
     corners = center + scale * (region.corners - center)
     X0 = rj.Box(corners.min(axis=0), corners.max(axis=0))
     template = rj.Template.octagonal(n_x) if n_x < 3 else rj.Template.box(n_x)
-    tube = rj.reach(closed_loop(data), X0, horizon, template, relaxation)
+    tube = recursion(closed_loop(data), X0, horizon, template, relaxation)
     return data, corners, tube
 
 
@@ -46,13 +46,13 @@ def test_a_start_time_shifts_a_time_varying_loop():
     data, region = random_loop(2, steps=5), box_region(2, seed=0)
     X0, template = rj.Polytope(region.A, region.b), rj.Template.box(2)
     loop = closed_loop(data)
-    late = rj.reach(loop, X0, 2, template, start=3)
+    late = recursion(loop, X0, 2, template, start=3)
     cut = rj.ClosedLoop(
         rj.AffinePlant(data.A[3:], data.B[3:], data.c[3:]),
         loop.controller,
         rj.Box(data.u_lower[3:], data.u_upper[3:]),
     )
-    early = rj.reach(cut, X0, 2, template)
+    early = recursion(cut, X0, 2, template)
     np.testing.assert_allclose(late.sets[2].b, early.sets[2].b, rtol=1e-12)
     np.testing.assert_array_equal(late.simulate(10), early.simulate(10))
 
@@ -78,7 +78,7 @@ def test_an_affine_loop_without_units_is_exact(n_x):
     A, B, K = rng.normal(size=(n_x, n_x)), rng.normal(size=(n_x, 1)), rng.normal(size=(1, n_x))
     loop = rj.ClosedLoop(rj.AffinePlant(A, B), rj.MLP.from_layers([(K, [0.1])]))
     X, template = rj.Box(-np.ones(n_x), np.ones(n_x)), rj.Template.octagonal(n_x)
-    following, certificate = rj.reach_step(loop, X, template)
+    following, certificate = one_step(loop, X, template)
     successors = np.asarray(loop.simulate(X.vertices(), 1)[:, 1])
     exact = (successors @ np.asarray(template.directions).T).max(axis=0)
     np.testing.assert_allclose(following.b, exact, atol=1e-7)
@@ -119,14 +119,14 @@ def test_other_multipliers_are_rechecked_from_the_certificate(planar):
 
 
 def test_one_step_equals_the_first_step_of_a_tube(planar):
-    following, certificate = rj.reach_step(planar.loop, planar.sets[0], planar.template)
+    following, certificate = one_step(planar.loop, planar.sets[0], planar.template)
     np.testing.assert_array_equal(following.b, planar.sets[1].b)
     assert certificate.gaps.shape == (len(planar.template),)
 
 
 def test_a_tube_continued_from_its_last_set_is_the_longer_tube(planar):
-    short = rj.reach(planar.loop, planar.sets[0], 2, planar.template)
-    more = rj.reach(planar.loop, short.sets[2], 1, planar.template)
+    short = recursion(planar.loop, planar.sets[0], 2, planar.template)
+    more = recursion(planar.loop, short.sets[2], 1, planar.template)
     np.testing.assert_allclose(more.sets[1].b, planar.sets[3].b, rtol=1e-12)
 
 
@@ -138,14 +138,14 @@ def test_progress_wraps_the_steps(planar):
             seen.append(k)
             yield k
 
-    rj.reach(planar.loop, planar.sets[0], 2, planar.template, progress=progress)
+    recursion(planar.loop, planar.sets[0], 2, planar.template, progress=progress)
     assert seen == [0, 1]
 
 
 def test_polytopes_and_boxes_may_start_a_tube_in_three_dimensions():
     data, region = random_loop(3), simplex_region(3, seed=0)
     X0 = rj.Polytope(region.A, region.b)
-    tube = rj.reach(closed_loop(data), X0, 2, rj.Template.box(3))
+    tube = recursion(closed_loop(data), X0, 2, rj.Template.box(3))
     states = np.vstack([region.corners, region.sample(10_000, seed=0)])
     assert np.all(tube.sets[2].contains(simulate(data, states, 2)[2]))
 
@@ -158,7 +158,7 @@ def test_networks_from_flax_certify_like_the_same_layers():
     )
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.ones((2, 1))), rj.MLP.from_flax(model))
     X0 = rj.Box([-0.1, 0.2], [0.1, 0.3])
-    following, _ = rj.reach_step(loop, X0, rj.Template.box(2))
+    following, _ = one_step(loop, X0, rj.Template.box(2))
     states = X0.sample(jax.random.key(0), 1000)
     u = np.asarray(jax.vmap(model)(states.astype(jnp.float32)), dtype=float)
     # flax computes in single precision
@@ -177,7 +177,7 @@ def test_a_bound_holds_where_the_compiler_rounds_one_interval_in_two_ways():
     loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[1.0]]), net, rj.Box([low], [high]))
     for solver in (rj.Clarabel(max_iterations=1), rj.Clarabel()):
         for relaxation in RELAXATIONS:
-            tube = rj.reach(
+            tube = recursion(
                 loop, rj.Box([x], [x + width]), 1, rj.Template.box(1), relaxation, solver=solver
             )
             assert tube.proof(1).bounds[0] >= high  # attained: the input is clipped there
@@ -193,8 +193,8 @@ def test_bounds_are_as_tight_for_small_and_large_units_of_the_state(scale):
         rj.AffinePlant([[1.0, 0.5], [0.0, 1.0]], B), rj.MLP.from_layers(scaled), box
     )
     X0 = rj.Box([-0.2 * scale, 0.1 * scale], [0.3 * scale, 0.4 * scale])
-    tube = rj.reach(loop, X0, 2, rj.Template.octagonal(2))
-    one = rj.reach(
+    tube = recursion(loop, X0, 2, rj.Template.octagonal(2))
+    one = recursion(
         rj.ClosedLoop(loop.plant, rj.MLP.from_layers(layers), rj.Box([-0.4], [0.3])),
         rj.Box([-0.2, 0.1], [0.3, 0.4]),
         2,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.loops import recursion
 
 
 def tube(rate=0.5, n=2):
@@ -13,7 +14,7 @@ def tube(rate=0.5, n=2):
     net = rj.MLP.from_layers([(np.zeros((1, n)), [0.0])])
     plant = rj.AffinePlant(rate * jnp.eye(n), np.zeros((n, 1)))
     X0 = rj.Box([0.5] * n, [1.0] * n)
-    return rj.reach(rj.ClosedLoop(plant, net), X0, 2, rj.Template.box(n))
+    return recursion(rj.ClosedLoop(plant, net), X0, 2, rj.Template.box(n))
 
 
 HALF = rj.Polytope([[3.0, 4.0]], [1.0])  # nearest corner of [1/8, 1/4]^2: 7/8, so it is met there

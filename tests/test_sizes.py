@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.loops import recursion
 from tests.networks import simplex_region
 
 
@@ -56,7 +57,7 @@ def test_beyond_four_dimensions_the_bounding_box_is_measured():
 def test_the_log_volume_of_a_tube_sums_its_steps():
     net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2) / 2, np.zeros((2, 1))), net)
-    tube = rj.reach(loop, rj.Box([0.0, 0.0], [1.0, 1.0]), 2, rj.Template.box(2))
+    tube = recursion(loop, rj.Box([0.0, 0.0], [1.0, 1.0]), 2, rj.Template.box(2))
     assert float(rj.log_volume(tube)) == pytest.approx(-6 * np.log(2), abs=1e-6)
     np.testing.assert_allclose(rj.log_widths(tube.sets[1]), -np.log(2), atol=1e-6)
 
@@ -74,7 +75,7 @@ def test_of_parallel_facets_the_inner_one_bounds_the_volume(beyond):
 
 def test_what_is_no_set_is_named():
     net = rj.MLP.from_layers([(np.zeros((1, 1)), [0.0])])
-    tube = rj.reach(
+    tube = recursion(
         rj.ClosedLoop(rj.AffinePlant([[0.5]], [[1.0]]), net),
         rj.Box([0.0], [1.0]),
         1,

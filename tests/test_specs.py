@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.loops import recursion
 from tests.networks import he_network
 
 
@@ -18,7 +19,7 @@ def contraction(n_x=2, input_box=None):
 @pytest.fixture(scope="module")
 def tube():
     """From `[0.5, 1]^2` to `[1/8, 1/4]^2` in two steps."""
-    return rj.reach(contraction(), rj.Box([0.5, 0.5], [1, 1]), 2, rj.Template.octagonal(2))
+    return recursion(contraction(), rj.Box([0.5, 0.5], [1, 1]), 2, rj.Template.octagonal(2))
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def loose():
         rj.Box([-1.0], [1.0]),
     )
     template = rj.Template.box(2)
-    return rj.reach(loop, rj.Box([-0.2, -0.2], [0.2, 0.2]), 3, template, rj.PaperQC(False))
+    return recursion(loop, rj.Box([-0.2, -0.2], [0.2, 0.2]), 3, template, rj.PaperQC(False))
 
 
 def half_space(a, b):
@@ -125,7 +126,7 @@ def test_the_safe_set_is_the_complement_of_its_outer_half_spaces(loose):
 
 def test_three_dimensions_and_a_narrow_avoid_set():
     start = rj.Box(np.full(3, 0.5), np.ones(3))
-    tube = rj.reach(contraction(3), start, 2, rj.Template.box(3))
+    tube = recursion(contraction(3), start, 2, rj.Template.box(3))
     beside = rj.Polytope(np.vstack([np.eye(3), -np.eye(3)]), [0.1, 1, 1, 0, 0, 0])
     inside = rj.Box(np.full(3, 0.2), np.full(3, 0.21))
     assert rj.verify(tube, avoid={2: [beside]}).status is rj.VerdictStatus.PROVED
@@ -143,7 +144,7 @@ def test_a_violation_that_rounding_makes_is_no_counterexample():
     K, high = 2.0**30, 1 + 2.0**-22 * 0.9
     net = rj.MLP.from_layers([([[1.0], [0.0]], [K, K]), ([[1.0, -1.0]], [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[1.0]]), net)
-    tube = rj.reach(loop, rj.Box([0.0], [high]), 1, rj.Template.box(1))
+    tube = recursion(loop, rj.Box([0.0], [high]), 1, rj.Template.box(1))
     verdict = rj.verify(tube, goal=rj.Box([-1.0], [high]))
     assert np.nanmin(verdict.simulated["goal"]) < -1e-9
     assert verdict.status is not rj.VerdictStatus.REFUTED

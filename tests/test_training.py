@@ -12,7 +12,7 @@ import pytest
 from flax import nnx
 
 import reachjax as rj
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import box_region
 
 TEMPLATE = rj.Template.octagonal(2)
@@ -27,7 +27,7 @@ def case():
 
 
 def test_penalties_are_those_of_the_tube(case):
-    tube = rj.reach(*case, 2, TEMPLATE)
+    tube = recursion(*case, 2, TEMPLATE)
     logs = rj.volume_penalty(*case, 2, TEMPLATE)
     assert float(logs) == pytest.approx(float(rj.log_volume(tube)) / 2, rel=1e-9)
     areas = rj.volume_penalty(*case, 2, TEMPLATE, measure=rj.volume)

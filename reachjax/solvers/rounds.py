@@ -149,6 +149,7 @@ def _facet(
 ) -> _Result:
     """The rounds of one facet."""
     size = float(interval_offsets(program)[0] - program.objective.mid[0, -1])
+    transform = np.asarray(program.transform)
     results: list[_Result] = []
 
     def solve(pairs: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -160,7 +161,7 @@ def _facet(
         if attained is None:
             return moment, False
         least = min(result.offset for result in results)
-        return moment, least - attained(program.transform @ moment[:, -1]) <= cuts.gap * size
+        return moment, least - attained(transform @ moment[:, -1]) <= cuts.gap * size
 
     _in_rounds(candidates, cuts, pairs, solve)
     best = min(reversed(results), key=lambda result: result.offset)
@@ -184,7 +185,8 @@ def _joined(program: Program, candidates: Candidates, found: list[_Result]) -> R
         solution.moments[i], solution.seconds[i] = mine.moments[0], mine.seconds[0]
     # proved with all products, whose sums round a little more
     whole = program.replace(products=products)
-    again = np.fmin(sound_offsets(whole, solution.multipliers), interval_offsets(whole))
+    multipliers = np.asarray(solution.multipliers)
+    again = np.fmin(sound_offsets(whole, multipliers), interval_offsets(whole))
     offsets = np.fmax(np.array([result.offset for result in found]), again)
     optimal = np.array([result.optimal for result in found])
     return Rounds(products, Judged(offsets, optimal, solution))

@@ -14,10 +14,14 @@ from jaxtyping import Array, Float
 
 from reachjax.checks import described, whole_number
 from reachjax.reach import reach
+from reachjax.relaxation import LocalBounds
 from reachjax.requirements import AvoidSets, check_margin, requirements, shortfall
 from reachjax.sets import AbstractSet, AbstractTemplate, PolyhedralSet
 from reachjax.sizes import log_volume
 from reachjax.systems import ClosedLoop
+
+STEPWISE = {"relaxation": LocalBounds(), "window": 1}
+"""What penalties ask of `reach`: small programs of one size, compiled once."""
 
 
 def volume_penalty(
@@ -40,7 +44,8 @@ def volume_penalty(
         template: what every set looks like: facet directions, ellipsoids, or both.
         measure: the size of one set. Logarithms weigh all steps alike, and are -inf for a flat set;
             `volume` is in the units of the states and weighs large sets most.
-        options: keyword arguments of `reach`, such as `relaxation` and `solver`.
+        options: keyword arguments of `reach`, such as `solver`; the relaxation is `LocalBounds()`
+            and the window 1 unless they say otherwise.
 
     Raises:
         RuntimeError, TypeError, ValueError: as `reach` does; `measure` gives no number.
@@ -58,7 +63,7 @@ def volume_penalty(
     """
     if not callable(measure):
         raise TypeError(f"measure must be a function of a set, but {described(measure)} arrived")
-    tube = reach(loop, X0, horizon, template, **options)
+    tube = reach(loop, X0, horizon, template, **STEPWISE | options)
     sizes = [measure(region) for region in tube.sets[1:]]
     if sizes[0] is None or jnp.shape(sizes[0]) != ():
         arrived = "None" if sizes[0] is None else f"an array of shape {jnp.shape(sizes[0])}"
@@ -94,7 +99,8 @@ def specification_penalty(
         safe: where every state must be at all times.
         margin: how far the sets should be from breaking a requirement, in the units of the state; a
             little more than zero keeps the proof when the weights move on.
-        options: keyword arguments of `reach`, such as `relaxation` and `solver`.
+        options: keyword arguments of `reach`, such as `solver`; the relaxation is `LocalBounds()`
+            and the window 1 unless they say otherwise.
 
     Raises:
         RuntimeError, TypeError, ValueError: as `reach` and `verify` do.
@@ -112,5 +118,5 @@ def specification_penalty(
     check_margin(margin)
     if isinstance(loop, ClosedLoop):  # mistakes are named before anything is solved
         requirements(loop.states, whole_number("horizon", horizon, 1), goal, avoid, safe)
-    tube = reach(loop, X0, horizon, template, **options)
+    tube = reach(loop, X0, horizon, template, **STEPWISE | options)
     return shortfall(tube, goal, avoid, safe, margin=margin)

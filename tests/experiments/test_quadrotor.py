@@ -40,6 +40,7 @@ from experiments.quadrotor_model import (
 )
 from experiments.quadrotor_mpc import QuadrotorMPC
 from experiments.reference_local_bounds import local_bounds_ellipsoid_step
+from tests.loops import recursion
 
 G = 9.81
 FEW = Draws(starts=1, steps=3)
@@ -223,7 +224,7 @@ def stranger():
 
 @pytest.mark.slow
 def test_no_state_of_a_network_trained_elsewhere_is_outside_its_ellipsoid(stranger):
-    tube = rj.reach(stranger, initial_set(), STEPS, rj.EllipsoidTemplate())
+    tube = recursion(stranger, initial_set(), STEPS, rj.EllipsoidTemplate())
     states = quadrotor_simulation.simulate(
         stranger, initial_set(), STEPS, 100_000, seed=5, progress=False
     )
@@ -339,7 +340,7 @@ def test_an_interrupted_resampling_continues(tmp_path, monkeypatch):
 
 def certify_one_step(loop, states, settings):
     """Quickly, for a controller about which nothing is claimed."""
-    tube = rj.reach(loop, initial_set(), 1, rj.EllipsoidTemplate())
+    tube = recursion(loop, initial_set(), 1, rj.EllipsoidTemplate())
     verdict = rj.verify(tube, goal=quadrotor_report.goal_set(), samples=100)
     return quadrotor_report.Analysis(settings.relaxation, tube, verdict, states, 0.0)
 

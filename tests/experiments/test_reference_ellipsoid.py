@@ -13,7 +13,7 @@ import pytest
 
 import reachjax as rj
 from experiments.reference_ellipsoid import paper_ellipsoid_step
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import LoopData, plant, simulate
 
 STEPS = 3
@@ -42,7 +42,7 @@ def ellipsoid(n):
 )
 def test_volumes_of_three_steps_are_those_of_the_paper(n_x, boxed, repeated, seed):
     data = random_loop(n_x, (5, 3), seed=seed, boxed=boxed)
-    tube = rj.reach(
+    tube = recursion(
         closed_loop(data),
         rj.Ellipsoid(*ellipsoid(n_x)),
         STEPS,

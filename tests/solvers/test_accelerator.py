@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import box_region, directions, simulate
 
 pytestmark = pytest.mark.skipif(
@@ -32,7 +32,7 @@ def test_networks_in_one_batch_are_those_one_at_a_time():
 
     def offsets(net):
         closed = loop.replace(controller=net)
-        return rj.reach(closed, box, 2, rj.Template.box(2), solver=rj.InteriorPoint()).sets[-1].b
+        return recursion(closed, box, 2, rj.Template.box(2), solver=rj.InteriorPoint()).sets[-1].b
 
     nets = [jax.tree.map(lambda w, s=s: w * (1 + s), loop.controller) for s in (0.0, 0.1, 0.2)]
     stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *nets)
@@ -45,7 +45,7 @@ def test_gradients_of_a_batch_are_clarabels():
 
     def size(net, solver):
         closed = loop.replace(controller=net)
-        tube = rj.reach(closed, box, 2, rj.Template.box(2), solver=solver)
+        tube = recursion(closed, box, 2, rj.Template.box(2), solver=solver)
         return rj.log_widths(tube.sets[-1]).sum()
 
     stack = jax.tree.map(lambda w: jnp.stack([w, 1.1 * w]), loop.controller)

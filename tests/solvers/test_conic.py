@@ -11,7 +11,7 @@ from reachjax.solvers import accepted_offsets
 from reachjax.solvers.compact import compact
 from reachjax.solvers.conic import STATUSES
 from reachjax.windows import step_program
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, one_step, random_loop
 from tests.networks import box_region, directions, simulate
 
 SOLVERS = {
@@ -85,7 +85,7 @@ LIMITED = {
 def test_bounds_are_sound_when_the_solver_is_stopped_early(setting, solver, expected):
     data, region, _ = setting
     X = rj.Polytope(region.A, region.b)
-    following, certificate = rj.reach_step(
+    following, certificate = one_step(
         closed_loop(data), X, rj.Template(directions(3, extra=1)), solver=solver
     )
     assert set(certificate.statuses) <= expected

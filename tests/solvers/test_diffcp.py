@@ -15,7 +15,7 @@ import scipy.sparse as sp
 
 import reachjax as rj
 from experiments.reference import paper_lmi
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import box_region
 
 H = 1e-4
@@ -64,7 +64,7 @@ def test_the_gradient_agrees_with_diffcp(n, hidden, seed, repeated):
     )
 
     def offset(loop, X0):
-        return rj.reach(loop, X0, 1, template, rj.PaperQC(repeated)).sets[1].b[0]
+        return recursion(loop, X0, 1, template, rj.PaperQC(repeated)).sets[1].b[0]
 
     value, gradient = jax.value_and_grad(offset, argnums=(0, 1))(loop, X0)
     assert float(value) == pytest.approx(c @ x, abs=1e-5)

@@ -12,7 +12,7 @@ import reachjax as rj
 from reachjax.lmi import lagrangian
 from reachjax.solvers import bounding_box, proved_offsets
 from reachjax.windows import step_program
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import box_region, simplex_region
 
 TEMPLATE = rj.Template.octagonal(2)
@@ -29,7 +29,7 @@ def planar(seed, polytope=False, hidden=(5, 3)):
 
 
 def value(loop, X0, horizon=1, **options):
-    tube = rj.reach(loop, X0, horizon, TEMPLATE, **options)
+    tube = recursion(loop, X0, horizon, TEMPLATE, **options)
     return sum(WEIGHTS @ region.b for region in tube.sets[1:])
 
 
@@ -98,7 +98,7 @@ def test_the_gradient_of_a_step_is_the_central_difference(one_step, part):
 def five_steps(request):
     """(compiled value, arguments, their gradient); neurons leave and enter the basis on the way."""
     args = planar(*request.param)
-    tube = rj.reach(*args, 5, TEMPLATE, samples=1)
+    tube = recursion(*args, 5, TEMPLATE, samples=1)
     kept = {tuple(np.asarray(tube.proof(t).program.used).tolist()) for t in range(1, 6)}
     assert len(kept) > 1
     assert all(s is rj.SolverStatus.SOLVED for t in range(1, 6) for s in tube.proof(t).statuses)
@@ -229,7 +229,7 @@ def test_the_gradient_is_the_central_difference_in_other_dimensions(n):
     template = rj.Template.box(n)
 
     def f(loop, X0):
-        return jnp.linspace(0.5, 2.0, 2 * n) @ rj.reach(loop, X0, 2, template).sets[2].b
+        return jnp.linspace(0.5, 2.0, 2 * n) @ recursion(loop, X0, 2, template).sets[2].b
 
     gradient = jax.jit(jax.grad(f, argnums=(0, 1)))(*args)
     for part in PARTS:
@@ -249,7 +249,8 @@ def test_flat_and_thin_sets_and_points_have_gradients(widths):
 
     def f(loop, position):
         X0 = rj.Box(position, position + jnp.array(widths))
-        return rj.reach(loop, X0, 2, rj.Template.box(2)).sets[2].b @ jnp.array([1.0, 2.0, 3.0, 4.0])
+        tube = recursion(loop, X0, 2, rj.Template.box(2))
+        return tube.sets[2].b @ jnp.array([1.0, 2.0, 3.0, 4.0])
 
     args = (rj.ClosedLoop(INTEGRATOR, FORKED), jnp.array([2.0, -0.25]))
     gradient, rng = jax.grad(f, argnums=(0, 1))(*args), np.random.default_rng(0)
@@ -263,7 +264,7 @@ def test_a_coordinate_that_becomes_constant_has_a_gradient():
 
     def f(c):
         loop = rj.ClosedLoop(plant.replace(c=c), FORKED)
-        return rj.reach(loop, rj.Box([2.0, -0.25], [2.5, 0.25]), 3, rj.Template.box(2)).sets[3].b
+        return recursion(loop, rj.Box([2.0, -0.25], [2.5, 0.25]), 3, rj.Template.box(2)).sets[3].b
 
     slopes, h = jax.jacrev(f)(plant.c), 1e-4
     for k in range(2):
@@ -276,7 +277,8 @@ def test_a_coordinate_that_becomes_constant_has_a_gradient():
 def test_an_input_range_of_zero_width_has_a_one_sided_gradient():
     def f(lower, upper):
         loop = rj.ClosedLoop(INTEGRATOR, FORKED, input_box=rj.Box(lower, upper))
-        return rj.reach(loop, rj.Box([2.5, -0.25], [3.0, 0.25]), 2, rj.Template.box(2)).sets[2].b[0]
+        X0 = rj.Box([2.5, -0.25], [3.0, 0.25])
+        return recursion(loop, X0, 2, rj.Template.box(2)).sets[2].b[0]
 
     zero, h = jnp.zeros(1), 1e-6
     gradient = jax.grad(f, argnums=(0, 1))(zero, zero)
@@ -288,7 +290,7 @@ def test_normals_have_a_derivative_where_bounds_are_attained_at_corners():
     loop, X0 = planar(1, polytope=True)
 
     def f(A):
-        return WEIGHTS @ rj.reach(loop, rj.Polytope(A, X0.b), 1, TEMPLATE).sets[1].b
+        return WEIGHTS @ recursion(loop, rj.Polytope(A, X0.b), 1, TEMPLATE).sets[1].b
 
     gradient, direction = (
         jax.grad(f)(X0.A),
@@ -296,7 +298,7 @@ def test_normals_have_a_derivative_where_bounds_are_attained_at_corners():
     )
     assert relative_error(f, (X0.A,), (gradient,), (direction,), STEP) <= PROMISED
     square = rj.Polytope(*rj.Box([0.0, 0.0], [1.0, 1.0]).facets)
-    sides = jax.grad(lambda A: rj.reach(loop, rj.Polytope(A, square.b), 1, TEMPLATE).sets[1].b[0])
+    sides = jax.grad(lambda A: recursion(loop, rj.Polytope(A, square.b), 1, TEMPLATE).sets[1].b[0])
     assert np.isnan(sides(square.A)).all()  # each bound is attained on a whole side
 
 
@@ -337,7 +339,7 @@ def test_what_a_solver_proposes_has_no_derivative():
     loop, X0 = planar(0)
 
     def claimed(loop):
-        return rj.reach(loop, X0, 1, TEMPLATE).proof(1).solver_offsets.sum()
+        return recursion(loop, X0, 1, TEMPLATE).proof(1).solver_offsets.sum()
 
     assert all(np.isnan(leaf).any() for leaf in jax.tree.leaves(jax.grad(claimed)(loop).controller))
 

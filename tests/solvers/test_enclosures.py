@@ -10,7 +10,7 @@ from reachjax.recheck import sound_level
 from reachjax.sets import NormalForm
 from reachjax.solvers import Enclosure, accepted_enclosure
 from reachjax.windows import step_program
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, random_loop, recursion
 from tests.solvers.test_differentiable import PARTS, along, central_difference, dot
 
 
@@ -99,7 +99,7 @@ def final(template, horizon, solver=rj.Auto(), relaxation=rj.LocalBounds()):  # 
     """A number that depends on centre and shape of the last set, and on all volumes."""
 
     def f(loop, X0):
-        tube = rj.reach(loop, X0, horizon, template, relaxation, solver=solver)
+        tube = recursion(loop, X0, horizon, template, relaxation, solver=solver)
         n, last = loop.states, tube.sets[-1]
         weights = jnp.asarray(np.random.default_rng(n).normal(size=(n, n)))
         linear = last.center @ jnp.arange(1.0, n + 1) + jnp.sum(weights * last.shape)

@@ -29,7 +29,7 @@ from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 from reachjax.solvers.factorisations import inverse_factor
 from reachjax.solvers.trimming import trimmed
 from reachjax.windows import step_program
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import (
     affine_network,
     box_region,
@@ -202,7 +202,7 @@ def test_facets_are_optimal_and_solved_or_inaccurate(answer):
 def test_no_sampled_successor_is_outside(seed):
     data, region = random_loop(3, seed=seed), box_region(3, seed)
     loop, template = closed_loop(data), rj.Template(directions(3, seed, extra=2))
-    following, certificate = rj.reach_step(loop, box_of(3, seed), template, solver=SOLVER)
+    following, certificate = one_step(loop, box_of(3, seed), template, solver=SOLVER)
     states = np.vstack([region.corners, region.sample(20_000, seed)])
     assert np.all(following.contains(simulate(data, states, 1)[1]))
     assert set(certificate.statuses) == {rj.SolverStatus.SOLVED}
@@ -478,7 +478,7 @@ def test_gradients_of_ellipsoids_of_weights_that_are_no_numbers_are_none(shape):
 
     def size(net):
         template = rj.EllipsoidTemplate(shape)
-        return rj.log_volume(rj.reach(loop.replace(controller=net), X, 1, template))
+        return rj.log_volume(recursion(loop.replace(controller=net), X, 1, template))
 
     astray = jax.tree.map(lambda w: np.nan * w, loop.controller)
     gradient = jax.jit(jax.grad(size))(astray)

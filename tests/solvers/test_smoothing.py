@@ -16,7 +16,7 @@ from reachjax.solvers.compact import compact
 from reachjax.solvers.primal_dual import DAMPING
 from reachjax.solvers.smoothing import smoothed_offsets
 from reachjax.windows import step_program
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import box_region, directions, simulate
 from tests.solvers.test_differentiable import along, planar, relative_error
 from tests.solvers.test_differentiable import value as planar_value
@@ -122,8 +122,8 @@ def test_offsets_are_sound_and_looser_by_no_more_than_their_weight(weight, relax
     loop, template = closed_loop(data), rj.Template(directions(3, 0, extra=2))
     X = rj.Polytope(region.A, region.b)
     options = {"relaxation": relaxation, "solver": rj.CentralPath(weight)}
-    following, certificate = rj.reach_step(loop, X, template, **options)
-    best, _ = rj.reach_step(loop, X, template, **options | {"solver": rj.Clarabel()})
+    following, certificate = one_step(loop, X, template, **options)
+    best, _ = one_step(loop, X, template, **options | {"solver": rj.Clarabel()})
     states = np.vstack([region.corners, region.sample(20_000, 0)])
     assert np.all(following.contains(simulate(data, states, 1)[1]))
     unit = np.linalg.norm(certificate.program.objective.mid[:, :-1], axis=1)
@@ -139,7 +139,7 @@ def test_a_kink_is_gone():
 
     def offset(a, solver):
         loop = rj.ClosedLoop(rj.AffinePlant(jnp.array([[1.0, a], [0.0, 1.0]]), [[0.0], [0.0]]), net)
-        return rj.reach(loop, box, 1, rj.Template.box(2), solver=solver).sets[1].b[0]
+        return recursion(loop, box, 1, rj.Template.box(2), solver=solver).sets[1].b[0]
 
     smooth = partial(offset, solver=rj.CentralPath(1e-1))
     h = 1e-4
@@ -157,7 +157,7 @@ def test_where_a_neuron_becomes_stable_the_offset_jumps_by_less_than_the_weight(
         net = rj.MLP.from_layers([([[1.0, 0.3], [-0.5, 1.0]], [bias, 0.1]), ([[0.7, -0.4]], [0.0])])
         loop = rj.ClosedLoop(rj.AffinePlant(0.5 * np.eye(2), [[1.0], [0.5]]), net)
         template = rj.Template.box(2)
-        following, proof = rj.reach_step(loop, box, template, solver=rj.CentralPath(weight))
+        following, proof = one_step(loop, box, template, solver=rj.CentralPath(weight))
         program = proof.program
         unit = np.linalg.norm(program.objective.mid[:, :-1], axis=1)
         return following.b, unit, len(compact(program).columns)
@@ -248,7 +248,7 @@ def test_points_have_their_offsets_and_derivatives(width):
     def bound(shift):
         X = rj.Box([0.3 + shift, 0.3], [0.3 + shift + width, 0.3 + width])
         template = rj.Template.box(2)
-        return rj.reach(loop, X, 1, template, solver=rj.CentralPath(1e-2)).sets[1].b[0]
+        return recursion(loop, X, 1, template, solver=rj.CentralPath(1e-2)).sets[1].b[0]
 
     h = 1e-4
     slope = (bound(h) - bound(-h)) / (2 * h)
@@ -269,9 +269,7 @@ def test_what_is_proposed_has_no_derivative():
 def test_ellipsoids_are_those_of_the_interior_point_method():
     loop = closed_loop(random_loop(2))
     volumes = [
-        float(
-            rj.reach_step(loop, round_of(2, 0), rj.EllipsoidTemplate(), solver=solver)[0].volume()
-        )
+        float(one_step(loop, round_of(2, 0), rj.EllipsoidTemplate(), solver=solver)[0].volume())
         for solver in (rj.CentralPath(), rj.InteriorPoint())
     ]
     assert volumes[0] == pytest.approx(volumes[1], rel=1e-6)

@@ -15,6 +15,7 @@ from reachjax.certificates import (
     EllipsoidCertificate,
     MixedCertificate,
 )
+from reachjax.partitions import PartitionedTube, reach_partitioned
 from reachjax.reach import ReachTube, reach, reach_step
 from reachjax.relaxation import AbstractRelaxation, AllProducts, CuttingPlanes, LocalBounds, PaperQC
 from reachjax.requirements import shortfall
@@ -41,7 +42,7 @@ from reachjax.solvers import (
     InteriorPoint,
     SolverStatus,
 )
-from reachjax.specs import Counterexample, Verdict, VerdictStatus, verify
+from reachjax.specs import verify
 from reachjax.systems import (
     MLP,
     AbstractActivation,
@@ -58,6 +59,7 @@ from reachjax.training import (
     specification_penalty,
     volume_penalty,
 )
+from reachjax.verdicts import Counterexample, Verdict, VerdictStatus
 
 __version__ = "0.1.0"
 
@@ -91,6 +93,7 @@ __all__ = [
     "MixedCertificate",
     "MixedTemplate",
     "PaperQC",
+    "PartitionedTube",
     "PenaltySchedule",
     "PolyhedralSet",
     "Polytope",
@@ -105,6 +108,7 @@ __all__ = [
     "log_volume",
     "log_widths",
     "reach",
+    "reach_partitioned",
     "reach_step",
     "runge_kutta",
     "shortfall",

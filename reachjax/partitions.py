@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from reachjax.cells import grid, halves
 from reachjax.checks import (
     described,
     is_concrete,
@@ -26,20 +27,15 @@ from reachjax.checks import (
 from reachjax.pytrees import Replaceable, pytree
 from reachjax.reach import SAMPLES, ReachTube, reach
 from reachjax.relaxation import AbstractRelaxation, CuttingPlanes
-from reachjax.sets import (
-    AbstractSet,
-    Box,
-    Ellipsoid,
-    Intersection,
-    PolyhedralSet,
-    Polytope,
-    Template,
-)
-from reachjax.solvers import AbstractSolver, Auto, bounding_box
+from reachjax.sets import AbstractSet, Polytope, Template
+from reachjax.solvers import AbstractSolver, Auto, bounding_box, support
 from reachjax.systems import ClosedLoop
 
 Bar = Callable[[Iterable[Any]], Iterable[Any]]
 """Wraps an iteration over cells, such as `tqdm.tqdm`."""
+
+NO_GAP = 1e-9
+"""A gap of this part of a set's width is none."""
 
 
 @pytree
@@ -61,6 +57,10 @@ class PartitionedTube(Replaceable):
     def horizon(self) -> int:
         """The number of steps."""
         return self.tubes[0].horizon
+
+    def sets(self, t: int) -> tuple[AbstractSet, ...]:
+        """One set of each cell: every state at time `t` is surely in one of them."""
+        return tuple(tube.sets[t] for tube in self.tubes)
 
     def bounds(self, t: int) -> Float[np.ndarray, " m"]:
         """What every facet's value at time `t` surely does not exceed: the largest of the cells'.
@@ -85,37 +85,6 @@ class PartitionedTube(Replaceable):
             ValueError: there is no certificate for this time.
         """
         return self.bounds(t) - self.witnesses(t)
-
-
-def halves(X: AbstractSet, axis: int) -> tuple[AbstractSet, AbstractSet]:
-    """The parts of a set on either side of the middle of its bounding box.
-
-    Raises:
-        TypeError: the set is of an unknown kind.
-
-    Example:
-        >>> [cell.upper.tolist() for cell in halves(Box([0.0, 0.0], [1.0, 2.0]), axis=1)]
-        [[1.0, 1.0], [1.0, 2.0]]
-    """
-    box = bounding_box(X)
-    middle = box.center[axis]
-    below = Box(box.lower, box.upper.at[axis].set(middle))
-    above = Box(box.lower.at[axis].set(middle), box.upper)
-    return _within(X, below), _within(X, above)
-
-
-def _within(X: AbstractSet, box: Box) -> AbstractSet:
-    """The points of a set that lie in a box."""
-    if isinstance(X, Box):
-        return box
-    if isinstance(X, Ellipsoid):
-        return Intersection(box, X)
-    if isinstance(X, Intersection):
-        return X.replace(polytope=_within(X.polytope, box))
-    if isinstance(X, PolyhedralSet):
-        (A, b), (C, d) = X.facets, box.facets
-        return Polytope(jnp.concatenate([A, C]), jnp.concatenate([b, d]))
-    raise TypeError(f"X0 must be a set that can be split, but {described(X)} arrived")
 
 
 def reach_partitioned(
@@ -146,7 +115,7 @@ def reach_partitioned(
         solver: what solves the semidefinite programs.
         cells: a number for each coordinate: equal parts of the box around the initial set. Or how
             many in all: then those cells are halved at which the union's gap is widest, until there
-            are as many.
+            are as many or no gap is left.
         executor: runs the cells' programs: any with the interface of `concurrent.futures`; threads
             by default. Arguments are sent as numpy arrays.
         start: the time of `X0`, for time-varying loops.
@@ -160,7 +129,7 @@ def reach_partitioned(
         ValueError: as `reach`; the arguments are traced, or there is no cell.
 
     Example:
-        >>> from reachjax import MLP, AffinePlant
+        >>> from reachjax import MLP, AffinePlant, Box
         >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
         >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
         >>> tube = reach_partitioned(loop, Box([-1.0], [2.0]), 2, Template.box(1), cells=(3,))
@@ -192,7 +161,7 @@ def reach_partitioned(
     try:
         run = _Run(loop, options, own or executor, progress)
         if isinstance(cells, Sequence):
-            tubes = run.tubes(_grid(X0, cells))
+            tubes = run.tubes(grid(X0, cells))
         else:
             tubes = _guided(run, X0, whole_number("cells", cells, 1))
     finally:
@@ -238,57 +207,32 @@ def _tube(loop: ClosedLoop, cell: AbstractSet, template: Template, options: dict
         return jax.device_get(reach(loop, cell, template=template, **options))
 
 
-def _grid(X0: AbstractSet, counts: Sequence[int]) -> list[AbstractSet]:
-    """Equal parts of the box around a set, those that the set reaches."""
-    if len(counts) != X0.dimension:
-        raise ValueError(
-            f"cells must be a number for each of {X0.dimension} coordinates, but {counts} arrived"
-        )
-    box, ends = bounding_box(X0), []
-    for i, count in enumerate(counts):
-        parts = whole_number(f"cells[{i}]", count, 1) + 1
-        ends.append(np.linspace(box.lower[i], box.upper[i], parts))
-    cells = []
-    for index in np.ndindex(*counts):
-        lower = [end[i] for end, i in zip(ends, index, strict=True)]
-        upper = [end[i + 1] for end, i in zip(ends, index, strict=True)]
-        cells.append(_within(X0, Box(lower, upper)))
-    return [cell for cell in cells if not _is_empty(cell)]
-
-
-def _is_empty(X: AbstractSet) -> bool:
-    """Whether a cell holds no point of the set that was cut."""
-    if isinstance(X, Box):
-        return False
-    try:
-        bounding_box(X)
-    except ValueError:
-        return True
-    return False
-
-
 def _guided(run: _Run, X0: AbstractSet, count: int) -> list[ReachTube]:
-    """Halve the cells at which the union's gap is widest, along their widest coordinate."""
-    widths = np.asarray(bounding_box(X0).widths)
-    scale = np.where(widths > 0, widths, np.inf)
+    """Halve the cells at which the union's gap is widest, along their longest side."""
+    sides = np.asarray(bounding_box(X0).widths)
+    sides = np.where(sides > 0, sides, np.inf)  # a side without length is not halved
     tubes = run.tubes([X0])
+    widths = _widths(tubes[0])
     while len(tubes) < count:
-        worst = _worst(tubes, min(math.ceil(len(tubes) / 4), count - len(tubes)))
-        split = []
-        for i in worst:
-            cell = tubes[i].sets[0]
-            axis = int(np.argmax(np.asarray(bounding_box(cell).widths) / scale))
-            split += [part for part in halves(cell, axis) if not _is_empty(part)]
-        kept = [tube for i, tube in enumerate(tubes) if i not in worst]
-        tubes = kept + run.tubes(split)
+        worst = _worst(tubes, widths)[: min(math.ceil(len(tubes) / 4), count - len(tubes))]
+        if not worst:
+            break
+        parts = [half for i in worst for half in halves(tubes[i].sets[0], sides)]
+        tubes = [tube for i, tube in enumerate(tubes) if i not in worst] + run.tubes(parts)
     return tubes
 
 
-def _worst(tubes: list[ReachTube], count: int) -> list[int]:
-    """The cells whose bounds leave the widest gaps in the union, in units of each set's width."""
+def _widths(tube: ReachTube) -> Float[np.ndarray, "h m"]:
+    """The width of each set in the direction of each facet."""
+    sets = tube.sets[1:]
+    return np.array([X.b + support(X, -X.A) for X in sets if isinstance(X, Polytope)])
+
+
+def _worst(tubes: list[ReachTube], widths: Float[np.ndarray, "h m"]) -> list[int]:
+    """The cells whose bounds leave gaps in the union, the widest first, in units of its widths."""
     steps = range(1, tubes[0].horizon + 1)
     bounds = np.array([[tube.proof(t).bounds for t in steps] for tube in tubes])
     witnesses = np.array([[tube.proof(t).witnesses for t in steps] for tube in tubes]).max(axis=0)
-    extent = np.ptp(np.concatenate([bounds.max(axis=0), witnesses], axis=1), axis=1)
-    beyond = (bounds - witnesses) / np.maximum(extent, 1e-300)[:, None]
-    return np.argsort(-beyond.max(axis=(1, 2)), stable=True)[:count].tolist()
+    beyond = (bounds - witnesses) / np.where(widths > 0, widths, np.inf)
+    widest = beyond.max(axis=(1, 2))
+    return [int(i) for i in np.argsort(-widest, stable=True) if widest[i] > NO_GAP]

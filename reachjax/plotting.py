@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from reachjax.partitions import PartitionedTube
 from reachjax.reach import ReachTube
 from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet
 
@@ -114,7 +116,7 @@ def _cut(corners: np.ndarray, ellipse: Ellipsoid) -> np.ndarray:
 
 
 def plot_tube(
-    tube: ReachTube,
+    tube: ReachTube | PartitionedTube,
     ax: Axes | None = None,
     samples: int = 2000,
     coordinates: tuple[int, int] = (0, 1),
@@ -124,23 +126,34 @@ def plot_tube(
     Args:
         tube: of a loop with two or more states.
         ax: where to draw; a new figure by default.
-        samples: how many trajectories to show.
+        samples: how many trajectories to show; of a partitioned tube so many from each cell.
         coordinates: the two states to draw, counted from 0: the horizontal axis, then the vertical
             one.
 
     Raises:
         ValueError: the loop has one state, or the coordinates are not two of its states.
     """
-    i, j = _two_of(tube.loop.states, coordinates)
+    first, *others = tube.tubes if isinstance(tube, PartitionedTube) else (tube,)
+    i, j = _two_of(first.loop.states, coordinates)
     ax = _axes(ax)
-    trajectories = np.asarray(tube.simulate(samples))[:, :, [i, j]]
-    for t, region in enumerate(tube.sets):
-        ax.scatter(*trajectories[:, t].T, **SAMPLES, label="simulated" if t == 0 else None)
-        first = {"edgecolor": "black", "label": "initial set"} if t == 0 else {}
-        plot_set(region, ax, (i, j), **(first or {"label": "certified" if t == 1 else None}))
+    _plot_cell(first, ax, samples, i, j, ("simulated", "initial set", "certified"))
+    for cell in others:
+        _plot_cell(cell, ax, samples, i, j, (None, None, None))
     ax.set_xlabel(f"$x_{{{i + 1}}}$")
     ax.set_ylabel(f"$x_{{{j + 1}}}$")
     return ax
+
+
+def _plot_cell(
+    tube: ReachTube, ax: Axes, samples: int, i: int, j: int, labels: Sequence[str | None]
+) -> None:
+    """The sets of one tube over its simulated states, with an entry each in the legend."""
+    simulated, initial, certified = labels
+    trajectories = np.asarray(tube.simulate(samples))[:, :, [i, j]]
+    for t, region in enumerate(tube.sets):
+        ax.scatter(*trajectories[:, t].T, **SAMPLES, label=None if t else simulated)
+        first = {"edgecolor": "black", "label": initial}
+        plot_set(region, ax, (i, j), **({"label": None if t > 1 else certified} if t else first))
 
 
 def _axes(ax: Axes | None) -> Axes:

@@ -1,109 +1,30 @@
 """Reach-avoid specifications, decided from a tube (the paper's equations (reach_avoid)).
 
-A verdict has three values. *Proved*: every state is surely where it must be, and the margins say by
-how much. *Refuted*: a simulated trajectory breaks the specification, and is given. *Unknown*: the
-sets are too large to prove it, and no trajectory breaks it; margins of both kinds say how far apart
-they are. Margins are distances in the units of the state.
+Certified margins prove a requirement. Trajectories are simulated in search of a counterexample; one
+of them refutes it only if it surely begins in the initial set and breaks it whatever rounding did.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import enum
-
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from reachjax.bounds import successor_box
 from reachjax.checks import whole_number
+from reachjax.partitions import PartitionedTube
 from reachjax.reach import ReachTube
 from reachjax.requirements import AvoidSets, Requirement, of_tube
 from reachjax.rounding import gamma
 from reachjax.sets import Box, PolyhedralSet
 from reachjax.solvers import SolverStatus
+from reachjax.verdicts import Counterexample, Verdict, VerdictStatus, of_cells
 
 SUSPECTS = 5
 """So many of the worst trajectories of each requirement are examined with their rounding."""
 
 
-class VerdictStatus(enum.Enum):
-    """What is known of a specification."""
-
-    PROVED = "proved"
-    REFUTED = "refuted"
-    UNKNOWN = "unknown"
-
-
-@dataclasses.dataclass(frozen=True)
-class Counterexample:
-    """A simulated trajectory that breaks a specification.
-
-    Attributes:
-        requirement: which part it breaks: `goal`, `safe` or `avoid[i]`.
-        time: when.
-        violation: by how much, in the units of the state.
-        states: `(horizon + 1, n_x)`, the whole trajectory.
-        inputs: `(horizon, n_u)`.
-    """
-
-    requirement: str
-    time: int
-    violation: float
-    states: Float[np.ndarray, "h+1 n_x"]
-    inputs: Float[np.ndarray, "h n_u"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Verdict:
-    """What is known of a specification, part by part.
-
-    Attributes:
-        status: proved, refuted or unknown.
-        margins: for each requirement `(horizon + 1,)`, the certified margin at each time; NaN where
-            nothing is required. Negative: not proved.
-        simulated: the same for the sampled trajectories. Negative: broken.
-        counterexample: the trajectory, when refuted.
-        unsolved: how many of the tube's facets the solver did not solve to its tolerance: their
-            bounds hold, but may be loose.
-    """
-
-    status: VerdictStatus
-    margins: dict[str, Float[np.ndarray, " h+1"]]
-    simulated: dict[str, Float[np.ndarray, " h+1"]]
-    counterexample: Counterexample | None = None
-    unsolved: int = 0
-
-    def __bool__(self) -> bool:
-        raise TypeError("a verdict has three values: compare verdict.status with VerdictStatus")
-
-    def __str__(self) -> str:
-        lines = [self.status.name]
-        for name, margins in self.margins.items():
-            t = int(np.nanargmin(margins))
-            simulated = float(np.nanmin(self.simulated[name]))
-            lines.append(
-                f"  {name}: certified margin {margins[t]:+.4g} (smallest, at t = {t}), "
-                f"simulated margin {simulated:+.4g}"
-            )
-        if self.counterexample is not None:
-            e = self.counterexample
-            lines.append(
-                f"  counterexample: from {np.round(e.states[0], 4).tolist()} it breaks "
-                f"{e.requirement} at t = {e.time} by {e.violation:.4g}"
-            )
-        if self.unsolved:
-            lines.append(
-                f"  {self.unsolved} programs were not solved to tolerance: their bounds hold, but "
-                "may be loose (see certificate.statuses)"
-            )
-        return "\n".join(lines)
-
-    __repr__ = __str__
-
-
 def verify(
-    tube: ReachTube,
+    tube: ReachTube | PartitionedTube,
     goal: PolyhedralSet | None = None,
     avoid: AvoidSets | None = None,
     safe: PolyhedralSet | None = None,
@@ -114,13 +35,13 @@ def verify(
     """Decide a reach-avoid specification from a tube.
 
     Args:
-        tube: certified sets for `t = 0 .. horizon`.
+        tube: certified sets for `t = 0 .. horizon`; of a partitioned tube, those of every cell.
         goal: where every state must be at the horizon.
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
             time to a sequence.
         safe: where every state must be at all times (its complement is avoided).
         samples: how many trajectories are simulated in search of a counterexample, besides those
-            from corners and witnesses.
+            from corners and witnesses; so many from each cell.
         seed: of the samples.
 
     Raises:
@@ -139,6 +60,9 @@ def verify(
         >>> verify(tube, goal=Box([0.0], [0.4])).counterexample.states.ravel().round(3).tolist()
         [2.0, 1.2, 0.72, 0.432]
     """
+    if isinstance(tube, PartitionedTube):
+        options = {"samples": samples, "seed": seed}
+        return of_cells([verify(each, goal, avoid, safe, **options) for each in tube.tubes])
     required = of_tube(tube, goal, avoid, safe)
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)

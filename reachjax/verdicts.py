@@ -1,0 +1,109 @@
+"""What is known of a specification: it is proved, refuted, or neither.
+
+*Proved*: every state is surely where it must be, and the margins say by how much. *Refuted*: a
+simulated trajectory breaks the specification, and is given. *Unknown*: the sets are too large to
+prove it, and no trajectory breaks it; margins of both kinds say how far apart they are. Margins are
+distances in the units of the state.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+import numpy as np
+from jaxtyping import Float
+
+
+class VerdictStatus(enum.Enum):
+    """What is known of a specification."""
+
+    PROVED = "proved"
+    REFUTED = "refuted"
+    UNKNOWN = "unknown"
+
+
+@dataclasses.dataclass(frozen=True)
+class Counterexample:
+    """A simulated trajectory that breaks a specification.
+
+    Attributes:
+        requirement: which part it breaks: `goal`, `safe` or `avoid[i]`.
+        time: when.
+        violation: by how much, in the units of the state.
+        states: `(horizon + 1, n_x)`, the whole trajectory.
+        inputs: `(horizon, n_u)`.
+    """
+
+    requirement: str
+    time: int
+    violation: float
+    states: Float[np.ndarray, "h+1 n_x"]
+    inputs: Float[np.ndarray, "h n_u"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What is known of a specification, part by part.
+
+    Attributes:
+        status: proved, refuted or unknown.
+        margins: for each requirement `(horizon + 1,)`, the certified margin at each time; NaN where
+            nothing is required. Negative: not proved.
+        simulated: the same for the sampled trajectories. Negative: broken.
+        counterexample: the trajectory, when refuted.
+        unsolved: how many of the tube's facets the solver did not solve to its tolerance: their
+            bounds hold, but may be loose.
+    """
+
+    status: VerdictStatus
+    margins: dict[str, Float[np.ndarray, " h+1"]]
+    simulated: dict[str, Float[np.ndarray, " h+1"]]
+    counterexample: Counterexample | None = None
+    unsolved: int = 0
+
+    def __bool__(self) -> bool:
+        raise TypeError("a verdict has three values: compare verdict.status with VerdictStatus")
+
+    def __str__(self) -> str:
+        lines = [self.status.name]
+        for name, margins in self.margins.items():
+            t = int(np.nanargmin(margins))
+            simulated = float(np.nanmin(self.simulated[name]))
+            lines.append(
+                f"  {name}: certified margin {margins[t]:+.4g} (smallest, at t = {t}), "
+                f"simulated margin {simulated:+.4g}"
+            )
+        if self.counterexample is not None:
+            e = self.counterexample
+            lines.append(
+                f"  counterexample: from {np.round(e.states[0], 4).tolist()} it breaks "
+                f"{e.requirement} at t = {e.time} by {e.violation:.4g}"
+            )
+        if self.unsolved:
+            lines.append(
+                f"  {self.unsolved} programs were not solved to tolerance: their bounds hold, but "
+                "may be loose (see certificate.statuses)"
+            )
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def of_cells(verdicts: list[Verdict]) -> Verdict:
+    """What is known of a union of cells: proved if all of them are, refuted if one of them is."""
+    broken = [v.counterexample for v in verdicts if v.counterexample is not None]
+    proved = all(verdict.status is VerdictStatus.PROVED for verdict in verdicts)
+    status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
+    return Verdict(
+        status=VerdictStatus.REFUTED if broken else status,
+        margins=_least([verdict.margins for verdict in verdicts]),
+        simulated=_least([verdict.simulated for verdict in verdicts]),
+        counterexample=max(broken, key=lambda example: example.violation, default=None),
+        unsolved=sum(verdict.unsolved for verdict in verdicts),
+    )
+
+
+def _least(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The smallest of every cell's margins."""
+    return {name: np.min([part[name] for part in parts], axis=0) for name in parts[0]}

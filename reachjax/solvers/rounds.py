@@ -1,6 +1,6 @@
 """Products added round by round, on the host: solve, see what the moments violate, solve again.
 
-Each facet has its own products: those whose multipliers are at zero are dropped before the next.
+Each facet has its own products and begins with those that the one before found of use.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from reachjax.lmi import Program
 from reachjax.recheck import interval_offsets, sound_offsets
@@ -86,12 +86,28 @@ def products_around(
     """
     candidates, n = Candidates(program, layout), len(program.transform)
 
-    def solve(pairs: np.ndarray) -> tuple[np.ndarray, bool]:
+    def solve(pairs: np.ndarray) -> _Round:
         given = program.replace(products=joint(candidates.core, pairs))
-        moments = np.asarray(solver.enclose(given, form).moments)
-        return moments[:n, :n] / moments[n - 1, n - 1], False
+        enclosure = solver.enclose(given, form)
+        moments = np.asarray(enclosure.moments)
+        moment = moments[:n, :n] / moments[n - 1, n - 1]
+        return _Round(moment, _idle(np.asarray(enclosure.multipliers), len(pairs)), False)
 
     return joint(candidates.core, _in_rounds(candidates, cuts, NONE, solve))
+
+
+class _Round(NamedTuple):
+    """What one round shows: the moments, which added products are idle, whether that is enough."""
+
+    moment: Float[np.ndarray, "n n"]
+    idle: Bool[np.ndarray, " p"]
+    enough: bool
+
+
+def _idle(multipliers: Float[np.ndarray, " K"], added: int) -> Bool[np.ndarray, " p"]:
+    """Which of the products added, the last ones, have a multiplier at zero."""
+    largest = abs(multipliers).max(initial=0.0)
+    return multipliers[len(multipliers) - added :] <= IDLE * largest
 
 
 class _Result(NamedTuple):
@@ -105,37 +121,39 @@ class _Result(NamedTuple):
     @property
     def of_use(self) -> Int[np.ndarray, "q 2"]:
         """The added products whose multipliers are not at zero."""
-        weights = np.asarray(self.solution.multipliers[0])
-        added = weights[len(weights) - len(self.pairs) :]
-        return self.pairs[added > IDLE * max(1e-300, abs(weights).max(initial=0.0))]
+        return self.pairs[~_idle(np.asarray(self.solution.multipliers[0]), len(self.pairs))]
 
 
 def _in_rounds(
     candidates: Candidates,
     cuts: CuttingPlanes,
     pairs: Int[np.ndarray, "p 2"],
-    solve: Callable[[Int[np.ndarray, "q 2"]], tuple[Float[np.ndarray, "n n"], bool]],
+    solve: Callable[[Int[np.ndarray, "q 2"]], _Round],
 ) -> Int[np.ndarray, "q 2"]:
-    """Solve and add what is violated, by turns; returns what was added.
+    """Solve and add what is violated, by turns; returns what there was at last.
 
-    When that is enough or the rounds have run out, the products of `LocalBounds` that are violated
-    are added all the same, until none is: no bound is looser than its.
+    Products that stay idle for two rounds are dropped. When there are enough or the rounds have run
+    out, the products of `LocalBounds` that are violated are added all the same, until none is: no
+    bound is looser than its.
 
     Args:
         candidates: what may be added.
         cuts: how many rounds, and of how many products.
         pairs: what is added from the beginning.
-        solve: the moments with these products added, and whether that is enough.
+        solve: what a round with these products shows.
     """
+    idle = np.zeros(len(pairs), dtype=bool)
     for number in itertools.count():
-        moment, enough = solve(pairs)
-        if not np.isfinite(moment).all():
+        shown = solve(pairs)
+        if not np.isfinite(shown.moment).all():
             break
-        batch = None if enough or number >= cuts.rounds else cuts.batch
-        more = candidates.violated(moment, pairs, batch)
+        last = shown.enough or number >= cuts.rounds
+        more = candidates.violated(shown.moment, pairs, None if last else cuts.batch)
         if not len(more):
             break
-        pairs = np.concatenate([pairs, more])
+        kept = np.full(len(pairs), True) if last else ~(idle & shown.idle)
+        pairs = np.concatenate([pairs[kept], more])
+        idle = np.concatenate([shown.idle[kept], np.zeros(len(more), dtype=bool)])
     return pairs
 
 
@@ -152,16 +170,18 @@ def _facet(
     transform = np.asarray(program.transform)
     results: list[_Result] = []
 
-    def solve(pairs: np.ndarray) -> tuple[np.ndarray, bool]:
+    def solve(pairs: np.ndarray) -> _Round:
         given = program.replace(products=joint(candidates.core, pairs))
         solution = solver.solve(given)
         (offset,), (optimal,) = accepted_offsets(given, solution)
         results.append(_Result(pairs, float(offset), bool(optimal), solution))
         moment = np.asarray(solution.moments[0])
+        idle = _idle(np.asarray(solution.multipliers[0]), len(pairs))
         if attained is None:
-            return moment, False
+            return _Round(moment, idle, False)
         least = min(result.offset for result in results)
-        return moment, least - attained(transform @ moment[:, -1]) <= cuts.gap * size
+        enough = least - attained(transform @ moment[:, -1]) <= cuts.gap * size
+        return _Round(moment, idle, enough)
 
     _in_rounds(candidates, cuts, pairs, solve)
     best = min(reversed(results), key=lambda result: result.offset)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 from numpy import ndarray
-from scipy.optimize import LinearConstraint, OptimizeResult, linprog, milp
+from scipy.optimize import OptimizeResult, linprog, milp
 
 import reachjax as rj
 from reachjax.checks import require_kind
@@ -197,7 +197,7 @@ class _Program:
             objective,
             integrality=whole,
             bounds=(lower, upper),
-            constraints=LinearConstraint(G, ub=h),
+            constraints=(G, np.full(len(h), -np.inf), h),
             options={"mip_rel_gap": 0.0},
         )
         _require_optimal(found)

@@ -79,6 +79,7 @@ class Simulations:
         self._box = X0.bounding_box()
         states = initial_states(X0, samples, seed)
         self._states = np.asarray(states)
+        self._middle = self._states.mean(axis=0)
         self._trajectories = np.asarray(loop.simulate(states, horizon, start))
 
     def climb(
@@ -97,10 +98,9 @@ class Simulations:
             states: where it begins; those that are no numbers begin at the middle of the samples.
         """
         known = np.isfinite(states).all(axis=1, keepdims=True)
-        begin = np.where(known, states, self._states.mean(axis=0))
-        found = ascended(
-            self._loop, self._X0, self._box, begin, region, which, k, self._horizon, self._start
-        )
+        begin = np.where(known, states, self._middle)
+        fixed = self._loop, self._X0, self._box, self._middle
+        found = ascended(*fixed, begin, region, which, k, self._horizon, self._start)
         trajectories = self._loop.simulate(found, self._horizon, self._start)
         inside = np.asarray(self._X0.contains(found)) & np.isfinite(trajectories).all(axis=(1, 2))
         self._states = np.concatenate([self._states, np.asarray(found)[inside]])

@@ -152,7 +152,7 @@ class Template(AbstractTemplate):
         facets: int = 12,
         *,
         start: int = 0,
-        samples: int = 1000,
+        samples: int = 10_000,
         seed: int = 0,
     ) -> Template:
         """Directions that fit the simulated states of each step.

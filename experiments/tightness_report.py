@@ -117,6 +117,12 @@ def write(results: list[Result], path: Path) -> None:
                     writer.writerow(row)
 
 
+def _power(value: float, _) -> str:
+    """The label of a power of ten."""
+    at_most = "\\leq " if value <= FLOOR else ""
+    return f"${at_most}10^{{{np.log10(value):.0f}}}$"
+
+
 def draw(results: list[Result], *paths: Path) -> None:
     """A row of two panels a group: how loose at each step, and at the last against seconds."""
     import matplotlib.pyplot as plt
@@ -127,6 +133,7 @@ def draw(results: list[Result], *paths: Path) -> None:
     for (left, right), result in zip(panels, results, strict=True):
         right.sharey(left)
         steps = np.arange(1, result.group.horizon + 1)
+        tightest = "exact" if result.reference.exact else "simulated"
         for name, each in result.measured.items():
             colour, marker = STYLES[name]
             excess = np.maximum(result.excess(name), FLOOR)
@@ -134,12 +141,16 @@ def draw(results: list[Result], *paths: Path) -> None:
             aside = steps + DODGE * (list(STYLES).index(name) - (len(STYLES) - 1) / 2)
             left.plot(aside, np.median(excess, axis=0), label=name, linewidth=1.2, **style)
             right.plot(each.seconds, excess[:, -1], linestyle="none", **style)
-        left.set(yscale="log", xticks=steps, ylabel="size / tightest - 1", title=result.group.name)
+        left.set(
+            yscale="log", xticks=steps, ylabel=f"size / {tightest} - 1", title=result.group.name
+        )
         right.set(xscale="log", title=f"{result.group.name}, t = {result.group.horizon}")
         for ax in (left, right):
             ax.axhspan(FLOOR, 2 * FLOOR, color="tab:green", alpha=0.15, linewidth=0)
             ax.grid(alpha=0.3)
         left.set_ylim(bottom=FLOOR)
+        left.yaxis.set_major_formatter(_power)
+        right.tick_params(labelleft=False)
     panels[-1, 0].set_xlabel("step t")
     panels[-1, 1].set_xlabel("seconds a tube, warm")
     found = {

@@ -35,7 +35,7 @@ t: size of the certified set over that of the tightest set of its template, the
    median over loops; in the plane the area, else the worst of the box's widths
 gap: the worst bound less the method's own witness, over facets, steps and loops
 s/tube: of a warm call, the median over loops;  first: of the first call, which
-   compiles what no row above has compiled
+   compiles what no row above has compiled;  * first, longer than --patience
 paper: with lambda_ij, as local bounds;  cuts: cutting planes, from local bounds
    without lambda_ij;  cells: 4 x 4, or 16 split where gaps are worst, of these"""
 
@@ -74,10 +74,11 @@ def table(result: Result) -> Table:
         shown.add_column(heading, justify="right", no_wrap=True)
     for name, each in result.measured.items():
         ratios = 1 + np.median(result.excess(name), axis=0)
-        seconds = np.median(each.seconds), each.first
+        cold = "*" if each.seconds[0] == each.first else ""
         gap = (each.bounds - each.witnesses).max()
         cells = [_ratio(ratios[t - 1]) for t in steps]
-        shown.add_row(name, *cells, f"{gap:.1e}", *map(_seconds, seconds))
+        seconds = cold + _seconds(np.median(each.seconds)), _seconds(each.first)
+        shown.add_row(name, *cells, f"{gap:.1e}", *seconds)
     slacks = result.slacks()
     least = min(slacks, key=lambda name: slacks[name])
     verdict = "sound" if result.sound else "[red]NOT SOUND[/red]"
@@ -119,8 +120,13 @@ def write(results: list[Result], path: Path) -> None:
 
 def _power(value: float, _) -> str:
     """The label of a power of ten."""
-    at_most = "\\leq " if value <= FLOOR else ""
-    return f"${at_most}10^{{{np.log10(value):.0f}}}$"
+    return "≤ " * (value <= FLOOR) + f"$10^{{{np.log10(value):.0f}}}$"
+
+
+def _decades(values: np.ndarray) -> tuple[float, float]:
+    """Powers of ten around some values, not too close to them."""
+    ends = np.log10([values.min() / 1.1, values.max() * 1.1])
+    return 10.0 ** np.floor(ends[0]), 10.0 ** np.ceil(ends[1])
 
 
 def draw(results: list[Result], *paths: Path) -> None:
@@ -130,6 +136,8 @@ def draw(results: list[Result], *paths: Path) -> None:
     figure, panels = plt.subplots(
         len(results), 2, figsize=(10, 1.2 + 2.5 * len(results)), squeeze=False, layout="constrained"
     )
+    seconds = [each.seconds for result in results for each in result.measured.values()]
+    limits = _decades(np.concatenate(seconds))
     for (left, right), result in zip(panels, results, strict=True):
         right.sharey(left)
         steps = np.arange(1, result.group.horizon + 1)
@@ -144,7 +152,9 @@ def draw(results: list[Result], *paths: Path) -> None:
         left.set(
             yscale="log", xticks=steps, ylabel=f"size / {tightest} - 1", title=result.group.name
         )
-        right.set(xscale="log", title=f"{result.group.name}, t = {result.group.horizon}")
+        right.set(
+            xscale="log", xlim=limits, title=f"{result.group.name}, t = {result.group.horizon}"
+        )
         for ax in (left, right):
             ax.axhspan(FLOOR, 2 * FLOOR, color="tab:green", alpha=0.15, linewidth=0)
             ax.grid(alpha=0.3)

@@ -1,6 +1,6 @@
 """What the study of tightness runs on: its options, and groups of loops that belong together."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -20,6 +20,8 @@ RANDOM_HORIZON = 2
 DENSE = "lambda_ij of 70 units, many minutes a tube"
 GRID = "4^6 cells"
 CELLS = "31 tubes of 8 s each"
+LARGEST = {"guided cells": (10, 31), "grid of cells": (20, 16)}
+"""Of random networks, the widest that are split into cells, and how many tubes that takes."""
 
 
 @dataclass(frozen=True)
@@ -121,8 +123,18 @@ def tiny(settings: Settings) -> list[Group]:
 
 def random(settings: Settings) -> list[Group]:
     """Random networks near whose kinks the initial set is."""
-    horizon = settings.horizon or RANDOM_HORIZON
-    return [_random(f"random 2x{w}", (2, w, w, 1), horizon, settings) for w in settings.widths]
+    found, horizon = [], settings.horizon or RANDOM_HORIZON
+    for width in settings.widths:
+        left_out = {
+            method: f"{tubes} tubes for each network"
+            for method, (widest, tubes) in LARGEST.items()
+            if width > widest
+        }
+        if horizon <= 3:
+            left_out["cuts, window 3"] = f"{horizon} steps, so that it is as one shot"
+        group = _random(f"random 2x{width}", (2, width, width, 1), horizon, settings)
+        found.append(replace(group, left_out=left_out))
+    return found
 
 
 def flying(settings: Settings) -> list[Group]:

@@ -16,12 +16,18 @@ from experiments.quadrotor_model import STEPS, initial_set
 
 TINY = (2, 4, 4, 1)
 HORIZONS = {"trained": 6, "tiny": 4, "quadrotor": STEPS}
-RANDOM_HORIZON = 2
+SMALL = 10
+"""Neurons a layer of random networks up to which two steps are affordable with lambda_ij."""
 DENSE = "lambda_ij of 70 units, many minutes a tube"
 GRID = "4^6 cells"
 CELLS = "31 tubes of 8 s each"
-LARGEST = {"guided cells": (10, 31), "grid of cells": (20, 16)}
-"""Of random networks, the widest that are split into cells, and how many tubes that takes."""
+LARGEST = {
+    "guided cells": (10, "31 tubes for each network"),
+    "grid of cells": (20, "16 tubes for each network"),
+    "paper": (20, "2016 lambda_ij, minutes a tube"),
+    "local bounds": (20, "2016 lambda_ij, minutes a tube"),
+}
+"""The widest random networks that a method is run on, and why on none that is wider."""
 
 
 @dataclass(frozen=True)
@@ -123,15 +129,14 @@ def tiny(settings: Settings) -> list[Group]:
 
 def random(settings: Settings) -> list[Group]:
     """Random networks near whose kinks the initial set is."""
-    found, horizon = [], settings.horizon or RANDOM_HORIZON
+    found = []
     for width in settings.widths:
-        left_out = {
-            method: f"{tubes} tubes for each network"
-            for method, (widest, tubes) in LARGEST.items()
-            if width > widest
-        }
+        horizon = settings.horizon or (2 if width <= SMALL else 1)
+        left_out = {name: why for name, (widest, why) in LARGEST.items() if width > widest}
         if horizon <= 3:
-            left_out["cuts, window 3"] = f"{horizon} steps, so that it is as one shot"
+            left_out["cuts, window 3"] = "no more steps, so it is as one shot"
+        if horizon == 1:
+            left_out["cuts, one shot"] = "one step, so it is as window 1"
         group = _random(f"random 2x{width}", (2, width, width, 1), horizon, settings)
         found.append(replace(group, left_out=left_out))
     return found

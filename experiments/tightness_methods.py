@@ -36,6 +36,7 @@ class Method:
 LIGHT = rj.LocalBounds(repeated=False)
 METHODS = {
     "paper": Method(rj.PaperQC()),
+    "paper, no lambda": Method(rj.PaperQC(repeated=False)),
     "local bounds": Method(rj.LocalBounds()),
     "local, no lambda": Method(LIGHT),
     "cuts, window 1": Method(rj.CuttingPlanes()),

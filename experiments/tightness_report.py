@@ -22,6 +22,7 @@ DODGE = 0.04
 """Steps by which methods stand apart, so that equal ones are all seen."""
 STYLES = {
     "paper": ("tab:brown", "s"),
+    "paper, no lambda": ("tab:pink", "p"),
     "local bounds": ("tab:gray", "D"),
     "local, no lambda": ("black", "x"),
     "cuts, window 1": ("tab:orange", "^"),
@@ -36,8 +37,8 @@ t: size of the certified set over that of the tightest set of its template, the
 gap: the worst bound less the method's own witness, over facets, steps and loops
 s/tube: of a warm call, the median over loops;  first: of the first call, which
    compiles what no row above has compiled;  * first, longer than --patience
-paper: with lambda_ij, as local bounds;  cuts: cutting planes, from local bounds
-   without lambda_ij;  cells: 4 x 4, or 16 split where gaps are worst, of these"""
+lambda: lambda_ij;  cuts: cutting planes, from local bounds without lambda_ij
+cells: 4 x 4, or 16 split where gaps are worst, by local bounds without lambda_ij"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +171,7 @@ def draw(results: list[Result], *paths: Path) -> None:
     }
     labels = [name for name in STYLES if name in found]
     handles = [found[name] for name in labels]
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
     for path in paths:
         figure.savefig(path, dpi=150)
     plt.close(figure)

@@ -38,7 +38,7 @@ gap: the worst bound less the method's own witness, over facets, steps and loops
 s/tube: of a warm call, the median over loops;  first: of the first call, which
    compiles what no row above has compiled;  * first, longer than --patience
 lambda: lambda_ij;  cuts: cutting planes, from local bounds without lambda_ij
-cells: 4 x 4, or 16 split where gaps are worst, by local bounds without lambda_ij"""
+cells: 4 x 4, or 16 split where gaps are worst; as local, no lambda"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def write(results: list[Result], path: Path) -> None:
 
 def _power(value: float, _) -> str:
     """The label of a power of ten."""
-    return "≤ " * (value <= FLOOR) + f"$10^{{{np.log10(value):.0f}}}$"
+    return ("≤ " if value <= FLOOR else "") + f"$10^{{{np.log10(value):.0f}}}$"
 
 
 def _decades(values: np.ndarray) -> tuple[float, float]:
@@ -159,7 +159,7 @@ def draw(results: list[Result], *paths: Path) -> None:
         for ax in (left, right):
             ax.axhspan(FLOOR, 2 * FLOOR, color="tab:green", alpha=0.15, linewidth=0)
             ax.grid(alpha=0.3)
-        left.set_ylim(bottom=FLOOR)
+        left.set(xlim=(0.5, result.group.horizon + 0.5), ylim=(FLOOR, None))
         left.yaxis.set_major_formatter(_power)
         right.tick_params(labelleft=False)
     panels[-1, 0].set_xlabel("step t")

@@ -10,7 +10,7 @@ import pytest
 import reachjax as rj
 from reachjax.solvers.candidates import Candidates, joint
 from reachjax.windows import Window
-from tests.loops import closed_loop, random_loop, recursion
+from tests.loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, saturating_network, simplex_region, simulate
 
 CUTS = rj.CuttingPlanes()
@@ -47,7 +47,7 @@ def initial(kind, n_x, seed=0):
 def tube_of(data, X0, relaxation, **options):
     n_x = X0.dimension
     template = rj.Template.octagonal(n_x) if n_x < 3 else rj.Template.box(n_x)
-    return recursion(closed_loop(data), X0, 2, template, relaxation, **options)
+    return rj.reach(closed_loop(data), X0, 2, template, relaxation, **options)
 
 
 def check_sound(tube, data, states):

@@ -20,7 +20,7 @@ SMALL = 10
 """Neurons a layer of random networks up to which two steps are affordable with lambda_ij."""
 DENSE = "lambda_ij of 70 units, many minutes a tube"
 GRID = "4^6 cells"
-CELLS = "31 tubes of 8 s each"
+CELLS = "31 tubes"
 LARGEST = {
     "guided cells": (10, "31 tubes for each network"),
     "grid of cells": (20, "16 tubes for each network"),

@@ -208,7 +208,8 @@ def reach(
     numbers = range(horizon)
     for k in numbers if progress is None else progress(numbers):
         before = steps if window is None else steps[max(0, k + 1 - window) :]
-        steps.append(Step(setting, sets[-1], k, tuple(before)))
+        proof = certificates[-1] if certificates else None
+        steps.append(Step(setting, sets[-1], k, tuple(before), proof))
         following, certificate = successors(steps[-1], template.at(k + 1))
         sets.append(following)
         certificates.append(certificate)

@@ -7,8 +7,9 @@ from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from reachjax.certificates import AbstractCertificate, Certificate
 from reachjax.lmi import Program
 from reachjax.relaxation import AbstractRelaxation
 from reachjax.rounding import Ball
@@ -63,12 +64,14 @@ class Step:
         X: the set of states.
         k: how many steps after the initial set.
         before: the steps that its window reaches back over, if it may have as many.
+        proof: of the set of states; None of the initial set.
     """
 
     setting: Setting
     X: AbstractSet
     k: int
     before: tuple[Step, ...]
+    proof: AbstractCertificate | None = None
 
     @property
     def t(self) -> int:
@@ -122,6 +125,16 @@ class Step:
         W, b = layers[0]
         upper, below = support(self.X, W), support(self.X, -W)
         return Ball.between(-below, jnp.maximum(-below, upper)) + b
+
+    @property
+    def offered(self) -> Int[np.ndarray, "p 2"]:
+        """Products that prove the set of states, where this window begins with the same facts."""
+        grown = bool(self.before) and len(self.window) == len(self.before[-1].window) + 1
+        if not grown or not isinstance(self.proof, Certificate):
+            return np.zeros((0, 2), dtype=int)
+        products, weights = self.proof.program.products, np.asarray(self.proof.multipliers)
+        pairs = np.stack([products.left, products.right], axis=1)
+        return pairs[np.any(weights > 0, axis=0)[np.asarray(products.multiplier)]]
 
     def program(self, directions: Float[Array, "f n_x"]) -> Program:
         """Theorem 1 with these directions of the successor for an objective."""

@@ -68,7 +68,7 @@ def _polytope(step: Step, template: Template, program: Program) -> tuple[Polytop
     if isinstance(setting.relaxation, CuttingPlanes):
         witness = None if setting.simulations is None else partial(step.attained, template)
         program, offsets, solution = proved_with_cuts(
-            program, step.window.layout, setting.solver, setting.relaxation, witness
+            program, step.window.layout, setting.solver, setting.relaxation, witness, step.offered
         )
     else:
         offsets, solution = proved_offsets(program, setting.solver)

@@ -60,6 +60,11 @@ class Candidates:
         left, right = np.sort(self.place[pairs], axis=1).T
         return left[left >= 0], right[left >= 0]
 
+    def addable(self, pairs: Int[np.ndarray, "p 2"]) -> Int[np.ndarray, "q 2"]:
+        """Those of these pairs that may be added."""
+        places = np.sort(self.place[pairs], axis=1)
+        return pairs[(places[:, 0] >= 0) & self.open[tuple(places.T)]]
+
     def violated(
         self, moment: Float[np.ndarray, "n n"], pairs: Int[np.ndarray, "p 2"], batch: int | None
     ) -> Int[np.ndarray, "q 2"]:

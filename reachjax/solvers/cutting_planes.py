@@ -19,7 +19,7 @@ from reachjax.lmi import Program
 from reachjax.relaxation import CuttingPlanes, FactLayout, LocalBounds
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver, Solution
-from reachjax.solvers.candidates import VIOLATED, joint
+from reachjax.solvers.candidates import NONE, VIOLATED, joint
 from reachjax.solvers.differentiable import enveloped, proved_offsets
 from reachjax.solvers.rounds import Witness, products_around, solved_in_rounds
 from reachjax.solvers.smoothing import CentralPath
@@ -31,6 +31,7 @@ def proved_with_cuts(
     solver: AbstractSolver,
     cuts: CuttingPlanes,
     witness: Witness | None = None,
+    offered: Int[np.ndarray, "p 2"] = NONE,
 ) -> tuple[Program, Float[Array, " f"], Solution]:
     """`proved_offsets`, with products added round by round.
 
@@ -40,6 +41,7 @@ def proved_with_cuts(
         solver: of the programs of each round.
         cuts: how many rounds, and of how many products.
         witness: what simulations attain; rounds do not stop for them if it is None.
+        offered: products to begin with, as numbers of facts, where numbers are known.
 
     Returns:
         The program with the products that were added, the proved offsets `(f,)`, and what the
@@ -49,7 +51,8 @@ def proved_with_cuts(
     if not is_concrete(fixed):
         whole = with_cuts(program, layout, solver, cuts)
         return whole, *proved_offsets(whole, solver)
-    rounds = solved_in_rounds(jax.device_get(fixed), layout, solver.for_rounds, cuts, witness)
+    given, by = jax.device_get(fixed), solver.for_rounds
+    rounds = solved_in_rounds(given, layout, by, cuts, witness, offered)
     whole = program.replace(products=jax.tree.map(jnp.asarray, rounds.products))
     if isinstance(solver, CentralPath):  # not the optimum, but the centre with these products
         return whole, *proved_offsets(whole, solver)

@@ -48,6 +48,7 @@ def solved_in_rounds(
     solver: AbstractSolver,
     cuts: CuttingPlanes,
     witness: Witness | None = None,
+    offered: Int[np.ndarray, "p 2"] = NONE,
 ) -> Rounds:
     """Solve for every facet, products being added as they are needed.
 
@@ -57,9 +58,10 @@ def solved_in_rounds(
         solver: of the programs of each round.
         cuts: how many rounds, and of how many products.
         witness: what simulations attain; rounds do not stop for them if it is None.
+        offered: products that the first facet begins with, those that may be added.
     """
     candidates = Candidates(program, layout)
-    found, used = [], NONE
+    found, used = [], candidates.addable(offered)
     for facet in range(len(program.objective.mid)):
         one = program.seeking(slice(facet, facet + 1))
         attained = None if witness is None else partial(witness, facet)

@@ -1,6 +1,6 @@
 """Cutting planes: tighter than what they begin with, sound whatever the rounds end with."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.solvers.candidates import Candidates, joint
+from reachjax.solvers.rounds import solved_in_rounds
 from reachjax.windows import Window
 from tests.loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, saturating_network, simplex_region, simulate
@@ -44,10 +45,10 @@ def initial(kind, n_x, seed=0):
     return chosen, np.asarray(chosen.sample(jax.random.key(0), 20_000))
 
 
-def tube_of(data, X0, relaxation, **options):
+def tube_of(data, X0, relaxation, window=1, **options):
     n_x = X0.dimension
     template = rj.Template.octagonal(n_x) if n_x < 3 else rj.Template.box(n_x)
-    return rj.reach(closed_loop(data), X0, 2, template, relaxation, **options)
+    return rj.reach(closed_loop(data), X0, 2, template, relaxation, window, **options)
 
 
 def check_sound(tube, data, states):
@@ -123,6 +124,30 @@ def test_garbage_multipliers_prove_loose_bounds_not_wrong_ones():
     for scale in (1e-3, 1.0, 1e3):
         multipliers = scale * rng.normal(size=proof.multipliers.shape)
         assert np.all(proof.recheck(multipliers) >= np.asarray(proof.witnesses) - 1e-12)
+
+
+@dataclass(frozen=True)
+class Counting(rj.InteriorPoint):
+    """Notes how many programs it solves."""
+
+    solved: list = field(default_factory=list, compare=False)
+
+    def solve(self, program):
+        self.solved.append(len(program.products.free))
+        return super().solve(program)
+
+
+def test_products_found_once_are_not_sought_again():
+    loop, (X0, _) = closed_loop(random_loop(2, hidden=(8, 6), seed=3)), initial("box", 2, seed=3)
+    window = Window.beginning(loop, X0, X0, 0, CUTS).extended(loop, X0, X0)
+    directions = rj.Template.octagonal(2).directions
+    program, solver = jax.device_get(window.program(directions, CUTS)), Counting()
+    first = solved_in_rounds(program, window.layout, solver, CUTS)
+    rounds = len(solver.solved)
+    offered = np.stack([first.products.left, first.products.right], axis=1)
+    again = solved_in_rounds(program, window.layout, solver, CUTS, offered=offered)
+    assert len(solver.solved) - rounds < rounds
+    np.testing.assert_allclose(again.judged.offsets, first.judged.offsets, atol=1e-5)
 
 
 def test_violated_products_are_those_of_negative_moments():

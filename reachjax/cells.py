@@ -1,8 +1,13 @@
-"""Cells: parts of a set that cover it, cut along coordinates."""
+"""Cells: parts of a set that cover it, cut along coordinates.
+
+A cell that is too thin to be told from an empty set is made larger, and then holds points beside
+the set; none is left out unless a separating direction proves it empty.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +22,18 @@ from reachjax.solvers import bounding_box, separation
 TOUCHING = 1e-6
 """A cell that a set barely touches is enlarged by this part of its box."""
 
-SAMPLES = 1000
+ENOUGH = 1000
 """A cell from which so many points cannot be drawn is too thin."""
 
 
-def grid(X: AbstractSet, counts: Sequence[int]) -> list[AbstractSet]:
+class Cell(NamedTuple):
+    """The part of a set that lies in a box, or a little more."""
+
+    box: Box
+    part: AbstractSet
+
+
+def grid(X: AbstractSet, counts: Sequence[int]) -> list[Cell]:
     """Equal parts of the box around a set, those that it reaches.
 
     Args:
@@ -33,7 +45,7 @@ def grid(X: AbstractSet, counts: Sequence[int]) -> list[AbstractSet]:
         ValueError: there is not a positive number for each coordinate.
 
     Example:
-        >>> [cell.lower.tolist() for cell in grid(Box([0.0, 0.0], [1.0, 2.0]), (1, 2))]
+        >>> [cell.part.lower.tolist() for cell in grid(Box([0.0, 0.0], [1.0, 2.0]), (1, 2))]
         [[0.0, 0.0], [0.0, 1.0]]
     """
     if len(counts) != X.dimension:
@@ -52,18 +64,19 @@ def grid(X: AbstractSet, counts: Sequence[int]) -> list[AbstractSet]:
     return _reached(X, boxes)
 
 
-def halves(X: AbstractSet, scale: Float[np.ndarray, " n"]) -> list[AbstractSet]:
-    """The parts of a set on either side of the middle of the longest side of its box.
+def halves(X: AbstractSet, box: Box, scale: Float[np.ndarray, " n"]) -> list[Cell]:
+    """The parts of a set in a box on either side of the middle of its longest side.
 
     Args:
         X: the set.
+        box: the cell that is cut.
         scale: the unit in which each coordinate is measured.
 
     Example:
-        >>> [cell.upper.tolist() for cell in halves(Box([0.0, 0.0], [1.0, 2.0]), np.ones(2))]
+        >>> X = Box([0.0, 0.0], [1.0, 2.0])
+        >>> [cell.part.upper.tolist() for cell in halves(X, X, np.ones(2))]
         [[1.0, 1.0], [1.0, 2.0]]
     """
-    box = bounding_box(X)
     axis = int(np.argmax(np.asarray(box.widths) / scale))
     middle = box.center[axis]
     below = Box(box.lower, box.upper.at[axis].set(middle))
@@ -71,9 +84,9 @@ def halves(X: AbstractSet, scale: Float[np.ndarray, " n"]) -> list[AbstractSet]:
     return _reached(X, [below, above])
 
 
-def _reached(X: AbstractSet, boxes: Iterable[Box]) -> list[AbstractSet]:
+def _reached(X: AbstractSet, boxes: Iterable[Box]) -> list[Cell]:
     """What a set has in common with boxes, but for those that it surely does not reach."""
-    return [_within(X, box) for box in boxes if not _apart(X, box)]
+    return [Cell(box, _within(X, box)) for box in boxes if not _apart(X, box)]
 
 
 def _apart(X: AbstractSet, box: Box) -> bool:
@@ -106,7 +119,7 @@ def _within(X: AbstractSet, box: Box) -> AbstractSet:
     for around in (box, larger):
         cell = _cut(X, around)
         try:
-            cell.sample(jax.random.key(0), SAMPLES)
+            cell.sample(jax.random.key(0), ENOUGH)
         except (ValueError, RuntimeError):  # too thin to be told from an empty set
             continue
         return cell
@@ -135,5 +148,7 @@ def _cut(X: AbstractSet, box: Box) -> AbstractSet:
         assert isinstance(polytope, PolyhedralSet)
         return X.replace(polytope=polytope)
     assert isinstance(X, PolyhedralSet)
+    if isinstance(X, Box):
+        return Box(jnp.maximum(X.lower, box.lower), jnp.minimum(X.upper, box.upper))
     (A, b), (C, d) = X.facets, box.facets
     return Polytope(jnp.concatenate([A, C]), jnp.concatenate([b, d]))

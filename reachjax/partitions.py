@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from reachjax.cells import grid, halves
 from reachjax.checks import (
@@ -36,6 +36,9 @@ Bar = Callable[[Iterable[Any]], Iterable[Any]]
 
 NO_GAP = 1e-9
 """A gap of this part of a set's width is none."""
+
+BESIDE = 1e-9
+"""States that are further beside the initial set than this are not in it."""
 
 
 @pytree
@@ -71,12 +74,12 @@ class PartitionedTube(Replaceable):
         return np.max([tube.proof(t).bounds for tube in self.tubes], axis=0)
 
     def witnesses(self, t: int) -> Float[np.ndarray, " m"]:
-        """The largest simulated value of every facet at time `t`.
+        """The largest simulated value of every facet at time `t`, from states of the initial set.
 
         Raises:
             ValueError: there is no certificate for this time.
         """
-        return np.max([tube.proof(t).witnesses for tube in self.tubes], axis=0)
+        return np.max([_attained(self.X0, tube, t) for tube in self.tubes], axis=0)
 
     def gaps(self, t: int) -> Float[np.ndarray, " m"]:
         """`bounds - witnesses`: how much tightness may be left in the union's facets.
@@ -96,7 +99,7 @@ def reach_partitioned(
     window: int | None = None,
     solver: AbstractSolver = Auto(),  # noqa: B008
     *,
-    cells: int | Sequence[int],
+    cells: int | Sequence[int] | Int[np.ndarray, " n_x"],
     executor: Executor | None = None,
     start: int = 0,
     samples: int = SAMPLES,
@@ -126,7 +129,7 @@ def reach_partitioned(
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind.
-        ValueError: as `reach`; the arguments are traced, or there is no cell.
+        ValueError: as `reach`; or the arguments are traced.
 
     Example:
         >>> from reachjax import MLP, AffinePlant, Box
@@ -160,8 +163,8 @@ def reach_partitioned(
     own = ThreadPoolExecutor() if executor is None else None
     try:
         run = _Run(loop, options, own or executor, progress)
-        if isinstance(cells, Sequence):
-            tubes = run.tubes(grid(X0, cells))
+        if isinstance(cells, Sequence | np.ndarray):
+            tubes = run.tubes([cell.part for cell in grid(X0, tuple(cells))])
         else:
             tubes = _guided(run, X0, whole_number("cells", cells, 1))
     finally:
@@ -211,15 +214,25 @@ def _guided(run: _Run, X0: AbstractSet, count: int) -> list[ReachTube]:
     """Halve the cells at which the union's gap is widest, along their longest side."""
     sides = np.asarray(bounding_box(X0).widths)
     sides = np.where(sides > 0, sides, np.inf)  # a side without length is not halved
-    tubes = run.tubes([X0])
+    boxes, tubes = [bounding_box(X0)], run.tubes([X0])
     widths = _widths(tubes[0])
     while len(tubes) < count:
-        worst = _worst(tubes, widths)[: min(math.ceil(len(tubes) / 4), count - len(tubes))]
+        some = min(math.ceil(len(tubes) / 4), count - len(tubes))
+        worst = _worst(X0, tubes, widths)[:some]
         if not worst:
             break
-        parts = [half for i in worst for half in halves(tubes[i].sets[0], sides)]
-        tubes = [tube for i, tube in enumerate(tubes) if i not in worst] + run.tubes(parts)
+        parts = [half for i in worst for half in halves(X0, boxes[i], sides)]
+        others = [i for i in range(len(tubes)) if i not in worst]
+        boxes = [boxes[i] for i in others] + [half.box for half in parts]
+        tubes = [tubes[i] for i in others] + run.tubes([half.part for half in parts])
     return tubes
+
+
+def _attained(X0: AbstractSet, tube: ReachTube, t: int) -> Float[np.ndarray, " m"]:
+    """What a cell's witnesses attain; those beside the initial set do not count."""
+    proof = tube.proof(t)
+    inside = np.asarray(X0.contains(proof.witness_states, BESIDE))
+    return np.where(inside, proof.witnesses, -np.inf)
 
 
 def _widths(tube: ReachTube) -> Float[np.ndarray, "h m"]:
@@ -228,11 +241,12 @@ def _widths(tube: ReachTube) -> Float[np.ndarray, "h m"]:
     return np.array([X.b + support(X, -X.A) for X in sets if isinstance(X, Polytope)])
 
 
-def _worst(tubes: list[ReachTube], widths: Float[np.ndarray, "h m"]) -> list[int]:
+def _worst(X0: AbstractSet, tubes: list[ReachTube], widths: Float[np.ndarray, "h m"]) -> list[int]:
     """The cells whose bounds leave gaps in the union, the widest first, in units of its widths."""
     steps = range(1, tubes[0].horizon + 1)
     bounds = np.array([[tube.proof(t).bounds for t in steps] for tube in tubes])
-    witnesses = np.array([[tube.proof(t).witnesses for t in steps] for tube in tubes]).max(axis=0)
+    attained = np.array([[_attained(X0, tube, t) for t in steps] for tube in tubes])
+    witnesses = attained.max(axis=0)
     beyond = (bounds - witnesses) / np.where(widths > 0, widths, np.inf)
     widest = beyond.max(axis=(1, 2))
     return [int(i) for i in np.argsort(-widest, stable=True) if widest[i] > NO_GAP]

@@ -155,8 +155,10 @@ def reach(
         horizon: the number `N` of steps.
         template: what every set looks like: facet directions, ellipsoids, or both.
         relaxation: which products of facts are used.
-        window: over how many steps each program reaches back: 1 is the paper's recursion, and the
-            horizon goes back to `X0` in one shot. Ever tighter, and larger programs.
+        window: over how many steps each program reaches back, as far as there are steps: 1 is the
+            paper's recursion, the horizon goes back to `X0` in one shot. Longer ones are tighter,
+            and their programs larger. None: the longest that the solver bears, chosen from numbers,
+            so inside `jax.jit` give one.
         solver: what solves the semidefinite programs.
         start: the time of `X0`, for time-varying loops.
         samples: how many trajectories are simulated for witnesses, besides those from corners.
@@ -168,8 +170,8 @@ def reach(
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind.
         ValueError: dimensions disagree, `X0` is empty or unbounded, the window is no
-            positive number, a time-varying loop ends before the horizon, or states overflow. What
-            depends on traced values is NaN instead, inside `jax.jit`.
+            positive number, or None inside `jax.jit`, a time-varying loop ends before the horizon,
+            or states overflow. What depends on traced values is NaN instead, inside `jax.jit`.
 
     The offsets of the sets have first derivatives in everything but facet normals (reverse mode):
     in the loop's weights, plant and input box, and in a box's ends or a polytope's offsets. In the
@@ -201,7 +203,7 @@ def reach(
         relaxation=relaxation,
         solver=solver,
         limit=LARGEST if window is None else None,
-        compact=window != 1 and is_concrete(fixed),
+        compact=window != 1 and is_concrete(fixed, jax.lax.stop_gradient(template)),
         simulations=simulations,
     )
     sets, certificates, steps = [X0], [], []
@@ -267,7 +269,7 @@ def _check(
     whole_number("seed", seed, 0)
     if window is not None:
         whole_number("window", window, 1)
-    elif not is_concrete(jax.lax.stop_gradient((loop, X0))):
+    elif not is_concrete(jax.lax.stop_gradient((loop, X0, template))):
         raise ValueError(
             "window=None is chosen from numbers: inside jax.jit, vmap or scan give a number, such "
             "as window=1"

@@ -11,11 +11,11 @@ import numpy as np
 
 from reachjax.bounds import successor_box
 from reachjax.checks import whole_number
-from reachjax.partitions import PartitionedTube
+from reachjax.partitions import BESIDE, PartitionedTube
 from reachjax.reach import ReachTube
 from reachjax.requirements import AvoidSets, Requirement, of_tube
 from reachjax.rounding import gamma
-from reachjax.sets import Box, PolyhedralSet
+from reachjax.sets import AbstractSet, Box, PolyhedralSet
 from reachjax.solvers import SolverStatus
 from reachjax.verdicts import Counterexample, Verdict, VerdictStatus, of_cells
 
@@ -60,17 +60,25 @@ def verify(
         >>> verify(tube, goal=Box([0.0], [0.4])).counterexample.states.ravel().round(3).tolist()
         [2.0, 1.2, 0.72, 0.432]
     """
-    if isinstance(tube, PartitionedTube):
-        options = {"samples": samples, "seed": seed}
-        return of_cells([verify(each, goal, avoid, safe, **options) for each in tube.tubes])
-    required = of_tube(tube, goal, avoid, safe)
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
+    if isinstance(tube, PartitionedTube):
+        cells = [(each, of_tube(each, goal, avoid, safe)) for each in tube.tubes]
+        return of_cells([_decided(*cell, samples, seed, tube.X0) for cell in cells])
+    return _decided(tube, of_tube(tube, goal, avoid, safe), samples, seed, tube.sets[0])
+
+
+def _decided(
+    tube: ReachTube, required: list[Requirement], samples: int, seed: int, X0: AbstractSet
+) -> Verdict:
+    """What a tube proves, or a trajectory from `X0` refutes."""
     proofs = [tube.proof(t) for t in range(1, tube.horizon + 1)]
     unsolved = sum(s is not SolverStatus.SOLVED for proof in proofs for s in proof.statuses)
     states = jnp.concatenate([proof.witness_states for proof in proofs])
     witnessed = tube.loop.simulate(states, tube.horizon, tube.start)
     trajectories = np.concatenate([witnessed, tube.simulate(samples, seed)])
+    if X0 is not tube.sets[0]:  # a cell may hold points beside the initial set
+        trajectories = trajectories[np.asarray(X0.contains(trajectories[:, 0], BESIDE))]
     margins: dict[str, np.ndarray] = {}
     simulated: dict[str, np.ndarray] = {}
     proved, suspects = True, []
@@ -78,12 +86,12 @@ def verify(
         blank = np.full(tube.horizon + 1, np.nan)
         margin, rooms = float(item.margins(tube).min()), item.simulated(trajectories)
         margins.setdefault(item.name, blank.copy())[item.time] = margin
-        simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min()
+        simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min(initial=np.inf)
         proved = proved and item.proved(margin)
         worst = np.argsort(rooms)[:SUSPECTS]
         suspects += [(rooms[k], item, trajectories[k]) for k in worst if rooms[k] <= 0]
     for room, item, states in sorted(suspects, key=lambda suspect: suspect[0]):
-        if _surely_broken(tube, item, states[0]):
+        if X0.surely_contains(states[0]) and _surely_broken(tube, item, states[0]):
             if proved:
                 raise RuntimeError("a proved specification is broken: please report this defect")
             example = _counterexample(tube, room, item, states)
@@ -94,8 +102,6 @@ def verify(
 
 def _surely_broken(tube: ReachTube, item: Requirement, x0: np.ndarray) -> bool:
     """Whether the exact trajectory from `x0` breaks a requirement, rounding accounted for."""
-    if not tube.sets[0].surely_contains(x0):
-        return False
     reached = Box(x0, x0)
     for t in range(item.time):
         reached = successor_box(tube.loop, reached, tube.start + t)

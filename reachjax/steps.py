@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from functools import cached_property
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -90,7 +91,9 @@ class Step:
     @cached_property
     def window(self) -> Window:
         """The window that this step ends: the longest one that stays in the limit."""
-        first, limit = 0, self.setting.limit
+        limit = self.setting.limit
+        # a window that had to be shorter a step ago has to be now
+        first = max(0, len(self.before) - len(self.before[-1].window)) if self.before else 0
         while True:
             window = self._reaching_back(self.before[first:])
             if limit is None or window.taken <= limit or len(window) == 1:
@@ -149,7 +152,7 @@ class Step:
         simulations = self.setting.simulations
         assert simulations is not None
         facets, n, k = len(template), self.setting.loop.states, self.k + 1
-        region = template.polytope(jnp.zeros(facets))
+        region = jax.lax.stop_gradient(template.polytope(jnp.zeros(facets)))
         starts = simulations.best(k, region, facet, facets)
         if len(self.window) == k:
             starts[-1] = column[:n]

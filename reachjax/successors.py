@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
+import jax
 import jax.numpy as jnp
-import numpy as np
 
 from reachjax.certificates import (
     AbstractCertificate,
@@ -33,6 +33,7 @@ from reachjax.solvers import (
     proved_with_cuts,
     with_cuts_around,
 )
+from reachjax.solvers.host import all_finite
 from reachjax.steps import Step
 
 
@@ -55,7 +56,8 @@ def successors(step: Step, template: AbstractTemplate) -> tuple[AbstractSet, Abs
 
 
 def _require_finite(step: Step, numbers) -> None:
-    if is_concrete(numbers) and not np.isfinite(numbers).all():
+    fixed = jax.lax.stop_gradient(numbers)
+    if is_concrete(fixed) and not all_finite(jax.device_get(fixed)):
         raise ValueError(
             f"the loop's states at t = {step.t + 1} overflow or are not numbers: check the "
             "weights of loop.controller and the entries of loop.plant"
@@ -65,6 +67,7 @@ def _require_finite(step: Step, numbers) -> None:
 def _polytope(step: Step, template: Template, program: Program) -> tuple[Polytope, Certificate]:
     """Problem (sdp::poly): the smallest offset for each facet."""
     setting = step.setting
+    _require_finite(step, program)
     if isinstance(setting.relaxation, CuttingPlanes):
         witness = None if setting.simulations is None else partial(step.attained, template)
         program, offsets, solution = proved_with_cuts(
@@ -85,6 +88,7 @@ def _ellipsoid(
     if template.shape is not None:
         middle = step.X.center if isinstance(step.X, Ellipsoid) else step.box.center
         form = Ellipsoid(setting.loop.step(middle, step.t), template.shape).normal_form
+    _require_finite(step, program)
     if isinstance(setting.relaxation, CuttingPlanes):
         program = with_cuts_around(
             program, step.window.layout, setting.solver, setting.relaxation, form

@@ -42,8 +42,8 @@ def test_cells_cover_the_set(name):
     # the vertices too, where there are some: cells that only touch the set hold them
     if isinstance(X, rj.PolyhedralSet):
         points = jnp.concatenate([points, X.vertices()])
-    for cells in (grid(X, (4, 4)), halves(X, np.ones(2)), grid(X, (1, 1))):
-        inside = np.array([cell.contains(points, 1e-9) for cell in cells])
+    for cells in (grid(X, (4, 4)), halves(X, X.bounding_box(), np.ones(2)), grid(X, (1, 1))):
+        inside = np.array([cell.part.contains(points, 1e-9) for cell in cells])
         assert inside.any(axis=0).all()
 
 
@@ -57,7 +57,7 @@ def test_cells_beside_the_set_are_left_out():
 @pytest.mark.parametrize("name", SETS)
 def test_every_cell_can_be_sampled(name):
     for cell in grid(SETS[name], (4, 4)):  # the diamond meets corner cells in a point
-        points = cell.sample(jax.random.key(0), 5)
+        points = cell.part.sample(jax.random.key(0), 5)
         assert bool(SETS[name].contains(points, 1e-5).all())
 
 
@@ -65,9 +65,34 @@ def test_cells_are_cut_in_every_dimension():
     X = rj.Box(np.zeros(3), [1.0, 2.0, 3.0])
     cells = grid(X, (1, 2, 3))
     assert len(cells) == 6
-    assert sum(cell.volume() for cell in cells) == pytest.approx(6.0)
-    assert [half.upper.tolist() for half in halves(X, np.ones(3))] == [[1, 2, 1.5], [1, 2, 3]]
-    assert halves(X, np.array([0.1, 2.0, 3.0]))[0].upper.tolist() == [0.5, 2, 3]
+    assert sum(cell.part.volume() for cell in cells) == pytest.approx(6.0)
+    lower, upper = halves(X, X, np.ones(3))
+    assert [lower.box.upper.tolist(), upper.box.upper.tolist()] == [[1, 2, 1.5], [1, 2, 3]]
+    assert halves(X, X, np.array([0.1, 2.0, 3.0]))[0].box.upper.tolist() == [0.5, 2, 3]
+
+
+def test_cells_of_cells_have_no_more_facets():
+    ball = rj.Ellipsoid([0.0, 0.0], np.eye(2))
+    half = halves(ball, ball.bounding_box(), np.ones(2))[0]
+    quarter = halves(ball, half.box, np.ones(2))[0]
+    assert len(quarter.part.facts()) == len(half.part.facts()) == 4
+
+
+def test_a_state_beside_the_set_refutes_nothing():
+    # cells that a skewed ellipse barely reaches are made larger, and hold points beside it
+    needle = rj.Ellipsoid([0.0, 0.0], [[1.0, 0.95], [0.95, 1.0]])
+    still = rj.ClosedLoop(
+        rj.AffinePlant(np.eye(2), np.zeros((2, 1))),
+        rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])]),
+    )
+    tube = rj.reach_partitioned(still, needle, 1, rj.Template.box(2), cells=(7, 7), **RECURSION)
+    assert any(not isinstance(cell.part, rj.Intersection) for cell in grid(needle, (7, 7)))
+    for direction in np.array([[1.0, -1.0], [-0.8, 1.0], [1.0, 0.2]]):
+        goal = rj.Polytope(direction[None], needle.support(direction[None]) + 1e-9)
+        verdict = rj.verify(tube, goal=goal, samples=50)
+        assert verdict.status is not rj.VerdictStatus.REFUTED
+        assert np.nanmin(verdict.simulated["goal"]) >= -1e-9
+    assert np.all(tube.witnesses(1) <= needle.support(rj.Template.box(2).directions) + 1e-9)
 
 
 def test_the_union_holds_every_state(loop, partitioned):

@@ -46,6 +46,20 @@ def test_longer_windows_are_tighter_and_hold_every_sample(relaxation, steps):
         assert np.all(bounds[1] <= bounds[0] + 1e-5 * size)
 
 
+@pytest.mark.parametrize("window", [2, None])
+def test_a_window_begins_at_the_time_of_its_first_set(window):
+    data = random_loop(2, hidden=(4, 3), seed=4, steps=6)
+    tube = tube_of(data, rj.CuttingPlanes(), window, start=2)
+    states = np.asarray(tube.sets[0].sample(jax.random.key(1), 5000))
+    loop = closed_loop(data)
+    for t in range(1, HORIZON + 1):
+        states = np.stack(
+            [np.asarray(x) for x in jax.vmap(lambda x, t=t: loop.step(x, t + 1))(states)]
+        )
+        assert bool(tube.sets[t].contains(states, 1e-12).all())
+        assert tube.proof(t).gaps.max() < 1e-2  # of sets of size 0.1 to 1: facts of other times
+
+
 def test_a_window_of_any_length_may_be_asked_for():
     data = random_loop(2, hidden=(3, 2), seed=2)
     long, whole = (tube_of(data, rj.CuttingPlanes(), window) for window in (10, HORIZON))

@@ -66,6 +66,8 @@ def edges(points: Float[np.ndarray, "c 2"], facets: int) -> Float[np.ndarray, "f
     offsets = np.einsum("ij,ij->i", normals, corners)
     while len(normals) > facets:
         growth = [_growth(normals, offsets, i) for i in range(len(normals))]
+        if not np.isfinite(growth).any():  # without any edge it opens, as a parallelogram does
+            return _unit(plane(facets) @ W)
         left_out = int(np.argmin(growth))
         normals, offsets = np.delete(normals, left_out, 0), np.delete(offsets, left_out)
     while len(normals) < facets:

@@ -17,7 +17,7 @@ from reachjax.sets.base import AbstractSet, PolyhedralSet
 from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polytope import Polytope
 
-MOST_DIMENSIONS = 12
+LISTED = 12
 """Corners of the initial set are simulated up to this dimension."""
 
 
@@ -149,7 +149,7 @@ class Template(AbstractTemplate):
         loop: Simulated,
         X0: AbstractSet,
         horizon: int,
-        facets: int = 12,
+        facets: int | None = None,
         *,
         start: int = 0,
         samples: int = 10_000,
@@ -165,13 +165,17 @@ class Template(AbstractTemplate):
             loop: the closed loop.
             X0: the set of initial states.
             horizon: the number `N` of steps.
-            facets: how many; an even number of at least `2 n` in more than two dimensions.
+            facets: how many; but in the plane an even number from `2 n` to `2 n^2`. None for 12, or
+                the nearest such number.
             start: the time of `X0`.
             samples: how many trajectories are simulated.
             seed: of the samples.
 
         Raises:
-            ValueError: there are too few facets to bound a set, or more than there are directions.
+            RuntimeError: `X0` cannot be sampled.
+            TypeError: `X0` is no set, or a number no whole one.
+            ValueError: there are too few facets to bound a set, or more than there are directions;
+                `X0` is empty or unbounded; or simulated states overflow.
 
         Example:
             >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop
@@ -180,12 +184,19 @@ class Template(AbstractTemplate):
             >>> Template.adapted(loop, Box([-1.0, -1.0], [1.0, 1.0]), horizon=3).directions.shape
             (3, 12, 2)
         """
+        require_kind("X0", X0, AbstractSet, "a set such as Box(lower, upper)")
         n = X0.dimension
+        if facets is None:
+            facets = 12 if n == 2 else min(max(12, 2 * n), 2 * n * n)
         count = whole_number("facets", facets, 3 if n == 2 else 2 * n)
         states = X0.sample(jax.random.key(seed), whole_number("samples", samples, n + 1))
-        if isinstance(X0, PolyhedralSet) and n <= MOST_DIMENSIONS:
+        if isinstance(X0, PolyhedralSet) and n <= LISTED:
             states = jnp.concatenate([states, X0.vertices()])
         trajectories = np.asarray(loop.simulate(states, horizon, start))
+        if not np.isfinite(trajectories).all():
+            raise ValueError(
+                "simulated states overflow or are not numbers: check the loop's weights"
+            )
         fitting = fit.edges if n == 2 else fit.axes
         return cls(np.stack([fitting(trajectories[:, k], count) for k in range(1, horizon + 1)]))
 

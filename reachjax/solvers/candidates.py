@@ -65,6 +65,12 @@ class Candidates:
         places = np.sort(self.place[pairs], axis=1)
         return pairs[(places[:, 0] >= 0) & self.open[tuple(places.T)]]
 
+    def missing(self, pairs: Int[np.ndarray, "p 2"]) -> Int[np.ndarray, "q 2"]:
+        """What `LocalBounds` has beyond these and the products to begin with."""
+        allowed = self.promised.copy()
+        allowed[self._entries(pairs)] = False
+        return self.live[np.argwhere(allowed)]
+
     def violated(
         self, moment: Float[np.ndarray, "n n"], pairs: Int[np.ndarray, "p 2"], batch: int | None
     ) -> Int[np.ndarray, "q 2"]:

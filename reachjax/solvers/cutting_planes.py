@@ -9,6 +9,8 @@ as there may be, with room for all that they may add.
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -79,7 +81,7 @@ def with_cuts_around(
     if not is_concrete(fixed):
         return program.replace(products=LocalBounds().products(layout))
     given, shape = jax.device_get(fixed)
-    products = products_around(given, layout, solver, cuts, shape)
+    products = products_around(given, layout, solver.for_rounds, cuts, shape)
     return program.replace(products=jax.tree.map(jnp.asarray, products))
 
 
@@ -125,5 +127,5 @@ def with_cuts(
 
 def _linear_pairs(cuts: CuttingPlanes, layout: FactLayout) -> Int[np.ndarray, "p 2"]:
     """The pairs of linear facts that a program begins with, the smaller number first."""
-    groups, _ = cuts.groups(layout)
-    return np.sort(np.array([pair for group in groups for pair in group]).reshape(-1, 2), axis=1)
+    pairs = list(itertools.chain.from_iterable(cuts.groups(layout)[0]))
+    return np.sort(np.array(pairs, dtype=int).reshape(-1, 2), axis=1)

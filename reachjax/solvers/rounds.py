@@ -18,12 +18,15 @@ from reachjax.recheck import interval_offsets, sound_offsets
 from reachjax.relaxation import CuttingPlanes, FactLayout, Products
 from reachjax.sets import NormalForm
 from reachjax.solvers.accepted import accepted_offsets
-from reachjax.solvers.base import AbstractSolver, Solution
+from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
 from reachjax.solvers.candidates import NONE, Candidates, joint
 from reachjax.solvers.differentiable import Judged
 
 IDLE = 1e-7
 """Multipliers below this part of the largest are at zero."""
+
+NEAR = 1e-9
+"""Offsets that differ by less, in parts of the facet's interval, are equally good."""
 
 Witness = Callable[[int, Float[np.ndarray, " n"]], float]
 """The value of a facet that a simulation attains, given its number and a moment's last column."""
@@ -121,6 +124,11 @@ class _Result(NamedTuple):
     solution: Solution
 
     @property
+    def differentiable(self) -> bool:
+        """Whether the offset is the solver's optimum, to its tolerance."""
+        return self.optimal and int(self.solution.statuses[0]) == SolverStatus.SOLVED
+
+    @property
     def of_use(self) -> Int[np.ndarray, "q 2"]:
         """The added products whose multipliers are not at zero."""
         return self.pairs[~_idle(np.asarray(self.solution.multipliers[0]), len(self.pairs))]
@@ -148,6 +156,9 @@ def _in_rounds(
     for number in itertools.count():
         shown = solve(pairs)
         if not np.isfinite(shown.moment).all():
+            if number == 0 and len(missing := candidates.missing(pairs)):
+                pairs = np.concatenate([pairs, missing])  # no moment to choose by: all that is due
+                solve(pairs)
             break
         last = shown.enough or number >= cuts.rounds
         more = candidates.violated(shown.moment, pairs, None if last else cuts.batch)
@@ -186,7 +197,9 @@ def _facet(
         return _Round(moment, idle, enough)
 
     _in_rounds(candidates, cuts, pairs, solve)
-    best = min(reversed(results), key=lambda result: result.offset)
+    least = min(result.offset for result in results)
+    near = [result for result in results if result.offset <= least + NEAR * size]
+    best = max(near, key=lambda result: result.differentiable)  # the first that is, if any is
     seconds = np.sum([result.solution.seconds for result in results], axis=0)
     return best._replace(solution=best.solution._replace(seconds=seconds))
 

@@ -153,8 +153,10 @@ def test_compiled_and_plain_gradients_agree():
     args = planar(0)
     plain = jax.grad(value, argnums=(0, 1))(*args, 2)
     compiled = jax.jit(jax.grad(value, argnums=(0, 1)), static_argnums=2)(*args, 2)
+    # two compilations round differently, and multipliers are as exact as the root of the solver's
+    # tolerance, 1e-9
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8), plain, compiled
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=3e-5, atol=1e-8), plain, compiled
     )
 
 

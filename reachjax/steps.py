@@ -11,11 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.certificates import AbstractCertificate, Certificate
+from reachjax.checks import is_concrete
 from reachjax.lmi import Program
 from reachjax.relaxation import AbstractRelaxation
 from reachjax.rounding import Ball
 from reachjax.sets import AbstractSet, Box, Polytope, Template
 from reachjax.solvers import AbstractSolver, bounding_box, support
+from reachjax.solvers.candidates import NONE
 from reachjax.systems import ClosedLoop
 from reachjax.windows import Window
 from reachjax.witnesses import Simulations
@@ -134,10 +136,13 @@ class Step:
         """Products that prove the set of states, where this window begins with the same facts."""
         grown = bool(self.before) and len(self.window) == len(self.before[-1].window) + 1
         if not grown or not isinstance(self.proof, Certificate):
-            return np.zeros((0, 2), dtype=int)
-        products, weights = self.proof.program.products, np.asarray(self.proof.multipliers)
+            return NONE
+        products = self.proof.program.products
+        weights = jax.lax.stop_gradient(self.proof.multipliers)
+        if not is_concrete(products, weights):
+            return NONE
         pairs = np.stack([products.left, products.right], axis=1)
-        return pairs[np.any(weights > 0, axis=0)[np.asarray(products.multiplier)]]
+        return pairs[np.any(np.asarray(weights) > 0, axis=0)[np.asarray(products.multiplier)]]
 
     def program(self, directions: Float[Array, "f n_x"]) -> Program:
         """Theorem 1 with these directions of the successor for an objective."""

@@ -118,7 +118,7 @@ def reach_partitioned(
         solver: what solves the semidefinite programs.
         cells: a number for each coordinate: equal parts of the box around the initial set. Or how
             many in all: then those cells are halved at which the union's gap is widest, until there
-            are as many or no gap is left.
+            are as many or no gap is left, at once if one cell's bounds are exact.
         executor: runs the cells' programs: any with the interface of `concurrent.futures`; threads
             by default. Arguments are sent as numpy arrays.
         start: the time of `X0`, for time-varying loops.
@@ -145,10 +145,12 @@ def reach_partitioned(
     require_double_precision(loop=loop, X0=X0, template=template)
     if not is_concrete(loop, X0, template):
         raise ValueError("partitions need numbers: call reach_partitioned outside of jax.jit")
-    if executor is not None and not callable(getattr(executor, "submit", None)):
+    if executor is not None and (
+        isinstance(executor, type) or not callable(getattr(executor, "submit", None))
+    ):
         raise TypeError(
-            "executor must have a method submit, as those of concurrent.futures have, but "
-            f"{described(executor)} arrived"
+            "executor must be an object with a method submit, as those of concurrent.futures are, "
+            f"but {described(executor)} arrived"
         )
     options = {
         "horizon": horizon,
@@ -163,10 +165,16 @@ def reach_partitioned(
     own = ThreadPoolExecutor() if executor is None else None
     try:
         run = _Run(loop, options, own or executor, progress)
-        if isinstance(cells, Sequence | np.ndarray):
-            tubes = run.tubes([cell.part for cell in grid(X0, tuple(cells))])
-        else:
+        if isinstance(cells, int | np.integer):
             tubes = _guided(run, X0, whole_number("cells", cells, 1))
+        elif np.ndim(cells) == 1:
+            counts = tuple(np.asarray(cells).tolist())
+            tubes = run.tubes([cell.part for cell in grid(X0, counts)])
+        else:
+            raise TypeError(
+                "cells must be a whole number, or one for each coordinate, but "
+                f"{described(cells)} arrived"
+            )
     finally:
         if own is not None:
             own.shutdown(cancel_futures=True)

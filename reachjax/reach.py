@@ -161,7 +161,8 @@ def reach(
             so inside `jax.jit` give one.
         solver: what solves the semidefinite programs.
         start: the time of `X0`, for time-varying loops.
-        samples: how many trajectories are simulated for witnesses, besides those from corners.
+        samples: how many trajectories are simulated for witnesses, besides those from corners. None
+            are inside `jax.jit`: witnesses and gaps are NaN there.
         seed: of the samples.
         progress: wraps the iteration over steps to show a progress bar, such as `tqdm.tqdm`; inside
             `jax.jit` it sees them once, while the loop is traced.

@@ -224,8 +224,19 @@ BAD = {
     "cells must be a number for each of 2 coordinates": (ValueError, {"cells": (2,)}),
     r"cells\[1\] must be at least 1, but 0": (ValueError, {"cells": (2, 0)}),
     "cells must be at least 1, but 0": (ValueError, {"cells": 0}),
-    "cells must be a whole number, but 2.5": (TypeError, {"cells": 2.5}),
-    "executor must have a method submit": (TypeError, {"cells": 2, "executor": map}),
+    r"cells must be a whole number, or one for each coordinate, but 2\.5": (
+        TypeError,
+        {"cells": 2.5},
+    ),
+    r"cells must be a whole number, or one for each .*ndarray arrived": (
+        TypeError,
+        {"cells": np.array([[2, 2]])},
+    ),
+    r"cells\[0\] must be a whole number, but 1\.5": (TypeError, {"cells": np.array([1.5, 2])}),
+    "executor must be an object with a method submit.*class": (
+        TypeError,
+        {"cells": 2, "executor": ThreadPoolExecutor},
+    ),
     "template must be a template of facets": (
         TypeError,
         {"cells": 2, "template": rj.EllipsoidTemplate()},

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.checks import Numbers, is_concrete, require_kind, same_size, whole_number
+from reachjax.checks import Numbers, described, is_concrete, require_kind, same_size, whole_number
 from reachjax.pytrees import Replaceable, converted, pytree
 from reachjax.sets import fit
 from reachjax.sets.base import AbstractSet, PolyhedralSet
@@ -173,7 +173,7 @@ class Template(AbstractTemplate):
 
         Raises:
             RuntimeError: `X0` cannot be sampled.
-            TypeError: `X0` is no set, or a number no whole one.
+            TypeError: the loop cannot be simulated, `X0` is no set, or a number no whole one.
             ValueError: there are too few facets to bound a set, or more than there are directions;
                 `X0` is empty or unbounded; or simulated states overflow.
 
@@ -185,6 +185,8 @@ class Template(AbstractTemplate):
             (3, 12, 2)
         """
         require_kind("X0", X0, AbstractSet, "a set such as Box(lower, upper)")
+        if not callable(getattr(loop, "simulate", None)):
+            raise TypeError(f"loop must be a ClosedLoop, but {described(loop)} arrived")
         n = X0.dimension
         if facets is None:
             facets = 12 if n == 2 else min(max(12, 2 * n), 2 * n * n)

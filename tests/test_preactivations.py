@@ -9,9 +9,15 @@ import pytest
 import reachjax as rj
 from reachjax.bounds import loop_bounds
 from reachjax.preactivations import bounds_over
+from reachjax.windows import _of_all
 
 exactly = np.vectorize(Fraction, otypes=[object])
-bounds_over = jax.jit(bounds_over)
+
+
+@jax.jit
+def bounds_of(loop, X):
+    """At time 0, with nothing known beforehand."""
+    return bounds_over(loop, X, X.bounding_box(), 0, _of_all(loop.units, None))
 
 
 def cancelling(n, seed, offset, size):
@@ -66,7 +72,7 @@ def test_no_exact_input_of_a_unit_is_beyond_its_bounds(offset, size):
     checked = 0
     for seed in range(6):
         loop, X = cancelling(2, seed, offset, size)
-        bounds = bounds_over(loop, X, X.bounding_box(), 0).preactivation
+        bounds = bounds_of(loop, X).preactivation
         (W1, _), (W2, _), _ = ((np.asarray(W), b) for W, b in loop.controller.layers)
         for direction in (*W1, *(W2 @ W1)):
             for x in touching(X, direction):
@@ -80,7 +86,7 @@ def test_no_exact_input_of_a_unit_is_beyond_its_bounds(offset, size):
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
 def test_bounds_of_the_layers_before_any_switch_are_attained(n):
     loop, X = cancelling(n, seed=3, offset=1.0, size=1.0)
-    bounds = bounds_over(loop, X, X.bounding_box(), 0).preactivation
+    bounds = bounds_of(loop, X).preactivation
     (W1, b1), (W2, b2), _ = ((np.asarray(W), np.asarray(b)) for W, b in loop.controller.layers)
     rows, constants = np.vstack([W1, W2 @ W1]), np.concatenate([b1, W2 @ b1 + b2])
     middle = rows @ np.asarray(X.center) + constants
@@ -91,7 +97,7 @@ def test_bounds_of_the_layers_before_any_switch_are_attained(n):
 
 def test_no_bound_is_looser_than_that_of_the_box():
     loop, X = cancelling(3, seed=1, offset=1.0, size=1.0)
-    over, around = bounds_over(loop, X, X.bounding_box(), 0), loop_bounds(loop, X.bounding_box(), 0)
+    over, around = bounds_of(loop, X), loop_bounds(loop, X.bounding_box(), 0)
     assert np.all(over.preactivation.upper <= around.preactivation.upper)
     assert np.all(over.preactivation.lower >= around.preactivation.lower)
     assert np.any(over.preactivation.upper < around.preactivation.upper - 0.1)

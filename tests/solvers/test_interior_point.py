@@ -1,7 +1,5 @@
 """The interior-point method: its algebra, its answers, and how it ends when it cannot answer."""
 
-import dataclasses
-import itertools
 from functools import partial
 
 import jax
@@ -12,7 +10,6 @@ from scipy.linalg import eigvalsh
 
 import reachjax as rj
 from reachjax.recheck import interval_offsets
-from reachjax.relaxation import AbstractRelaxation
 from reachjax.sets import NormalForm
 from reachjax.solvers import (
     accepted_enclosure,
@@ -44,20 +41,6 @@ from tests.solvers.test_differentiable import PROMISED, STEP, along, dot, planar
 from tests.solvers.test_differentiable import value as planar_value
 
 SOLVER = rj.InteriorPoint()
-
-
-@dataclasses.dataclass(frozen=True)
-class AllPairs(AbstractRelaxation):
-    """Every product of two facts: far more multipliers than the matrix has entries."""
-
-    remove_stable: bool = True
-
-    def groups(self, facts):
-        free = [[pair] for pair in zip(facts.output, facts.slack, strict=True)]
-        kinds = facts.output, facts.slack, facts.output_cap, facts.slack_cap
-        rows = [0, *facts.set_facets, *itertools.chain(*kinds)]
-        pairs = [[pair] for pair in itertools.combinations(rows, 2)]
-        return free + [pair for pair in pairs if pair not in free], len(free)
 
 
 def program_of(data, X, relaxation, rows):
@@ -142,12 +125,12 @@ DEGENERATE = {
     "a simplex": {"X": simplex},
     "an ellipsoid": {"X": round_of, "network": saturating_network},
     "one state": {"n_x": 1, "seed": 4},
-    "every product": {"hidden": (4,), "relaxation": AllPairs()},
+    "every product": {"hidden": (4,), "relaxation": rj.AllProducts()},
     "every product, all of it implied": {
         "n_x": 2,
         "hidden": (4, 3),
         "network": affine_network,
-        "relaxation": AllPairs(),
+        "relaxation": rj.AllProducts(),
     },
 }
 

@@ -202,6 +202,7 @@ def test_operations_of_products_and_factorisations_are_counted():
     assert operations(thrice, eye) == 3 * 2 * 6**3
 
 
+@pytest.mark.slow
 def test_every_part_of_a_step_can_be_timed():
     ready = parts(4, rj.LocalBounds(), rj.Clarabel())
     assert tuple(ready) == PARTS

@@ -88,10 +88,12 @@ def _enveloped(facts, objective, program, judged) -> tuple[Array, Solution]:
 
 
 def _forward(facts, objective, program, judged):
-    solution = judged.solution
+    # not `judged` itself: multipliers change with the program, so a second derivative has to fail
+    result: Any = _enveloped(facts, objective, program, judged)
+    _, solution = result
     trusted = judged.optimal & (solution.statuses == SolverStatus.SOLVED)
     moments = jnp.where(trusted[:, None, None], solution.moments, jnp.nan)
-    return (judged.offsets, solution), (program, solution.multipliers, moments)
+    return result, (program, solution.multipliers, moments)
 
 
 def _backward(residual, cotangents):

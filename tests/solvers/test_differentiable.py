@@ -149,15 +149,16 @@ def test_the_lagrangian_at_the_solution_is_the_offset():
     np.testing.assert_allclose(values, offsets, atol=1e-6)
 
 
+def agree(first, second):
+    """Compilations round differently; multipliers are exact to the root of a tolerance, 1e-9."""
+    np.testing.assert_allclose(first, second, rtol=3e-5, atol=1e-8)
+
+
 def test_compiled_and_plain_gradients_agree():
     args = planar(0)
     plain = jax.grad(value, argnums=(0, 1))(*args, 2)
     compiled = jax.jit(jax.grad(value, argnums=(0, 1)), static_argnums=2)(*args, 2)
-    # two compilations round differently, and multipliers are as exact as the root of the solver's
-    # tolerance, 1e-9
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=3e-5, atol=1e-8), plain, compiled
-    )
+    jax.tree.map(agree, plain, compiled)
 
 
 def test_a_batch_of_networks_and_sets_equals_one_at_a_time():
@@ -186,9 +187,8 @@ def test_scan_and_remat_give_the_same_gradient():
         return jax.tree.map(lambda w, g: w - 1e-3 * g, net, gradient), gradient
 
     _, first = jax.jit(lambda net: jax.lax.scan(descend, net, length=2))(loop.controller)
-    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8)  # noqa: E731
-    jax.tree.map(close, again, plain)
-    jax.tree.map(lambda a, b: close(a[0], b), first, plain.controller)
+    jax.tree.map(agree, again, plain)
+    jax.tree.map(lambda a, b: agree(a[0], b), first, plain.controller)
 
 
 def test_a_training_loop_compiles_once_while_neurons_become_stable():

@@ -25,7 +25,15 @@ from scipy.spatial import ConvexHull
 
 import reachjax as rj
 from experiments import stored
-from experiments.double_integrator import GOAL_BOX, INITIAL_BOX, INPUT_BOX, STATE_BOX, A, B
+from experiments.double_integrator import (
+    GOAL_BOX,
+    INITIAL_BOX,
+    INPUT_BOX,
+    RELAXATIONS,
+    STATE_BOX,
+    A,
+    B,
+)
 from experiments.imitation import fit, training_share
 from experiments.sampling import Samples
 
@@ -112,8 +120,8 @@ def closed_loop(net: rj.MLP) -> rj.ClosedLoop:
 
 def certified_tube(net: rj.MLP, horizon: int = HORIZON, **options) -> rj.ReachTube:
     """What is reachable from the paper's initial set, one step at a time."""
-    X0, stepwise = rj.Box(*INITIAL_BOX), {"relaxation": rj.LocalBounds(), "window": 1}
-    return rj.reach(closed_loop(net), X0, horizon, TEMPLATE(2), **stepwise | options)
+    options = RELAXATIONS["local-bounds"] | options
+    return rj.reach(closed_loop(net), rj.Box(*INITIAL_BOX), horizon, TEMPLATE(2), **options)
 
 
 def run(layers, samples: Samples, tuning: Tuning, path: Path) -> Outcome:

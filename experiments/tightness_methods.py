@@ -13,24 +13,22 @@ import reachjax as rj
 from experiments import benchmark_cases, stored
 from experiments.benchmark_methods import repeated
 from experiments.tightness_cases import Group, Settings
-from reachjax.partitions import PartitionedTube, reach_partitioned
-from reachjax.relaxation import AbstractRelaxation
 
 
 @dataclass(frozen=True)
 class Method:
     """A relaxation, a window, and cells of the initial set, if it is split."""
 
-    relaxation: AbstractRelaxation
+    relaxation: rj.AbstractRelaxation
     window: int | None = 1
     cells: int | tuple[int, ...] | None = None
 
-    def tube(self, loop: rj.ClosedLoop, group: Group) -> rj.ReachTube | PartitionedTube:
+    def tube(self, loop: rj.ClosedLoop, group: Group) -> rj.ReachTube | rj.PartitionedTube:
         """What it certifies of a loop."""
         task = loop, group.X0, group.horizon, group.template, self.relaxation, self.window
         if self.cells is None:
             return rj.reach(*task)
-        return reach_partitioned(*task, cells=self.cells)
+        return rj.reach_partitioned(*task, cells=self.cells)
 
 
 LIGHT = rj.LocalBounds(repeated=False)
@@ -119,10 +117,10 @@ def _measured(group: Group, method: Method, settings: Settings) -> dict[str, Any
     }
 
 
-def _facets(tube: rj.ReachTube | PartitionedTube) -> tuple[ndarray, ndarray]:
+def _facets(tube: rj.ReachTube | rj.PartitionedTube) -> tuple[ndarray, ndarray]:
     """Bounds and witnesses `(horizon, m)`."""
     steps = range(1, tube.horizon + 1)
-    if isinstance(tube, PartitionedTube):
+    if isinstance(tube, rj.PartitionedTube):
         pairs = [(tube.bounds(t), tube.witnesses(t)) for t in steps]
     else:
         pairs = [(tube.proof(t).bounds, tube.proof(t).witnesses) for t in steps]

@@ -154,7 +154,6 @@ def reach_partitioned(
         )
     options = {
         "horizon": horizon,
-        "template": template,
         "relaxation": relaxation,
         "window": window,
         "solver": solver,
@@ -164,7 +163,7 @@ def reach_partitioned(
     }
     own = ThreadPoolExecutor() if executor is None else None
     try:
-        run = _Run(loop, options, own or executor, progress)
+        run = _Run(loop, template, options, own or executor, progress)
         if isinstance(cells, int | np.integer):
             tubes = _guided(run, X0, whole_number("cells", cells, 1))
         elif np.ndim(cells) == 1:
@@ -184,15 +183,23 @@ def reach_partitioned(
 class _Run:
     """Tubes of one loop, computed by an executor, cell by cell."""
 
-    def __init__(self, loop: ClosedLoop, options: dict, executor: Any, progress: Bar | None):
-        self._loop, self._options = loop, options
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        template: Template,
+        options: dict,
+        executor: Any,
+        progress: Bar | None,
+    ):
+        self._loop, self._template = jax.device_get((loop, template))
+        self._options = options
         self._executor, self._progress = executor, progress
 
     def tubes(self, cells: Sequence[AbstractSet]) -> list[ReachTube]:
         """One for each cell, in their order; the first error ends the run."""
-        arrays = [jax.device_get((self._loop, cell, self._options["template"])) for cell in cells]
-        others = {name: value for name, value in self._options.items() if name != "template"}
-        futures = [self._executor.submit(_tube, *each, others) for each in arrays]
+        given = self._template, self._options
+        arrays = jax.device_get(list(cells))
+        futures = [self._executor.submit(_tube, self._loop, cell, *given) for cell in arrays]
         try:
             done = _results(futures)
             for _ in done if self._progress is None else self._progress(done):
@@ -213,16 +220,15 @@ def _results(futures: list[Future]) -> Iterator[Any]:
 def _tube(loop: ClosedLoop, cell: AbstractSet, template: Template, options: dict) -> ReachTube:
     """One cell's tube, from numpy arrays to numpy arrays, wherever it runs."""
     with jax.enable_x64(True):
-        given = jax.tree.map(jnp.asarray, (loop, cell, template))
-        loop, cell, template = given
+        loop, cell, template = jax.tree.map(jnp.asarray, (loop, cell, template))
         return jax.device_get(reach(loop, cell, template=template, **options))
 
 
 def _guided(run: _Run, X0: AbstractSet, count: int) -> list[ReachTube]:
     """Halve the cells at which the union's gap is widest, along their longest side."""
-    sides = np.asarray(bounding_box(X0).widths)
-    sides = np.where(sides > 0, sides, np.inf)  # a side without length is not halved
     boxes, tubes = [bounding_box(X0)], run.tubes([X0])
+    sides = np.asarray(boxes[0].widths)
+    sides = np.where(sides > 0, sides, np.inf)  # a side without length is not halved
     widths = _widths(tubes[0])
     while len(tubes) < count:
         some = min(math.ceil(len(tubes) / 4), count - len(tubes))

@@ -14,10 +14,8 @@ from jaxtyping import Array, Float, Int
 
 from reachjax.ascent import ascended
 from reachjax.sets import AbstractSet, Ellipsoid, Intersection, PolyhedralSet
+from reachjax.sets.base import MOST_DIMENSIONS
 from reachjax.systems import ClosedLoop
-
-MOST_DIMENSIONS = 12
-"""Corners are listed up to this dimension (a box has 4096 of them there)."""
 
 BLOCK = 1024
 """Trajectories are evaluated in multiples of so many, for which code is compiled once."""

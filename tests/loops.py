@@ -1,5 +1,7 @@
 """The library's loops from the arrays of `tests.networks`."""
 
+import numpy as np
+
 import reachjax as rj
 from tests.networks import LoopData, he_network, input_box, plant
 
@@ -11,6 +13,13 @@ def closed_loop(data: LoopData) -> rj.ClosedLoop:
         rj.MLP.from_layers(data.layers),
         input_box=None if data.u_lower is None else rj.Box(data.u_lower, data.u_upper),
     )
+
+
+def autonomous(A, input_box=None):
+    """`x+ = A x`, whatever the controller does: its sets are known exactly."""
+    n_x = len(A)
+    net = rj.MLP.from_layers([(np.zeros((1, n_x)), [0.0])])
+    return rj.ClosedLoop(rj.AffinePlant(A, np.zeros((n_x, 1))), net, input_box)
 
 
 def random_loop(n_x, hidden=(6, 4), seed=0, boxed=True, steps=None, network=he_network):

@@ -8,7 +8,7 @@ import pytest
 import reachjax as rj
 from reachjax.ascent import ascended
 from reachjax.witnesses import Simulations
-from tests.loops import closed_loop, random_loop
+from tests.loops import autonomous, closed_loop, random_loop
 from tests.networks import box_region, plant, simplex_region, simulate
 
 HORIZON, STARTS = 2, 6
@@ -86,10 +86,7 @@ def test_of_an_affine_loop_ascents_find_the_support(n_x, kind):
 def test_the_surface_of_an_ellipsoid_has_its_closed_form():
     n_x = 3
     X = initial("ellipsoid", n_x, seed=4)
-    loop = rj.ClosedLoop(
-        rj.AffinePlant(np.eye(n_x), np.zeros((n_x, 1))),
-        rj.MLP.from_layers([(np.zeros((1, n_x)), [0.0])]),
-    )
+    loop = autonomous(np.eye(n_x))
     begin, end, *_ = climbed(loop, X, k=1, horizon=1)
     rows = np.asarray(rj.Template.box(n_x).directions)[np.arange(len(begin)) % (2 * n_x)]
     Q = np.asarray(X.shape)

@@ -9,7 +9,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.cells import grid, halves
-from tests.loops import closed_loop, random_loop, recursion
+from tests.loops import autonomous, closed_loop, random_loop, recursion
 
 RECURSION = {"relaxation": rj.LocalBounds(), "window": 1}
 DIAMOND = rj.Polytope([[1, 1], [1, -1], [-1, 1], [-1, -1]], [1, 1, 1, 1])
@@ -81,18 +81,17 @@ def test_cells_of_cells_have_no_more_facets():
 def test_a_state_beside_the_set_refutes_nothing():
     # cells that a skewed ellipse barely reaches are made larger, and hold points beside it
     needle = rj.Ellipsoid([0.0, 0.0], [[1.0, 0.95], [0.95, 1.0]])
-    still = rj.ClosedLoop(
-        rj.AffinePlant(np.eye(2), np.zeros((2, 1))),
-        rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])]),
+    template, cells = rj.Template.box(2), (7, 7)
+    tube = rj.reach_partitioned(
+        autonomous(np.eye(2)), needle, 1, template, cells=cells, **RECURSION
     )
-    tube = rj.reach_partitioned(still, needle, 1, rj.Template.box(2), cells=(7, 7), **RECURSION)
-    assert any(not isinstance(cell.part, rj.Intersection) for cell in grid(needle, (7, 7)))
+    assert any(not isinstance(cell.part, rj.Intersection) for cell in grid(needle, cells))
     for direction in np.array([[1.0, -1.0], [-0.8, 1.0], [1.0, 0.2]]):
         goal = rj.Polytope(direction[None], needle.support(direction[None]) + 1e-9)
         verdict = rj.verify(tube, goal=goal, samples=50)
         assert verdict.status is not rj.VerdictStatus.REFUTED
         assert np.nanmin(verdict.simulated["goal"]) >= -1e-9
-    assert np.all(tube.witnesses(1) <= needle.support(rj.Template.box(2).directions) + 1e-9)
+    assert np.all(tube.witnesses(1) <= needle.support(template.directions) + 1e-9)
 
 
 def test_the_union_holds_every_state(loop, partitioned):
@@ -125,11 +124,8 @@ def test_guided_cells_close_the_gap_faster_than_none(loop):
 
 
 def test_nothing_is_split_where_no_gap_is_left():
-    still = rj.ClosedLoop(
-        rj.AffinePlant(0.5 * np.eye(2), np.zeros((2, 1))),
-        rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])]),
-    )
-    tube = rj.reach_partitioned(still, SETS["box"], 1, rj.Template.box(2), cells=4, **RECURSION)
+    still, template = autonomous(0.5 * np.eye(2)), rj.Template.box(2)
+    tube = rj.reach_partitioned(still, SETS["box"], 1, template, cells=4, **RECURSION)
     assert len(tube.tubes) == 1
 
 

@@ -5,15 +5,13 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import recursion
+from tests.loops import autonomous, recursion
 from tests.networks import he_network
 
 
 def contraction(n_x=2, input_box=None):
-    """`x+ = x / 2`: its sets are known exactly."""
-    A = np.eye(n_x) / 2
-    net = rj.MLP.from_layers([(np.zeros((1, n_x)), [0.0])])
-    return rj.ClosedLoop(rj.AffinePlant(A, np.zeros((n_x, 1))), net, input_box)
+    """`x+ = x / 2`."""
+    return autonomous(np.eye(n_x) / 2, input_box)
 
 
 @pytest.fixture(scope="module")

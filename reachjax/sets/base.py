@@ -84,6 +84,10 @@ class AbstractSet(Replaceable, abc.ABC):
         """The smallest box around the set."""
 
 
+MOST_DIMENSIONS = 12
+"""Corners are listed for simulations up to this dimension (a box has 4096 of them there)."""
+
+
 class PolyhedralSet(AbstractSet):
     """A set bounded by facets, `A x <= b`."""
 

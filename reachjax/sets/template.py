@@ -13,12 +13,9 @@ from jaxtyping import Array, Float
 from reachjax.checks import Numbers, described, is_concrete, require_kind, same_size, whole_number
 from reachjax.pytrees import Replaceable, converted, pytree
 from reachjax.sets import fit
-from reachjax.sets.base import AbstractSet, PolyhedralSet
+from reachjax.sets.base import MOST_DIMENSIONS, AbstractSet, PolyhedralSet
 from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polytope import Polytope
-
-LISTED = 12
-"""Corners of the initial set are simulated up to this dimension."""
 
 
 class Simulated(Protocol):
@@ -192,7 +189,7 @@ class Template(AbstractTemplate):
             facets = 12 if n == 2 else min(max(12, 2 * n), 2 * n * n)
         count = whole_number("facets", facets, 3 if n == 2 else 2 * n)
         states = X0.sample(jax.random.key(seed), whole_number("samples", samples, n + 1))
-        if isinstance(X0, PolyhedralSet) and n <= LISTED:
+        if isinstance(X0, PolyhedralSet) and n <= MOST_DIMENSIONS:
             states = jnp.concatenate([states, X0.vertices()])
         trajectories = np.asarray(loop.simulate(states, horizon, start))
         if not np.isfinite(trajectories).all():

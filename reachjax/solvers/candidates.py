@@ -67,16 +67,21 @@ class Candidates:
 
     def missing(self, pairs: Int[np.ndarray, "p 2"]) -> Int[np.ndarray, "q 2"]:
         """What `LocalBounds` has beyond these and the products to begin with."""
-        allowed = self.promised.copy()
-        allowed[self._entries(pairs)] = False
-        return self.live[np.argwhere(allowed)]
+        return self.live[np.argwhere(self._besides(pairs, self.promised))]
+
+    def _besides(
+        self, pairs: Int[np.ndarray, "p 2"], entries: Bool[np.ndarray, "m m"]
+    ) -> Bool[np.ndarray, "m m"]:
+        """Those of these entries that are none of the pairs."""
+        besides = entries.copy()
+        besides[self._entries(pairs)] = False
+        return besides
 
     def violated(
         self, moment: Float[np.ndarray, "n n"], pairs: Int[np.ndarray, "p 2"], batch: int | None
     ) -> Int[np.ndarray, "q 2"]:
         """The most violated pairs that are not there yet; None for all that `LocalBounds` has."""
-        allowed = (self.promised if batch is None else self.open).copy()
-        allowed[self._entries(pairs)] = False
+        allowed = self._besides(pairs, self.promised if batch is None else self.open)
         values = np.where(allowed, self.rows @ moment @ self.rows.T, 0.0)
         count = int((values < -VIOLATED).sum())
         count = count if batch is None else min(batch, count)

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 
 import reachjax as rj
 from reachjax.sets import fit
-from tests.loops import closed_loop, random_loop
+from tests.loops import autonomous, closed_loop, random_loop
 from tests.networks import box_region, simulate
 
 HORIZON = 3
@@ -166,14 +166,11 @@ def test_a_tube_in_one_shot_has_about_the_area_of_the_states():
 
 @pytest.mark.parametrize(("n_x", "facets"), [(1, 2), (2, 12), (3, 12), (7, 14)])
 def test_the_default_number_of_facets_is_twelve_or_the_nearest_that_bounds(n_x, facets):
-    A, B = 0.5 * np.eye(n_x), np.zeros((n_x, 1))
-    net = rj.MLP.from_layers([(np.zeros((1, n_x)), [0.0])])
-    loop, X0 = rj.ClosedLoop(rj.AffinePlant(A, B), net), rj.Box(-np.ones(n_x), np.ones(n_x))
+    loop, X0 = autonomous(0.5 * np.eye(n_x)), rj.Box(-np.ones(n_x), np.ones(n_x))
     assert rj.Template.adapted(loop, X0, 1).directions.shape == (1, facets, n_x)
 
 
 def test_three_facets_of_a_parallelogram_bound_it():
-    net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
-    loop = rj.ClosedLoop(rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], np.zeros((2, 1))), net)
+    loop = autonomous([[1.0, 1.0], [0.0, 1.0]])
     template = rj.Template.adapted(loop, rj.Box([-1.0, -1.0], [1.0, 1.0]), 1, facets=3)
     assert np.isfinite(template.at(1).polytope(np.ones(3)).volume())

@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.bounds import LoopBounds
@@ -73,7 +74,7 @@ def columns(first: int, count: int, size: int) -> Rows:
     return Rows.exact(jnp.eye(count, size, k=first))
 
 
-def picking(places: Int[Array, " k"], size: int) -> Rows:
+def picking(places: Int[Array | np.ndarray, " k"], size: int) -> Rows:
     """The rows that pick these entries of the basis; zero where a place is negative."""
     return Rows.exact(jax.nn.one_hot(places, size, dtype=float))
 
@@ -81,7 +82,7 @@ def picking(places: Int[Array, " k"], size: int) -> Rows:
 def loop_rows(
     loop: ClosedLoop,
     state: Rows,
-    places: Int[Array, " k"],
+    places: Int[Array | np.ndarray, " k"],
     t: int | jax.Array,
     bounds: LoopBounds,
     prune: bool,

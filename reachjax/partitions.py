@@ -12,7 +12,6 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_complete
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -208,7 +207,7 @@ class _Run:
             for future in futures:
                 future.cancel()
             raise
-        return [jax.tree.map(jnp.asarray, future.result()) for future in futures]
+        return [jax.device_put(future.result()) for future in futures]
 
 
 def _results(futures: list[Future]) -> Iterator[Any]:
@@ -220,7 +219,7 @@ def _results(futures: list[Future]) -> Iterator[Any]:
 def _tube(loop: ClosedLoop, cell: AbstractSet, template: Template, options: dict) -> ReachTube:
     """One cell's tube, from numpy arrays to numpy arrays, wherever it runs."""
     with jax.enable_x64(True):
-        loop, cell, template = jax.tree.map(jnp.asarray, (loop, cell, template))
+        loop, cell, template = jax.device_put((loop, cell, template))
         return jax.device_get(reach(loop, cell, template=template, **options))
 
 

@@ -53,13 +53,15 @@ def bounds_over(
     n, size = loop.states, loop.states + loop.units + 1
     places = n + jnp.arange(loop.units)
 
-    def once(_, bounds: LoopBounds) -> LoopBounds:
+    def once(known: Ball, _) -> tuple[Ball, LoopBounds]:
+        bounds = loop_bounds(loop, box, t, known)
         rows = loop_rows(loop, columns(0, n, size), places, t, bounds, prune=True)
-        ranges = _ranges(rows.preactivation, X, bounds)
-        return loop_bounds(loop, box, t, _meet(ranges, known))
+        return _meet(_ranges(rows.preactivation, X, bounds), known), bounds
 
+    # a layer is settled when those before it are: one pass each, compiled once
     layers = len(loop.controller.layers) - 1 + 2 * (loop.input_box is not None)
-    return jax.lax.fori_loop(0, layers, once, loop_bounds(loop, box, t, known))
+    _, passes = jax.lax.scan(once, known, length=layers + 1)
+    return jax.tree.map(lambda part: part[-1], passes)
 
 
 def _meet(one: Ball, other: Ball) -> Ball:

@@ -15,7 +15,7 @@ import dataclasses
 import itertools
 from typing import ClassVar
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -144,7 +144,7 @@ class AbstractRelaxation(abc.ABC):
         left, right = pairs.T
         sign = np.where(np.isin(left, facts.cone_rows[1:]), -1.0, 1.0)
         signed = np.arange(len(groups)) < free
-        return Products(*map(jnp.asarray, (left, right, sign, owner, signed)))
+        return Products(*jax.device_put((left, right, sign, owner, signed)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,7 @@ from reachjax.lmi import Program
 from reachjax.relaxation import AbstractRelaxation
 from reachjax.rounding import Ball
 from reachjax.sets import AbstractSet, Box, Polytope, Template
-from reachjax.solvers import AbstractSolver, bounding_box, support
+from reachjax.solvers import AbstractSolver, bounding_box, row_ranges
 from reachjax.solvers.candidates import NONE
 from reachjax.systems import ClosedLoop
 from reachjax.windows import Window
@@ -128,8 +128,7 @@ class Step:
         ):
             return None
         W, b = layers[0]
-        upper, below = support(self.X, W), support(self.X, -W)
-        return Ball.between(-below, jnp.maximum(-below, upper)) + b
+        return _inputs(*row_ranges(self.X, W), b)
 
     @property
     def offered(self) -> Int[np.ndarray, "p 2"]:
@@ -163,3 +162,8 @@ class Step:
             starts[-1] = column[:n]
         simulations.climb(k, region, np.full(facets, facet), starts)
         return float(simulations.attained(k, region)[0][facet])
+
+
+@jax.jit
+def _inputs(lower: Float[Array, " k"], upper: Float[Array, " k"], b: Float[Array, " k"]) -> Ball:
+    return Ball.between(lower, upper) + b

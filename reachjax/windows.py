@@ -12,24 +12,23 @@ window of many steps has as many columns as it has units that switch.
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from reachjax.basis import Rows, columns, loop_rows, picking
+from reachjax.basis import Rows, columns, loop_rows
 from reachjax.bounds import LoopBounds, loop_bounds
 from reachjax.lmi import Program
 from reachjax.preactivations import bounds_over, rounded
 from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, FactLayout
 from reachjax.rounding import Ball
+from reachjax.scaling import scaled_states, scaled_units
 from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection
 from reachjax.systems import ClosedLoop
-
-CONSTANT = 1e-9
-"""An output whose radius is a smaller part than this of its input's size has a single value."""
 
 COLUMNS = 16
 """The columns of a compact basis come in multiples of this many."""
@@ -87,10 +86,20 @@ class Window(Replaceable):
             compact: whether their columns are left out as well, which needs concrete numbers.
         """
         prune, linear = relaxation.remove_stable, relaxation.linear_bounds
-        ball = _ball(rounded(X, box))
-        state, cone, T = _first(X.cone_facts(), box, ball)
-        empty, shape = (), (loop.units, int(t), loop.states)
-        return cls(empty, cone, state, T, empty, *shape, prune, linear, compact and prune)
+        state, cone, T = _first(X.cone_facts(), box, _ball(rounded(X, box)))
+        return cls(
+            facts=(),
+            cone=cone,
+            state=state,
+            transform=T,
+            facets=(),
+            units=loop.units,
+            start=int(t),
+            taken=loop.states,
+            prune=prune,
+            linear=linear,
+            compact=compact and prune,
+        )
 
     def __len__(self) -> int:
         return len(self.facts)
@@ -116,9 +125,10 @@ class Window(Replaceable):
         bounds = _bounds(loop, around if sharp else None, box, t, _of_all(self.units, known))
         places, taken = self._places(bounds)
         grown = self._padded(taken + 1)
-        block, state, T = _extended(
-            loop, X.facts(), grown.state, grown.transform, bounds, t, places, self.prune
+        units, state, T = _extended(
+            loop, grown.state, grown.transform, bounds, t, places, self.prune
         )
+        block = _block(X, grown.state, units, T)
         return grown.replace(
             facts=(*grown.facts, block),
             state=state,
@@ -137,38 +147,27 @@ class Window(Replaceable):
             directions: one row for each facet.
             relaxation: which products of facts are used.
         """
-        size = len(self.transform)
-        parts = columns(size - 1, 1, size), *self.facts, self.cone
-        return Program(
-            facts=jax.tree.map(lambda *part: jnp.concatenate(part), *parts),
-            objective=_objective(directions, self.state, self.transform),
-            products=relaxation.products(self.layout),
-            transform=self.transform,
-        )
+        one, objective = _ends(directions, self.state, self.transform)
+        facts = _joined(one, *self.facts, self.cone)
+        return Program(facts, objective, relaxation.products(self.layout), self.transform)
 
-    def _places(self, bounds: LoopBounds) -> tuple[Int[Array, " k"], int]:
+    def _places(self, bounds: LoopBounds) -> tuple[Int[np.ndarray, " k"], int]:
         """The column of each unit of one more step, and how many are taken then."""
         if not self.compact:
-            return self.taken + jnp.arange(self.units), self.taken + self.units
-        passing, blocking = jax.lax.stop_gradient((bounds.passing, bounds.blocking))
-        stays = ~np.asarray(passing | blocking)
+            return self.taken + np.arange(self.units), self.taken + self.units
+        passing, blocking = jax.device_get(jax.lax.stop_gradient((bounds.passing, bounds.blocking)))
+        stays = ~(passing | blocking)
         places = np.where(stays, self.taken + np.cumsum(stays) - 1, -1)
-        return jnp.asarray(places), self.taken + int(stays.sum())
+        return places, self.taken + int(stays.sum())
 
     def _padded(self, needed: int) -> Window:
         """The same with at least so many columns; new ones are empty."""
         more = (-(-needed // COLUMNS) * COLUMNS if self.compact else needed) - len(self.transform)
         if more <= 0:
             return self
-
-        def wider(rows: Rows) -> Rows:
-            return jax.tree.map(lambda part: _spread(part, more), rows)
-
-        T = _spread(_spread(self.transform, more).T, more).T
-        facts = tuple(map(wider, self.facts))
-        return self.replace(
-            facts=facts, cone=wider(self.cone), state=wider(self.state), transform=T
-        )
+        rows = self.facts, self.cone, self.state
+        (facts, cone, state), T = _widened(rows, self.transform, more)
+        return self.replace(facts=facts, cone=cone, state=state, transform=T)
 
 
 def step_program(
@@ -190,6 +189,7 @@ def _ball(around: Box | Ellipsoid | Intersection) -> Ellipsoid | None:
     return around.ellipsoid if isinstance(around, Intersection) else around
 
 
+@partial(jax.jit, static_argnames="units")
 def _of_all(units: int, known: Ball | None) -> Ball:
     """Bounds of every unit's input, of infinite radius but for those known, the first ones."""
     mid, rad = jnp.zeros(units), jnp.full(units, jnp.inf)
@@ -204,14 +204,7 @@ def _first(
     cone_facts: Float[Array, "r n_x+1"], box: Box, ball: Ellipsoid | None
 ) -> tuple[Rows, Rows, Float[Array, "n_x+1 n_x+1"]]:
     """Rows of the state, scaled rows of its cone fact, and the scaling."""
-    n = box.dimension
-    state, around = columns(0, n, n + 1), Ball.between(box.lower, box.upper)
-    # The optimal value does not depend on the scaling, but its derivative at inexact multipliers
-    # does: with the scaling's share, facts of thin sets keep their size and errors cancel.
-    T = jnp.diag(jnp.append(around.rad, 1.0)).at[:-1, -1].set(around.mid)
-    if ball is not None:
-        T = T.at[:n, :n].set(ball.from_ball()).at[:n, -1].set(ball.center)
-    T = jax.lax.optimization_barrier(T)
+    state, T = columns(0, box.dimension, box.dimension + 1), scaled_states(box, ball)
     return state, _holding(cone_facts, state) @ T, T
 
 
@@ -232,54 +225,48 @@ def _bounds(
 @partial(jax.jit, static_argnames="prune")
 def _extended(
     loop: ClosedLoop,
-    set_facts: Float[Array, "m n_x+1"],
     state: Rows,
     T: Float[Array, "n n"],
     bounds: LoopBounds,
     t: int,
-    places: Int[Array, " k"],
+    places: Int[Array | np.ndarray, " k"],
     prune: bool,
 ) -> tuple[Rows, Rows, Float[Array, "n n"]]:
-    """Scaled facts of one step, the state after it, and the scaling with its units."""
-    rows, size = loop_rows(loop, state, places, t, bounds, prune), len(T)
-    here = picking(places, size).mid
-    mid, rad = _scales(bounds, prune)
-    T = T.at[:, -1].add(mid @ here) + jnp.diag(rad @ here)
-    # one rounding of it for all rows, whatever the compiler fuses
-    T = jax.lax.optimization_barrier(T)
-    facts = jax.tree.map(
-        lambda *part: jnp.concatenate(part), _holding(set_facts, state), *rows.facts
-    )
-    return facts @ T, rows.successor, T
+    """Scaled facts of the units of one step, the state after it, and the scaling with these."""
+    rows = loop_rows(loop, state, places, t, bounds, prune)
+    T = scaled_units(T, places, bounds, prune)
+    return _joined(*rows.facts) @ T, rows.successor, T
 
 
 @jax.jit
-def _objective(directions: Float[Array, "f n_x"], state: Rows, T: Float[Array, "n n"]) -> Ball:
-    return (directions @ state) @ T
+def _block(X: AbstractSet, state: Rows, units: Rows, T: Float[Array, "n n"]) -> Rows:
+    """Scaled facts of one step: of its set, then of its units."""
+    return _joined(_holding(X.facts(), state) @ T, units)
 
 
-def _holding(facts: Float[Array, "m n_x+1"], state: Rows) -> Ball:
+@jax.jit
+def _ends(
+    directions: Float[Array, "f n_x"], state: Rows, T: Float[Array, "n n"]
+) -> tuple[Rows, Rows]:
+    """The constant, which is the first fact, and the objective, over the scaled basis."""
+    return columns(len(T) - 1, 1, len(T)), (directions @ state) @ T
+
+
+def _joined(*parts: Rows) -> Rows:
+    return jax.tree.map(lambda *part: jnp.concatenate(part), *parts)
+
+
+def _holding(facts: Float[Array, "m n_x+1"], state: Rows) -> Rows:
     """Facts of states as rows over the basis."""
     return facts[:, :-1] @ state + facts[:, -1]
 
 
-def _scales(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """Midpoint and radius of the output of each unit.
+@partial(jax.jit, static_argnames="more")
+def _widened(rows: Any, T: Float[Array, "n n"], more: int) -> tuple[Any, Float[Array, "n+m n+m"]]:
+    """All rows and the scaling, with empty columns before the last."""
 
-    A unit that has left the basis gets radius zero. One that stays although its output has a single
-    value (a dead neuron that the paper keeps) is scaled by its input, so that it does stay: a
-    radius at rounding level would tell the solver what the paper's constraints do not.
-    """
-    y, z = bounds.preactivation, bounds.output
-    if prune:
-        gone = bounds.passing | bounds.blocking
-        return jnp.where(gone, 0.0, z.mid), jnp.where(gone, 0.0, z.rad)
-    size = abs(y.mid) + y.rad
-    constant = z.rad <= CONSTANT * size
-    # a tenth of the input's size: measured, solvers lose digits at the whole and at a hundredth
-    return z.mid, jnp.where(constant, jnp.where(size > 0, size / 10, 1.0), z.rad)
+    def wider(part: Float[Array, "k n"]) -> Float[Array, "k n+m"]:
+        empty = jnp.zeros((len(part), more))
+        return jnp.concatenate([part[:, :-1], empty, part[:, -1:]], axis=1)
 
-
-def _spread(part: Float[Array, "m n"], more: int) -> Float[Array, "m n+more"]:
-    """With empty columns before the last."""
-    return jnp.concatenate([part[:, :-1], jnp.zeros((len(part), more)), part[:, -1:]], axis=1)
+    return jax.tree.map(wider, rows), wider(wider(T).T).T

@@ -10,7 +10,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.ascent import ascended
 from reachjax.sets import AbstractSet, Ellipsoid, Intersection, PolyhedralSet
@@ -24,7 +24,7 @@ PULL = 1 - 1e-12
 """How far a rounded point is brought towards the middle of the set."""
 
 
-def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[Array, "c n_x"]:
+def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, "c n_x"]:
     """Corners of the set, in few dimensions, and `count` points drawn from it.
 
     Where the set has a round part, half of the points are on the surface, just inside.
@@ -36,11 +36,21 @@ def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[Array, "c n_
         surface = middle + PULL * (X0.sample_boundary(key, count) - middle)
         states = states.at[::2].set(surface[::2])
     states = jnp.concatenate([_corners(X0), states])
-    # corners and points of triangulations are rounded: bring them inside, or a witness could lie
+    states, inside = jax.device_get(_brought_inside(X0, states))
+    return states[inside] if inside.any() else states  # a flat set contains none exactly
+
+
+@jax.jit
+def _brought_inside(
+    X0: AbstractSet, states: Float[Array, "c n_x"]
+) -> tuple[Float[Array, "c n_x"], Bool[Array, " c"]]:
+    """States inside the set, and whether they are now.
+
+    Corners and points of triangulations are rounded: left as they are, a witness could lie.
+    """
     center = states.mean(axis=0)
-    inside = jnp.where(X0.contains(states)[:, None], states, center + PULL * (states - center))
-    kept = np.asarray(X0.contains(inside))
-    return inside[kept] if kept.any() else states  # a set without interior contains none exactly
+    states = jnp.where(X0.contains(states)[:, None], states, center + PULL * (states - center))
+    return states, X0.contains(states)
 
 
 def _corners(X0: AbstractSet) -> Float[Array, "v n_x"]:
@@ -76,8 +86,7 @@ class Simulations:
         self._loop, self._X0, self._start, self._horizon = loop, X0, start, horizon
         self._box = X0.bounding_box()
         states = initial_states(X0, samples, seed)
-        self._states = np.asarray(states)
-        self._middle = self._states.mean(axis=0)
+        self._states, self._middle = states, states.mean(axis=0)
         self._trajectories = np.asarray(loop.simulate(states, horizon, start))
 
     def climb(

@@ -3,7 +3,14 @@
 import numpy as np
 
 import reachjax as rj
-from tests.networks import LoopData, he_network, input_box, plant
+from tests.networks import (
+    LoopData,
+    box_region,
+    he_network,
+    input_box,
+    plant,
+    simplex_region,
+)
 
 
 def closed_loop(data: LoopData) -> rj.ClosedLoop:
@@ -28,6 +35,27 @@ def random_loop(n_x, hidden=(6, 4), seed=0, boxed=True, steps=None, network=he_n
     box = input_box(n_u, seed, steps) if boxed else (None, None)
     layers = network((n_x, *hidden, n_u), seed)
     return LoopData(layers, *plant(n_x, n_u, seed, steps), *box)
+
+
+def initial_set(kind, n_x, seed=0):
+    """A set of this kind; boxes and ellipsoids are skewed but for the kind `box`."""
+    rng, straight = np.random.default_rng(seed), box_region(n_x, seed).corners
+    rotated, simplex = box_region(n_x, seed, rotated=True), simplex_region(n_x, seed)
+    box = rj.Box(straight.min(axis=0), straight.max(axis=0))
+    L = 0.3 * rng.normal(size=(n_x, n_x)) + 0.1 * np.eye(n_x)
+    ball = rj.Ellipsoid(box.center, L @ L.T)
+    around = ball.bounding_box()
+    middle, far = around.center[0], around.center[0] + 0.2 * around.widths[0]
+    return {
+        "box": box,
+        "polytope": rj.Polytope(rotated.A, rotated.b),
+        "simplex": rj.Polytope(simplex.A, simplex.b),  # the middle of its box is outside
+        "ellipsoid": ball,
+        "intersection": rj.Intersection(around.replace(upper=around.upper.at[0].set(middle)), ball),
+        "far intersection": rj.Intersection(
+            around.replace(lower=around.lower.at[0].set(far)), ball
+        ),
+    }[kind]
 
 
 def recursion(loop, X0, horizon, template, relaxation=rj.LocalBounds(), **options):  # noqa: B008

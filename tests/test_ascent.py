@@ -8,35 +8,14 @@ import pytest
 import reachjax as rj
 from reachjax.ascent import ascended
 from reachjax.witnesses import Simulations
-from tests.loops import autonomous, closed_loop, random_loop
-from tests.networks import box_region, plant, simplex_region, simulate
+from tests.loops import autonomous, closed_loop, initial_set, random_loop
+from tests.networks import plant, simulate
 
 HORIZON, STARTS = 2, 6
 DIMENSIONS = (1, 2, 3, 6)
 SETS = ["box", "polytope", "simplex", "ellipsoid", "intersection", "far intersection"]
 EDGE = 1e-8
 """Ascents end 1e-9 of the way from the edge of a set that is no box, on both ends of a range."""
-
-
-def initial(kind, n_x, seed=0):
-    """A set of this kind; boxes and ellipsoids are skewed but for the kind `box`."""
-    rng, straight = np.random.default_rng(seed), box_region(n_x, seed).corners
-    rotated, simplex = box_region(n_x, seed, rotated=True), simplex_region(n_x, seed)
-    box = rj.Box(straight.min(axis=0), straight.max(axis=0))
-    L = 0.3 * rng.normal(size=(n_x, n_x)) + 0.1 * np.eye(n_x)
-    ball = rj.Ellipsoid(box.center, L @ L.T)
-    around = ball.bounding_box()
-    middle, far = around.center[0], around.center[0] + 0.2 * around.widths[0]
-    return {
-        "box": box,
-        "polytope": rj.Polytope(rotated.A, rotated.b),
-        "simplex": rj.Polytope(simplex.A, simplex.b),  # the middle of its box is outside
-        "ellipsoid": ball,
-        "intersection": rj.Intersection(around.replace(upper=around.upper.at[0].set(middle)), ball),
-        "far intersection": rj.Intersection(
-            around.replace(lower=around.lower.at[0].set(far)), ball
-        ),
-    }[kind]
 
 
 def climbed(loop, X, k=HORIZON, starts=None, horizon=HORIZON, start=0):
@@ -62,7 +41,7 @@ def climbed(loop, X, k=HORIZON, starts=None, horizon=HORIZON, start=0):
 def test_an_ascent_never_leaves_the_set_and_never_loses(n_x, kind):
     loop = closed_loop(random_loop(n_x, seed=1))
     for seed in range(2):
-        X = initial(kind, n_x, seed)
+        X = initial_set(kind, n_x, seed)
         _, end, before, after = climbed(loop, X)
         assert np.asarray(X.contains(end)).all()
         # what begins on the edge is brought inside first
@@ -75,7 +54,7 @@ def test_an_ascent_never_leaves_the_set_and_never_loses(n_x, kind):
 def test_of_an_affine_loop_ascents_find_the_support(n_x, kind):
     W, (A, B, c) = np.random.default_rng(n_x).normal(size=(1, n_x)), plant(n_x, 1, seed=n_x)
     loop = rj.ClosedLoop(rj.AffinePlant(A, B, c), rj.MLP.from_layers([(W, [0.1])]))
-    X, M = initial(kind, n_x, seed=n_x), np.linalg.matrix_power(A + B @ W, HORIZON)
+    X, M = initial_set(kind, n_x, seed=n_x), np.linalg.matrix_power(A + B @ W, HORIZON)
     signed = np.asarray(rj.Template.box(n_x).directions)
     _, end, *_ = climbed(loop, X)
     values = np.sum((end @ M.T).reshape(STARTS, 2 * n_x, n_x) * signed, axis=2)
@@ -85,7 +64,7 @@ def test_of_an_affine_loop_ascents_find_the_support(n_x, kind):
 
 def test_the_surface_of_an_ellipsoid_has_its_closed_form():
     n_x = 3
-    X = initial("ellipsoid", n_x, seed=4)
+    X = initial_set("ellipsoid", n_x, seed=4)
     loop = autonomous(np.eye(n_x))
     begin, end, *_ = climbed(loop, X, k=1, horizon=1)
     rows = np.asarray(rj.Template.box(n_x).directions)[np.arange(len(begin)) % (2 * n_x)]
@@ -97,7 +76,7 @@ def test_the_surface_of_an_ellipsoid_has_its_closed_form():
 
 @pytest.mark.parametrize("k", [1, 3])
 def test_values_are_those_after_so_many_steps(k):
-    data, X = random_loop(2, seed=2), initial("box", 2)
+    data, X = random_loop(2, seed=2), initial_set("box", 2)
     begin, end, _, after = climbed(closed_loop(data), X, k=k, horizon=3)
     rows = np.asarray(rj.Template.box(2).directions)[np.arange(len(begin)) % 4]
     simulated = np.sum(simulate(data, end, 3)[k] * rows, axis=1)
@@ -109,7 +88,7 @@ def test_values_are_those_after_so_many_steps(k):
 
 
 def test_a_time_varying_loop_is_climbed_from_its_start():
-    data, X = random_loop(2, seed=3, steps=4), initial("box", 2, seed=3)
+    data, X = random_loop(2, seed=3, steps=4), initial_set("box", 2, seed=3)
     A, B, c, lower, upper = (
         part[2:] for part in (data.A, data.B, data.c, data.u_lower, data.u_upper)
     )
@@ -123,14 +102,14 @@ def test_a_time_varying_loop_is_climbed_from_its_start():
 
 @pytest.mark.parametrize("kind", ["box", "polytope", "ellipsoid", "intersection"])
 def test_starts_outside_are_brought_inside(kind):
-    X = initial(kind, 2)
+    X = initial_set(kind, 2)
     away = 10 * np.random.default_rng(0).normal(size=(4 * STARTS, 2))
     _, end, *_ = climbed(closed_loop(random_loop(2, seed=1)), X, starts=away)
     assert np.asarray(X.contains(end)).all()
 
 
 def test_a_point_stays_where_it_is():
-    X = initial("box", 2)
+    X = initial_set("box", 2)
     X = X.replace(upper=X.lower)
     begin, end, *_ = climbed(closed_loop(random_loop(2, seed=1)), X)
     np.testing.assert_array_equal(end, begin)
@@ -138,7 +117,7 @@ def test_a_point_stays_where_it_is():
 
 @pytest.mark.parametrize("kind", SETS[:-1])
 def test_simulations_keep_what_ascents_find_and_tolerate_what_is_no_number(kind):
-    data, X, n_x = random_loop(3, seed=2), initial(kind, 3, seed=1), 3
+    data, X, n_x = random_loop(3, seed=2), initial_set(kind, 3, seed=1), 3
     simulations = Simulations(closed_loop(data), X, HORIZON, 0, samples=50, seed=0)
     region, which = rj.Template.box(n_x).polytope(jnp.zeros(6)), np.arange(6)
     before, _ = simulations.attained(HORIZON, region)

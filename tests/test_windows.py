@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.solvers import bounding_box
 from reachjax.windows import COLUMNS, Window
-from tests.loops import closed_loop, random_loop
+from tests.loops import closed_loop, initial_set, random_loop, recursion
 from tests.networks import box_region, simulate
 
 HORIZON = 3
@@ -79,8 +80,8 @@ def test_the_length_is_chosen_by_the_columns_that_are_needed(monkeypatch):
 
 
 def test_units_that_left_the_basis_take_no_columns():
-    data = random_loop(2, hidden=(20, 20), seed=1)
-    loop, box = closed_loop(data), rj.Box([0.0, 0.0], [1e-3, 1e-3])
+    loop = closed_loop(random_loop(2, hidden=(20, 20), seed=1))
+    box = rj.Box([0.0, 0.0], [1e-3, 1e-3])
     relaxation = rj.CuttingPlanes()
     windows = [
         Window.beginning(loop, box, box, 0, relaxation, compact) for compact in (False, True)
@@ -99,19 +100,65 @@ def test_units_that_left_the_basis_take_no_columns():
     np.testing.assert_allclose(*rows, atol=1e-14)
 
 
+def unrolled(loop, states):
+    """`[x, z, 1]` of trajectories over `HORIZON` steps, and the states after them."""
+
+    def advance(x, t):
+        outputs = []
+
+        def unit(activation, y):
+            outputs.append(activation(y))
+            return outputs[-1]
+
+        following = loop.step(x, t, unit)
+        return following, jnp.concatenate(outputs)
+
+    def trajectory(x):
+        last, z = jax.lax.scan(advance, x, jnp.arange(HORIZON))
+        return jnp.concatenate([x, z.ravel(), jnp.ones(1)]), last
+
+    return jax.vmap(trajectory)(states)
+
+
+@pytest.mark.parametrize("relaxation", [rj.PaperQC(), rj.CuttingPlanes()], ids=str)
+@pytest.mark.parametrize("kind", ["box", "polytope", "ellipsoid", "intersection"])
+@pytest.mark.parametrize("n_x", [1, 2, 3])
+def test_facts_hold_of_every_trajectory(n_x, kind, relaxation):
+    loop, X0 = closed_loop(random_loop(n_x, hidden=(5, 4), seed=3)), initial_set(kind, n_x)
+    sets = recursion(loop, X0, HORIZON, rj.Template.box(n_x)).sets[:HORIZON]
+    window = Window.beginning(loop, X0, bounding_box(X0), 0, relaxation)
+    for X in sets:
+        window = window.extended(loop, X, bounding_box(X))
+    program = window.program(jnp.eye(n_x), relaxation)
+    xi, last = unrolled(loop, X0.sample(jax.random.key(2), 2000))
+    used = np.asarray(program.used)
+    eta = np.zeros(xi.shape)
+    T = np.asarray(program.transform)[np.ix_(used, used)]
+    eta[:, used] = np.linalg.solve(T, np.asarray(xi)[:, used].T).T
+    np.testing.assert_allclose(eta @ program.objective.mid.T, last, atol=1e-12)
+    values = eta @ program.facts.mid.T
+    linear, cone = np.split(values, [len(window.layout.linear)], axis=1)
+    assert linear.min() >= -1e-12
+    assert cone.shape[1] == len(X0.cone_facts())
+    if cone.shape[1]:
+        assert np.all(np.linalg.norm(cone[:, 1:], axis=1) <= cone[:, 0] + 1e-12)
+
+
 def test_traced_windows_need_a_number():
     data = random_loop(2, hidden=(3, 2), seed=2)
     X0, template = rj.Box([0.0, 0.0], [0.1, 0.1]), rj.Template.box(2)
 
-    def size(loop, window):
-        tube = rj.reach(loop, X0, 2, template, rj.LocalBounds(), window=window)
+    def size(loop, window, relaxation=rj.LocalBounds()):  # noqa: B008
+        tube = rj.reach(loop, X0, 2, template, relaxation, window=window)
         return jnp.sum(tube.sets[2].b)
 
-    loop = closed_loop(data)
+    loop, cuts = closed_loop(data), rj.CuttingPlanes(rounds=2, batch=20)
     with pytest.raises(ValueError, match="window=None is chosen from numbers"):
         jax.jit(lambda loop: size(loop, None))(loop)
-    compiled, plain = jax.jit(lambda loop: size(loop, 2))(loop), size(loop, 2)
-    assert float(compiled) == pytest.approx(float(plain), abs=1e-6)
+    for relaxation in (rj.LocalBounds(), cuts):
+        plain = float(size(loop, 2, relaxation))
+        compiled = float(jax.jit(lambda loop, by=relaxation: size(loop, 2, by))(loop))
+        assert compiled == pytest.approx(plain, abs=1e-5)
     assert jnp.isfinite(jax.grad(lambda loop: size(loop, None))(loop).controller.layers[0][0]).all()
 
 

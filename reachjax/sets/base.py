@@ -11,6 +11,7 @@ from __future__ import annotations
 import abc
 from typing import TYPE_CHECKING
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
@@ -119,5 +120,12 @@ class PolyhedralSet(AbstractSet):
         self, points: Float[ArrayLike, "*batch n"], tolerance: float = 0.0
     ) -> Bool[Array, "*batch"]:
         """Whether `A x <= b + tolerance` holds for each point."""
-        A, b = self.facets
-        return jnp.all(self._points(points) @ A.T <= b + tolerance, axis=-1)
+        return _satisfied(self, self._points(points), tolerance)
+
+
+@jax.jit
+def _satisfied(
+    X: PolyhedralSet, points: Float[Array, "*batch n"], tolerance: float
+) -> Bool[Array, "*batch"]:
+    A, b = X.facets
+    return jnp.all(points @ A.T <= b + tolerance, axis=-1)

@@ -6,7 +6,13 @@ from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, SolverSta
 from reachjax.solvers.cutting_planes import proved_with_cuts, with_cuts_around
 from reachjax.solvers.differentiable import proved_offsets
 from reachjax.solvers.enclosures import proved_ellipsoid, proved_size
-from reachjax.solvers.geometry import bounding_box, polytope_volume, separation, support
+from reachjax.solvers.geometry import (
+    bounding_box,
+    polytope_volume,
+    row_ranges,
+    separation,
+    support,
+)
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import SCS, Clarabel, CvxpySolver
 from reachjax.solvers.smoothing import CentralPath
@@ -30,6 +36,7 @@ __all__ = [
     "proved_offsets",
     "proved_size",
     "proved_with_cuts",
+    "row_ranges",
     "separation",
     "support",
     "with_cuts_around",

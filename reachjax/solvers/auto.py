@@ -64,11 +64,6 @@ class Auto(AbstractSolver):
         size, count = len(program.transform), len(program.products.free)
         return self.large if size > self.limit and _is_lean(count, size) else self.small
 
-    @property
-    def for_rounds(self) -> AbstractSolver:
-        """The interior-point method: a model stated for every round costs more than solving it."""
-        return self.large
-
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet."""
         return self.choice(program).solve(program)

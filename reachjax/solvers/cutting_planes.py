@@ -55,7 +55,7 @@ def proved_with_cuts(
         return whole, *proved_offsets(whole, solver)
     given, by = jax.device_get(fixed), solver.for_rounds
     rounds = solved_in_rounds(given, layout, by, cuts, witness, offered)
-    whole = program.replace(products=jax.tree.map(jnp.asarray, rounds.products))
+    whole = program.replace(products=jax.device_put(rounds.products))
     if isinstance(solver, CentralPath):  # not the optimum, but the centre with these products
         return whole, *proved_offsets(whole, solver)
     return whole, *enveloped(whole, rounds.judged)
@@ -82,7 +82,7 @@ def with_cuts_around(
         return program.replace(products=LocalBounds().products(layout))
     given, shape = jax.device_get(fixed)
     products = products_around(given, layout, solver.for_rounds, cuts, shape)
-    return program.replace(products=jax.tree.map(jnp.asarray, products))
+    return program.replace(products=jax.device_put(products))
 
 
 def with_cuts(

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from reachjax.checks import is_concrete
@@ -34,7 +33,7 @@ def on_host(function: Any, shapes: Any, argument: Any) -> Any:
         argument: a tree of JAX arrays.
     """
     if is_concrete(argument):
-        return jax.tree.map(jnp.asarray, function(jax.device_get(argument)))
+        return jax.device_put(function(jax.device_get(argument)))
     core = [leaf.ndim for leaf in jax.tree.leaves(argument)]
     structure = jax.tree.structure(argument)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.checks import Numbers, require_kind, same_size, whole_number
 from reachjax.pytrees import Replaceable, pytree
@@ -107,7 +107,7 @@ class ClosedLoop(Replaceable):
         return self.plant.propagate(x, self.input(x, t, unit), t)
 
     def simulate(
-        self, x0: Float[Array, "*batch n"], horizon: int, start: int = 0
+        self, x0: Float[ArrayLike, "*batch n"], horizon: int, start: int = 0
     ) -> Float[Array, "*batch horizon+1 n"]:
         """Trajectories from one initial state `(n,)` or from many `(batch, n)`, `x0` included.
 

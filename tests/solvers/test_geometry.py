@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.solvers import bounding_box, separation, support
+from reachjax.solvers import bounding_box, row_ranges, separation, support
 from tests.networks import simplex_region
 
 
@@ -24,6 +24,10 @@ def supports(A, b, D):
     return support(rj.Polytope(A, b), D)
 
 
+def ranges(A, b, D):
+    return jnp.concatenate(row_ranges(rj.Polytope(A, b), D))
+
+
 def separations(A, b, C, d):
     return separation(rj.Polytope(A, b), rj.Polytope(C, d))[None]
 
@@ -32,13 +36,18 @@ def arguments(name, n):
     A, b = simplex(n, seed=n)
     if name == "box":
         return A, b
-    if name == "supports":
+    if name in ("supports", "ranges"):
         return A, b, jnp.asarray(np.random.default_rng(n).normal(size=(3, n)))
     far, offset = simplex(n, seed=n + 7)
     return A, b, 3.0 * far, 3.0 * (offset + far @ jnp.full(n, 2.0))
 
 
-FUNCTIONS = {"box": box_ends, "supports": supports, "separations": separations}
+FUNCTIONS = {
+    "box": box_ends,
+    "supports": supports,
+    "ranges": ranges,
+    "separations": separations,
+}
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -71,3 +80,13 @@ def test_supports_of_a_box_and_of_the_same_polytope_agree():
     np.testing.assert_allclose(support(box, D), support(polytope, D), rtol=1e-12)
     gradient = jax.grad(lambda u: support(rj.Box(box.lower, u), D)[0])(box.upper)
     np.testing.assert_allclose(gradient, [1.0, 2.0])
+
+
+def test_where_a_whole_face_attains_a_range_its_normal_has_no_derivative():
+    box, rows = rj.Box([-1.0, 2.0], [0.5, 3.0]), jnp.eye(2)
+    A, b = box.facets
+    np.testing.assert_allclose(row_ranges(rj.Polytope(A, b), rows), [box.lower, box.upper])
+    upper = lambda A, b: row_ranges(rj.Polytope(A, b), rows)[1][0]  # noqa: E731
+    normals, offsets = jax.grad(upper, argnums=(0, 1))(A, b)
+    assert np.isnan(normals[2]).any()  # the facet x_1 <= 1/2
+    np.testing.assert_allclose(offsets, [0.0, 0.0, 1.0, 0.0], atol=1e-12)

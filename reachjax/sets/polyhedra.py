@@ -117,7 +117,7 @@ def support_and_multipliers(
     lower, upper = bounding_box(A, b)
     size = np.maximum(np.abs(lower), np.abs(upper))
     error = gamma(len(b) + len(size) + 4)
-    exponents = np.frexp(np.linalg.norm(directions, axis=1))[1]
+    exponents = np.frexp(abs(directions).max(axis=1))[1]  # squares of entries may overflow
     D = np.ldexp(directions, -exponents[:, None])
     Y, points = maximisers(A, b, D)
     residual = np.abs(D - Y @ A) + error * (np.abs(D) + Y @ np.abs(A))

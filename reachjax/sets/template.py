@@ -21,6 +21,11 @@ from reachjax.sets.polytope import Polytope
 class Simulated(Protocol):
     """What can be simulated, such as a `ClosedLoop`."""
 
+    @property
+    def states(self) -> int:
+        """The number of states."""
+        ...
+
     def simulate(
         self, x0: Float[Array, "c n"], horizon: int, start: int = 0
     ) -> Float[Array, "c horizon+1 n"]:
@@ -171,8 +176,8 @@ class Template(AbstractTemplate):
         Raises:
             RuntimeError: `X0` cannot be sampled.
             TypeError: the loop cannot be simulated, `X0` is no set, or a number no whole one.
-            ValueError: there are too few facets to bound a set, or more than there are directions;
-                `X0` is empty or unbounded; or simulated states overflow.
+            ValueError: dimensions disagree; there are too few facets to bound a set, or more than
+                there are directions; `X0` is empty or unbounded; or simulated states overflow.
 
         Example:
             >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop
@@ -185,6 +190,7 @@ class Template(AbstractTemplate):
         if not callable(getattr(loop, "simulate", None)):
             raise TypeError(f"loop must be a ClosedLoop, but {described(loop)} arrived")
         n = X0.dimension
+        same_size("the loop's number of states is", "the dimension of X0 is", (loop.states, n))
         if facets is None:
             facets = 12 if n == 2 else min(max(12, 2 * n), 2 * n * n)
         count = whole_number("facets", facets, 3 if n == 2 else 2 * n)

@@ -137,12 +137,13 @@ def test_a_time_varying_loop_is_simulated_from_its_start():
         (2, {"facets": 8.0}, TypeError, "facets"),
         (2, {"samples": 2}, ValueError, "samples must be at least 3"),
         (2, {"horizon": 0}, ValueError, "horizon must be at least 1"),
+        (2, {"X0": rj.Box([0.0], [1.0])}, ValueError, "the dimension of X0 is 1"),
     ],
 )
 def test_bad_arguments_are_named(n_x, options, error, words):
     _, loop, X0 = case(n_x)
     with pytest.raises(error, match=words):
-        rj.Template.adapted(loop, X0, **{"horizon": 2, **options})
+        rj.Template.adapted(**{"loop": loop, "X0": X0, "horizon": 2, **options})
 
 
 def test_a_template_of_fewer_steps_than_the_horizon_is_an_error():

@@ -32,6 +32,13 @@ def test_dual_multipliers_are_nonnegative_and_prove_the_support(region):
         assert y @ region.b == pytest.approx((region.corners @ a).max(), abs=1e-10)
 
 
+@pytest.mark.parametrize("size", [1e-200, 1e200])
+def test_supports_in_directions_whose_squares_are_no_numbers(region, size):
+    D = np.random.default_rng(1).normal(size=(10, region.A.shape[1]))
+    values = polyhedra.support(region.A, region.b, size * D)
+    np.testing.assert_allclose(values / size, polyhedra.support(region.A, region.b, D), rtol=1e-9)
+
+
 def test_bounds_hold_for_the_exact_corners_of_a_long_thin_triangle():
     # x <= 1, x + 1e6 y >= 0 and x - 1e6 y >= 0: corners (0, 0) and (1, -+1e-6), to rounding
     A, b = np.array([[1.0, 0.0], [-1.0, -1e6], [-1.0, 1e6]]), np.array([1.0, 0.0, 0.0])

@@ -53,15 +53,17 @@ def bounds_over(
     n, size = loop.states, loop.states + loop.units + 1
     places = n + jnp.arange(loop.units)
 
-    def once(known: Ball, _) -> tuple[Ball, LoopBounds]:
+    def once(_, found: tuple[Ball, LoopBounds]) -> tuple[Ball, LoopBounds]:
+        known, _ = found
         bounds = loop_bounds(loop, box, t, known)
         rows = loop_rows(loop, columns(0, n, size), places, t, bounds, prune=True)
         return _meet(_ranges(rows.preactivation, X, bounds), known), bounds
 
     # a layer is settled when those before it are: one pass each, compiled once
     layers = len(loop.controller.layers) - 1 + 2 * (loop.input_box is not None)
-    _, passes = jax.lax.scan(once, known, length=layers + 1)
-    return jax.tree.map(lambda part: part[-1], passes)
+    shapes = jax.eval_shape(loop_bounds, loop, box, t, known)
+    blank = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)
+    return jax.lax.fori_loop(0, layers + 1, once, (known, blank))[1]
 
 
 def _meet(one: Ball, other: Ball) -> Ball:

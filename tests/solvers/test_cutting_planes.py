@@ -216,15 +216,22 @@ def test_the_gradient_in_facet_directions_is_that_of_differences():
     assert float(jax.grad(total)(0.0)) == pytest.approx(float(difference), rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["polytope", "ellipsoid"])
+MOVED = {
+    "polytope": lambda X, by: X.replace(b=X.b * (1 + by)),
+    "ellipsoid": lambda X, by: X.replace(center=X.center + by),
+    "intersection": lambda X, by: X.replace(
+        polytope=X.polytope.replace(upper=X.polytope.upper + by),
+        ellipsoid=X.ellipsoid.replace(center=X.ellipsoid.center - by),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", MOVED)
 def test_the_gradient_in_the_initial_set_is_that_of_differences(kind):
     loop, (X0, _) = closed_loop(random_loop(2, hidden=(4, 3), seed=5)), initial(kind, 2, seed=5)
 
     def total(by):
-        if kind == "polytope":
-            X = X0.replace(b=X0.b * (1 + by))
-        else:
-            X = X0.replace(center=X0.center + by)
+        X = MOVED[kind](X0, by)
         return jnp.sum(rj.reach(loop, X, 2, rj.Template.box(2), CUTS).sets[2].b[:3])
 
     difference = (total(1e-4) - total(-1e-4)) / 2e-4

@@ -119,7 +119,7 @@ def reach_partitioned(
             many in all: then those cells are halved at which the union's gap is widest, until there
             are as many or no gap is left, at once if one cell's bounds are exact.
         executor: runs the cells' programs: any with the interface of `concurrent.futures`; threads
-            by default. Arguments are sent as numpy arrays.
+            by default, of which one at a time is in cvxpy. Arguments are sent as numpy arrays.
         start: the time of `X0`, for time-varying loops.
         samples: how many trajectories are simulated in each cell for witnesses.
         seed: of the samples.
@@ -163,10 +163,10 @@ def reach_partitioned(
     own = ThreadPoolExecutor() if executor is None else None
     try:
         run = _Run(loop, template, options, own or executor, progress)
-        if isinstance(cells, int | np.integer):
-            tubes = _guided(run, X0, whole_number("cells", cells, 1))
-        elif np.ndim(cells) == 1:
-            counts = tuple(np.asarray(cells).tolist())
+        counts: Any = cells.tolist() if isinstance(cells, np.ndarray | jax.Array) else cells
+        if isinstance(counts, int | np.integer):
+            tubes = _guided(run, X0, whole_number("cells", counts, 1))
+        elif isinstance(counts, Sequence) and not isinstance(counts, str):
             tubes = run.tubes([cell.part for cell in grid(X0, counts)])
         else:
             raise TypeError(

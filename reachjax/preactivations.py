@@ -59,7 +59,8 @@ def bounds_over(
         rows = loop_rows(loop, columns(0, n, size), places, t, bounds, prune=True)
         return _meet(_ranges(rows.preactivation, X, bounds), known), bounds
 
-    # a layer is settled when those before it are: one pass each, compiled once
+    # a layer is settled when those before it are: one pass each, of which the last one's ranges go
+    # unused, so that one pass is all that is compiled
     layers = len(loop.controller.layers) - 1 + 2 * (loop.input_box is not None)
     shapes = jax.eval_shape(loop_bounds, loop, box, t, known)
     blank = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)

@@ -176,9 +176,10 @@ def reach(
 
     The offsets of the sets have first derivatives in everything but facet normals (reverse mode):
     in the loop's weights, plant and input box, and in a box's ends or a polytope's offsets. In the
-    normals of `X0` and of the template the derivative is NaN where a bound of a coordinate is
-    attained on a whole face. Centre and shape of ellipsoids have them too, in all of the above and
-    in the centre and shape of an ellipsoid `X0`. They are NaN where a program was not solved.
+    normals of `X0` and of the template the derivative is NaN where a bound of a coordinate, or of
+    an input of the first layer, is attained on a whole face. Centre and shape of ellipsoids have
+    them too, in all of the above and in the centre and shape of an ellipsoid `X0`. They are NaN
+    where a program was not solved.
 
     Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 

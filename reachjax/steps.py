@@ -164,6 +164,6 @@ class Step:
         return float(simulations.attained(k, region)[0][facet])
 
 
-@jax.jit
+@jax.jit  # so that the interval arithmetic is compiled as one
 def _inputs(lower: Float[Array, " k"], upper: Float[Array, " k"], b: Float[Array, " k"]) -> Ball:
     return Ball.between(lower, upper) + b

@@ -4,9 +4,9 @@ The basis is `[x[t], z[t], ..., z[t + w - 1], 1]`: a state and the outputs of th
 steps. States after `x[t]` are rows over it, and the sets that are known to hold them add facts. A
 window of one step is the paper's recursion; one that begins at the initial set forgets nothing.
 
-A window grows by one step at a time, by one compiled function. Units that bounds prove to be affine
-leave the basis; outside of `jax.jit` their columns can be left out as well (`compact`), so that a
-window of many steps has as many columns as it has units that switch.
+A window grows by one step at a time, by functions that are compiled once. Units that bounds prove
+to be affine leave the basis; outside of `jax.jit` their columns can be left out as well
+(`compact`), so that a window of many steps has as many columns as it has units that switch.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class Window(Replaceable):
         """
         t, around = self.start + len(self), rounded(X, box)
         sharp = self.prune and (self.linear or not isinstance(around, Box))
-        bounds = _bounds(loop, around if sharp else None, box, t, _of_all(self.units, known))
+        bounds = _bounds(loop, around if sharp else None, box, t, known_inputs(self.units, known))
         places, taken = self._places(bounds)
         grown = self._padded(taken + 1)
         units, state, T = _extended(
@@ -190,8 +190,13 @@ def _ball(around: Box | Ellipsoid | Intersection) -> Ellipsoid | None:
 
 
 @partial(jax.jit, static_argnames="units")
-def _of_all(units: int, known: Ball | None) -> Ball:
-    """Bounds of every unit's input, of infinite radius but for those known, the first ones."""
+def known_inputs(units: int, known: Ball | None) -> Ball:
+    """Bounds of every unit's input, of infinite radius but for those known, the first ones.
+
+    Args:
+        units: how many there are.
+        known: bounds of the first ones, if there are any.
+    """
     mid, rad = jnp.zeros(units), jnp.full(units, jnp.inf)
     if known is None:
         return Ball(mid, rad)

@@ -9,7 +9,7 @@ import reachjax as rj
 from reachjax.bounds import loop_bounds, successor_box
 from reachjax.preactivations import bounds_over, rounded
 from reachjax.steps import Setting, Step
-from reachjax.windows import Window, _of_all
+from reachjax.windows import Window, known_inputs
 from tests.loops import closed_loop, random_loop
 from tests.networks import (
     affine_network,
@@ -61,7 +61,7 @@ def samples(X, count=4000):
 def linear_bounds(loop, X, t=0):
     """What a window of one step has for bounds, where a relaxation asks for linear ones."""
     setting = Setting(loop, t, rj.AllProducts(), rj.Auto(), None, False, None)
-    known, box = _of_all(loop.units, Step(setting, X, 0, ()).first_inputs), X.bounding_box()
+    known, box = known_inputs(loop.units, Step(setting, X, 0, ()).first_inputs), X.bounding_box()
     return bounds_over(loop, rounded(X, box), box, t, known).preactivation
 
 

@@ -1,5 +1,6 @@
 """Partitions: cells that cover the initial set, tubes whose union holds every state."""
 
+import warnings
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
@@ -205,6 +206,18 @@ def test_a_cluster_runs_the_cells(loop, partitioned):
         np.testing.assert_allclose(tube.bounds(t), partitioned.bounds(t), atol=1e-9)
 
 
+@pytest.mark.parametrize("cells", [np.array([2, 1]), jnp.array([2, 1]), np.array(2), np.int64(2)])
+def test_cells_may_be_counted_by_arrays(loop, cells):
+    tube = rj.reach_partitioned(loop, SETS["box"], 1, rj.Template.box(2), cells=cells, **RECURSION)
+    assert len(tube.tubes) == 2
+
+
+def test_threads_leave_the_filters_of_warnings_alone(loop):
+    before = list(warnings.filters)
+    rj.reach_partitioned(loop, SETS["box"], 2, rj.Template.box(2), cells=(3, 2), **RECURSION)
+    assert warnings.filters == before
+
+
 def test_an_error_in_a_cell_ends_the_run(loop):
     class Broken(rj.Clarabel):
         def solve(self, program):
@@ -224,11 +237,15 @@ BAD = {
         TypeError,
         {"cells": 2.5},
     ),
-    r"cells must be a whole number, or one for each .*ndarray arrived": (
+    r"cells must be a whole number, or one for each coordinate, but 'ab'": (
         TypeError,
-        {"cells": np.array([[2, 2]])},
+        {"cells": "ab"},
     ),
+    r"for each of 2 coordinates, but \[\[2, 2\]\]": (ValueError, {"cells": np.array([[2, 2]])}),
     r"cells\[0\] must be a whole number, but 1\.5": (TypeError, {"cells": np.array([1.5, 2])}),
+    r"cells\[1\] must be a whole number, but 2\.5": (TypeError, {"cells": (2, 2.5)}),
+    r"cells\[1\] must be a whole number, but True": (TypeError, {"cells": (2, True)}),
+    r"cells must be a whole number, but True": (TypeError, {"cells": True}),
     "executor must be an object with a method submit.*class": (
         TypeError,
         {"cells": 2, "executor": ThreadPoolExecutor},

@@ -9,7 +9,7 @@ import pytest
 import reachjax as rj
 from reachjax.bounds import loop_bounds
 from reachjax.preactivations import bounds_over
-from reachjax.windows import _of_all
+from reachjax.windows import known_inputs
 
 exactly = np.vectorize(Fraction, otypes=[object])
 
@@ -17,7 +17,7 @@ exactly = np.vectorize(Fraction, otypes=[object])
 @jax.jit
 def bounds_of(loop, X):
     """At time 0, with nothing known beforehand."""
-    return bounds_over(loop, X, X.bounding_box(), 0, _of_all(loop.units, None))
+    return bounds_over(loop, X, X.bounding_box(), 0, known_inputs(loop.units, None))
 
 
 def cancelling(n, seed, offset, size):

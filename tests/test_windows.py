@@ -122,26 +122,30 @@ def unrolled(loop, states):
 
 @pytest.mark.parametrize("relaxation", [rj.PaperQC(), rj.CuttingPlanes()], ids=str)
 @pytest.mark.parametrize("kind", ["box", "polytope", "ellipsoid", "intersection"])
-@pytest.mark.parametrize("n_x", [1, 2, 3])
+@pytest.mark.parametrize("n_x", [1, 2, 6])
 def test_facts_hold_of_every_trajectory(n_x, kind, relaxation):
     loop, X0 = closed_loop(random_loop(n_x, hidden=(5, 4), seed=3)), initial_set(kind, n_x)
     sets = recursion(loop, X0, HORIZON, rj.Template.box(n_x)).sets[:HORIZON]
-    window = Window.beginning(loop, X0, bounding_box(X0), 0, relaxation)
+    windows = [
+        Window.beginning(loop, X0, bounding_box(X0), 0, relaxation, compact)
+        for compact in (False, True)
+    ]
     for X in sets:
-        window = window.extended(loop, X, bounding_box(X))
-    program = window.program(jnp.eye(n_x), relaxation)
-    xi, last = unrolled(loop, X0.sample(jax.random.key(2), 2000))
-    used = np.asarray(program.used)
-    eta = np.zeros(xi.shape)
-    T = np.asarray(program.transform)[np.ix_(used, used)]
-    eta[:, used] = np.linalg.solve(T, np.asarray(xi)[:, used].T).T
-    np.testing.assert_allclose(eta @ program.objective.mid.T, last, atol=1e-12)
-    values = eta @ program.facts.mid.T
-    linear, cone = np.split(values, [len(window.layout.linear)], axis=1)
-    assert linear.min() >= -1e-12
-    assert cone.shape[1] == len(X0.cone_facts())
-    if cone.shape[1]:
-        assert np.all(np.linalg.norm(cone[:, 1:], axis=1) <= cone[:, 0] + 1e-12)
+        windows = [window.extended(loop, X, bounding_box(X)) for window in windows]
+    programs = [window.program(jnp.eye(n_x), relaxation) for window in windows]
+    xi, last = map(np.asarray, unrolled(loop, X0.sample(jax.random.key(2), 2000)))
+    stays = np.asarray(programs[0].used)
+    for program in programs:
+        used = np.asarray(program.used)
+        eta = np.zeros((len(xi), len(used)))
+        T = np.asarray(program.transform)[np.ix_(used, used)]
+        eta[:, used] = np.linalg.solve(T, xi[:, stays].T).T
+        np.testing.assert_allclose(eta @ program.objective.mid.T, last, atol=1e-12)
+        linear, cone = np.split(eta @ program.facts.mid.T, [len(windows[0].layout.linear)], axis=1)
+        assert linear.min() >= -1e-12
+        assert cone.shape[1] == len(X0.cone_facts())
+        if cone.shape[1]:
+            assert np.all(np.linalg.norm(cone[:, 1:], axis=1) <= cone[:, 0] + 1e-12)
 
 
 def test_traced_windows_need_a_number():

@@ -22,6 +22,9 @@ from reachjax.rounding import gamma
 if TYPE_CHECKING:
     from reachjax.sets.box import Box
 
+MOST_DIMENSIONS = 12
+"""Corners are among the states that are simulated up to this dimension, where a box has 4096."""
+
 
 class AbstractSet(Replaceable, abc.ABC):
     """A closed convex set of states in `n` dimensions."""
@@ -83,10 +86,6 @@ class AbstractSet(Replaceable, abc.ABC):
     @abc.abstractmethod
     def bounding_box(self) -> Box:
         """The smallest box around the set."""
-
-
-MOST_DIMENSIONS = 12
-"""Corners are listed for simulations up to this dimension (a box has 4096 of them there)."""
 
 
 class PolyhedralSet(AbstractSet):

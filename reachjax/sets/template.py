@@ -187,7 +187,7 @@ class Template(AbstractTemplate):
             (3, 12, 2)
         """
         require_kind("X0", X0, AbstractSet, "a set such as Box(lower, upper)")
-        if not callable(getattr(loop, "simulate", None)):
+        if isinstance(loop, type) or not callable(getattr(loop, "simulate", None)):
             raise TypeError(f"loop must be a ClosedLoop, but {described(loop)} arrived")
         n = X0.dimension
         same_size("the loop's number of states is", "the dimension of X0 is", (loop.states, n))

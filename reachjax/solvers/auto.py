@@ -20,8 +20,9 @@ class Auto(AbstractSolver):
 
     Clarabel's time grows with the entries of the matrix, `n (n + 1) / 2`, the interior-point
     method's with the number of multipliers, so the latter is chosen where these are fewer. For
-    facets the choice depends on shapes alone, so that it is the same inside `jax.jit`, and
-    `choice(certificate.program)` tells which solver a certificate's multipliers came from.
+    facets the choice depends on shapes alone: a program that is solved at once has the same inside
+    `jax.jit`, and `choice(certificate.program)` tells which solver its multipliers came from. Under
+    `CuttingPlanes` each round has its own.
 
     Args:
         small: what solves facets of programs up to the limit, and programs of more multipliers

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import abc
+import threading
 import time
 import warnings
-from functools import cache
-from typing import Any
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -34,6 +36,22 @@ STATUSES = {
 }
 """cvxpy's words for how a solver ended."""
 
+ONE_AT_A_TIME = threading.RLock()
+"""Threads share cvxpy's count of variables, and the filters of warnings that are set around it."""
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _one_at_a_time(method: Callable[P, T]) -> Callable[P, T]:
+    @wraps(method)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> T:
+        with ONE_AT_A_TIME:
+            return method(*args, **kwargs)
+
+    return alone
+
 
 class AbstractConicSolver(AbstractSolver, abc.ABC):
     """A solver that cvxpy calls by name."""
@@ -42,6 +60,7 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
     def settings(self) -> tuple[str, dict[str, Any]]:
         """The name cvxpy has for the solver, and the keyword arguments for `Problem.solve`."""
 
+    @_one_at_a_time
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet.
 
@@ -78,6 +97,7 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
                 solution.moments[i][used] = moment / moment[-1, -1]
         return solution
 
+    @_one_at_a_time
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
         """Propose the smallest ellipsoid around the successors, and its multipliers.
 

@@ -164,7 +164,8 @@ def test_violated_products_are_those_of_negative_moments():
     pairs = candidates.violated(moment, np.zeros((0, 2), dtype=int), 10**6)
     facts = program.facts.mid
     norms = np.linalg.norm(facts, axis=1)
-    values = (facts @ moment @ facts.T) / np.where(norms > 0, np.outer(norms, norms), 1.0)
+    facts = facts / np.where(norms > 0, norms, 1.0)[:, None]
+    values = facts @ moment @ facts.T
     assert len(pairs)
     assert np.all(values[pairs[:, 0], pairs[:, 1]] < 0)
     there = joint(candidates.core, pairs)

@@ -11,6 +11,8 @@ bound is looser than that by intervals.
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -32,6 +34,21 @@ def rounded(X: AbstractSet, box: Box) -> Box | Ellipsoid | Intersection:
     return X if isinstance(X, Ellipsoid) else box
 
 
+@partial(jax.jit, static_argnames="units")
+def known_inputs(units: int, known: Ball | None) -> Ball:
+    """Bounds of every unit's input, of infinite radius but for those known, the first ones.
+
+    Args:
+        units: how many there are.
+        known: bounds of the first ones, if there are any.
+    """
+    mid, rad = jnp.zeros(units), jnp.full(units, jnp.inf)
+    if known is None:
+        return Ball(mid, rad)
+    here = slice(0, len(known.mid))
+    return Ball(mid.at[here].set(known.mid), rad.at[here].set(known.rad))
+
+
 def bounds_over(
     loop: ClosedLoop,
     X: Box | Ellipsoid | Intersection,
@@ -46,7 +63,7 @@ def bounds_over(
         X: the set of states at time `t`, as `rounded` gives it.
         box: a box around it.
         t: the time.
-        known: `(k,)`, other bounds of the units' inputs, of infinite radius where there are none.
+        known: `(k,)`, other bounds of the units' inputs, from `known_inputs`.
     """
     if loop.units == 0:
         return loop_bounds(loop, box, t)

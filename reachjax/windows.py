@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from reachjax.basis import Rows, columns, loop_rows
 from reachjax.bounds import LoopBounds, loop_bounds
 from reachjax.lmi import Program
-from reachjax.preactivations import bounds_over, rounded
+from reachjax.preactivations import bounds_over, known_inputs, rounded
 from reachjax.pytrees import Replaceable, pytree, static
 from reachjax.relaxation import AbstractRelaxation, FactLayout
 from reachjax.rounding import Ball
@@ -187,21 +187,6 @@ def _ball(around: Box | Ellipsoid | Intersection) -> Ellipsoid | None:
     if isinstance(around, Box):
         return None
     return around.ellipsoid if isinstance(around, Intersection) else around
-
-
-@partial(jax.jit, static_argnames="units")
-def known_inputs(units: int, known: Ball | None) -> Ball:
-    """Bounds of every unit's input, of infinite radius but for those known, the first ones.
-
-    Args:
-        units: how many there are.
-        known: bounds of the first ones, if there are any.
-    """
-    mid, rad = jnp.zeros(units), jnp.full(units, jnp.inf)
-    if known is None:
-        return Ball(mid, rad)
-    here = slice(0, len(known.mid))
-    return Ball(mid.at[here].set(known.mid), rad.at[here].set(known.rad))
 
 
 @jax.jit

@@ -7,9 +7,9 @@ import pytest
 
 import reachjax as rj
 from reachjax.bounds import loop_bounds, successor_box
-from reachjax.preactivations import bounds_over, rounded
+from reachjax.preactivations import bounds_over, known_inputs, rounded
 from reachjax.steps import Setting, Step
-from reachjax.windows import Window, known_inputs
+from reachjax.windows import Window
 from tests.loops import closed_loop, random_loop
 from tests.networks import (
     affine_network,

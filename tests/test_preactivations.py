@@ -8,8 +8,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.bounds import loop_bounds
-from reachjax.preactivations import bounds_over
-from reachjax.windows import known_inputs
+from reachjax.preactivations import bounds_over, known_inputs
 
 exactly = np.vectorize(Fraction, otypes=[object])
 

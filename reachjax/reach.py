@@ -170,9 +170,10 @@ def reach(
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind.
-        ValueError: dimensions disagree, `X0` is empty or unbounded, the window is no
-            positive number, or None inside `jax.jit`, a time-varying loop ends before the horizon,
-            or states overflow. What depends on traced values is NaN instead, inside `jax.jit`.
+        ValueError: dimensions disagree, `X0` is empty or unbounded, the window is no positive
+            number, or None inside `jax.jit`, a time-varying loop ends before the horizon, states
+            overflow, or `progress` leaves out steps. What depends on traced values is NaN instead,
+            inside `jax.jit`.
 
     The offsets of the sets have first derivatives in everything but facet normals (reverse mode):
     in the loop's weights, plant and input box, and in a box's ends or a polytope's offsets. In the
@@ -210,13 +211,17 @@ def reach(
     )
     sets, certificates, steps = [X0], [], []
     numbers = range(horizon)
-    for k in numbers if progress is None else progress(numbers):
+    for _, k in zip(numbers if progress is None else progress(numbers), numbers, strict=False):
         before = steps if window is None else steps[max(0, k + 1 - window) :]
         proof = certificates[-1] if certificates else None
         steps.append(Step(setting, sets[-1], k, tuple(before), proof))
         following, certificate = successors(steps[-1], template.at(k + 1))
         sets.append(following)
         certificates.append(certificate)
+    if len(steps) < horizon:
+        raise ValueError(
+            f"progress must pass on each of the {horizon} steps, but {len(steps)} arrived"
+        )
     if simulations is not None and is_concrete(certificates):
         certificates = _with_witnesses(certificates, sets, simulations, steps)
     return ReachTube(loop, template, tuple(sets), (None, *certificates), start)

@@ -97,6 +97,7 @@ BAD_VALUES = {
     "3 time steps .*, but start 0 and horizon 4": lambda: reach(loop=LTV, horizon=4),
     "3 time steps .*, but start 2 and horizon 2": lambda: reach(loop=LTV, horizon=2, start=2),
     "3 time steps .*, but start 3 and horizon 1": lambda: rj.change_of_basis(LTV, t=3),
+    "progress must pass on each of the": lambda: reach(progress=lambda steps: []),
 }
 
 BAD_TYPES = {

@@ -142,6 +142,11 @@ def test_progress_wraps_the_steps(planar):
     assert seen == [0, 1]
 
 
+def test_progress_does_not_choose_the_steps(planar):
+    turned = recursion(planar.loop, planar.sets[0], 2, planar.template, progress=reversed)
+    np.testing.assert_array_equal(turned.sets[2].b, planar.sets[2].b)
+
+
 def test_polytopes_and_boxes_may_start_a_tube_in_three_dimensions():
     data, region = random_loop(3), simplex_region(3, seed=0)
     X0 = rj.Polytope(region.A, region.b)

@@ -68,7 +68,7 @@ def loop_bounds(
         rounding = gamma(8) * (abs(y.mid) + y.rad)
         zero = activation.phases(y.lower, y.upper)[1]
         z = Ball(jnp.where(zero, 0.0, z.mid), jnp.where(zero, 0.0, z.rad + rounding))
-        units.append((y, z, *_phases(activation, y)))
+        units.append((y, z, *_phases(activation, y, z)))
         return z
 
     state = Ball.between(box.lower, box.upper)
@@ -79,19 +79,21 @@ def loop_bounds(
     return LoopBounds(state, y, z, passing, blocking, excess, successor)
 
 
-def _phases(activation: AbstractActivation, y: Ball) -> tuple[Array, Array, Array]:
+def _phases(activation: AbstractActivation, y: Ball, z: Ball) -> tuple[Array, Array, Array]:
     """Units that are affine but for inputs that change their sign by next to nothing.
 
     Kept, such a unit would need multipliers of the size of `1 / MARGINAL`, and derivatives lose as
     many digits. An activation is nonexpansive, so its output is off by twice the distance of an
-    input from where it is the identity.
+    input from where it is the identity; and what is taken for zero by no more than its size.
     """
     spare = MARGINAL * (abs(y.mid) + y.rad)
     surely = activation.phases(y.lower, y.upper)
     passing = activation.phases(y.lower + spare, jnp.maximum(y.upper, y.lower + spare))[0]
     blocking = activation.phases(jnp.minimum(y.lower, y.upper - spare), y.upper - spare)[1]
-    excess = jnp.where(surely[0] | surely[1] | ~(passing | blocking), 0.0, 2 * spare)
-    return passing, blocking & ~passing, excess
+    blocking &= ~passing
+    excess = jnp.where(blocking, jnp.minimum(2 * spare, abs(z.mid) + z.rad), 2 * spare)
+    excess = jnp.where(surely[0] | surely[1] | ~(passing | blocking), 0.0, excess)
+    return passing, blocking, excess
 
 
 @jax.jit

@@ -95,6 +95,18 @@ def require_kind(name: str, value: Any, kind: type, expected: str) -> None:
         raise TypeError(f"{name} must be {expected}, but {described(value)} arrived")
 
 
+def require_bar(progress: Any) -> None:
+    """Check that a progress bar is None or can be called.
+
+    Raises:
+        TypeError: it is neither.
+    """
+    if progress is not None and not callable(progress):
+        raise TypeError(
+            f"progress must wrap an iterable, as tqdm.tqdm does, but {progress!r} arrived"
+        )
+
+
 def described(value: Any) -> str:
     """A short word for what arrived: classes and plain values as they are, objects by kind."""
     if isinstance(value, type | str | int | float | list | None):

@@ -19,6 +19,7 @@ from reachjax.cells import grid, halves
 from reachjax.checks import (
     described,
     is_concrete,
+    require_bar,
     require_double_precision,
     require_kind,
     whole_number,
@@ -151,6 +152,7 @@ def reach_partitioned(
             "executor must be an object with a method submit, as those of concurrent.futures are, "
             f"but {described(executor)} arrived"
         )
+    require_bar(progress)
     options = {
         "horizon": horizon,
         "relaxation": relaxation,

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from reachjax.certificates import AbstractCertificate
 from reachjax.checks import (
     is_concrete,
+    require_bar,
     require_double_precision,
     require_kind,
     same_size,
@@ -268,10 +269,7 @@ def _check(
     loop.check_horizon(horizon, start)
     if template.steps is not None and template.steps < horizon:
         raise ValueError(f"template is given for {template.steps} steps, but horizon is {horizon}")
-    if progress is not None and not callable(progress):
-        raise TypeError(
-            f"progress must wrap an iterable, as tqdm.tqdm does, but {progress!r} arrived"
-        )
+    require_bar(progress)
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     if window is not None:

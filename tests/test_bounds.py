@@ -175,3 +175,12 @@ def test_a_neuron_that_is_constantly_zero_is_not_both_passing_and_blocking():
     loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net)
     bounds = loop_bounds(loop, rj.Box([0.0], [1.0]), 0)
     assert bool(bounds.passing[0]) != bool(bounds.blocking[0])
+
+
+@pytest.mark.parametrize("size", [1e10, 1e14])
+def test_what_counts_as_zero_is_off_by_no_more_than_the_input_box(size):
+    net = rj.MLP.from_layers([([[size, size]], [0.0]), ([[1.0]], [0.0])])  # inputs of 0 to `size`
+    loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.ones((2, 1))), net, rj.Box([-1.0], [1.0]))
+    bounds = loop_bounds(loop, rj.Box([-1.0, -1.0], [1.0, 1.0]), 0)
+    assert bool(bounds.blocking[-1])  # 1 - u, whose part above zero is next to nothing of `size`
+    assert 1.0 <= float(bounds.excess[-1]) <= 1.0 + 1e-13 * size

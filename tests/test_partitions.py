@@ -250,6 +250,7 @@ BAD = {
         TypeError,
         {"cells": 2, "executor": ThreadPoolExecutor},
     ),
+    "progress must wrap an iterable": (TypeError, {"cells": 2, "progress": 3}),
     "template must be a template of facets": (
         TypeError,
         {"cells": 2, "template": rj.EllipsoidTemplate()},

@@ -165,7 +165,9 @@ def reach_partitioned(
     own = ThreadPoolExecutor() if executor is None else None
     try:
         run = _Run(loop, template, options, own or executor, progress)
-        counts: Any = cells.tolist() if isinstance(cells, np.ndarray | jax.Array) else cells
+        counts: Any = cells
+        if isinstance(cells, np.ndarray | jax.Array) and cells.ndim < 2:
+            counts = cells.tolist()
         if isinstance(counts, int | np.integer):
             tubes = _guided(run, X0, whole_number("cells", counts, 1))
         elif isinstance(counts, Sequence) and not isinstance(counts, str):

@@ -241,7 +241,10 @@ BAD = {
         TypeError,
         {"cells": "ab"},
     ),
-    r"for each of 2 coordinates, but \[\[2, 2\]\]": (ValueError, {"cells": np.array([[2, 2]])}),
+    r"cells must be a whole number, or one for each .*ndarray arrived": (
+        TypeError,
+        {"cells": np.array([[2, 2]])},
+    ),
     r"cells\[0\] must be a whole number, but 1\.5": (TypeError, {"cells": np.array([1.5, 2])}),
     r"cells\[1\] must be a whole number, but 2\.5": (TypeError, {"cells": (2, 2.5)}),
     r"cells\[1\] must be a whole number, but True": (TypeError, {"cells": (2, True)}),

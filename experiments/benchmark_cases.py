@@ -13,7 +13,7 @@ import reachjax as rj
 from experiments import double_integrator
 from experiments.command import at_least_one
 from experiments.double_integrator import INITIAL_BOX, INPUT_BOX, A, B
-from reachjax.witnesses import initial_states
+from reachjax.proofs.witnesses import initial_states
 
 RANDOM_BOX = np.array([[0.25, -0.25], [0.75, 0.25]])  # the size of the paper's X_0, near the kinks
 

@@ -24,13 +24,13 @@ from experiments.benchmark_methods import CLOCKS, REFERENCE, paper_data, repeate
 from experiments.command import blank_table
 from experiments.operations import operations
 from experiments.reference import paper_step
-from reachjax.lmi import Program
-from reachjax.solvers import accepted_offsets
+from reachjax.programs.lmi import Program
+from reachjax.programs.trimming import trimmed
+from reachjax.programs.windows import step_program
+from reachjax.proofs.accepted import accepted_offsets
 from reachjax.solvers.arrangement import arranged, cut
 from reachjax.solvers.facets import solve_facets
 from reachjax.solvers.primal_dual import start, step
-from reachjax.solvers.trimming import trimmed
-from reachjax.windows import step_program
 
 SOLVERS = {"Clarabel": rj.Clarabel(), "InteriorPoint": rj.InteriorPoint()}
 FACETS = 2

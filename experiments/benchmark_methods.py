@@ -14,7 +14,7 @@ import reachjax as rj
 from experiments.benchmark_cases import Case, Settings
 from experiments.double_integrator import INPUT_BOX, A, B
 from experiments.reference import basis_sizes, paper_step
-from reachjax.solvers.compact import compact
+from reachjax.programs.compact import compact
 
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 REFERENCE = "cvxpy per facet"

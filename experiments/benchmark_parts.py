@@ -18,11 +18,11 @@ import pytest
 
 import reachjax as rj
 from experiments.benchmark_cases import random_case
-from reachjax.bounds import loop_bounds
-from reachjax.solvers import accepted_offsets
+from reachjax.programs.bounds import loop_bounds
+from reachjax.programs.trimming import trimmed
+from reachjax.programs.windows import step_program
+from reachjax.proofs.accepted import accepted_offsets
 from reachjax.solvers.arrangement import arranged, cut
-from reachjax.solvers.trimming import trimmed
-from reachjax.windows import step_program
 
 jax.config.update("jax_enable_x64", True)
 

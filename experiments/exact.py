@@ -19,7 +19,7 @@ from numpy import ndarray
 from scipy.optimize import OptimizeResult, linprog, milp
 
 import reachjax as rj
-from reachjax.checks import require_kind
+from reachjax.numerics.checks import require_kind
 from reachjax.sets import PolyhedralSet
 
 SHARP = 1e-5

@@ -23,12 +23,12 @@ from rich.progress import track
 import reachjax as rj
 from experiments.benchmark_cases import he_network
 from experiments.command import at_least_one, blank_table, run_experiment
-from reachjax.lmi import Program
-from reachjax.recheck import interval_offsets
-from reachjax.relaxation import Products
-from reachjax.solvers import accepted_offsets
-from reachjax.windows import step_program
-from reachjax.witnesses import initial_states
+from reachjax.programs.lmi import Program
+from reachjax.programs.relaxations import Products
+from reachjax.programs.windows import step_program
+from reachjax.proofs.accepted import accepted_offsets
+from reachjax.proofs.recheck import interval_offsets
+from reachjax.proofs.witnesses import initial_states
 
 THIN = 1e-5
 AGREEMENT_NOTE = """\

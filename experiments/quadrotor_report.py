@@ -140,7 +140,7 @@ def draw(analysis: Analysis, path: Path) -> None:
     """The paper's two figures: simulated states, certified ellipsoids' shadows, goal and limit."""
     import matplotlib.pyplot as plt
 
-    from reachjax.plotting import plot_set, plot_tube
+    from reachjax.tubes.plotting import plot_set, plot_tube
 
     figure, panels = plt.subplots(1, 2, figsize=(11, 4.8), layout="constrained")
     example = analysis.verdict.counterexample

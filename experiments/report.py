@@ -98,7 +98,7 @@ def draw(analyses: list[Analysis], goal: np.ndarray, safe: np.ndarray, path: Pat
     """One panel a controller: samples, certified sets, goal, constraint and counterexample."""
     import matplotlib.pyplot as plt
 
-    from reachjax.plotting import plot_set, plot_tube
+    from reachjax.tubes.plotting import plot_set, plot_tube
 
     figure, axes = plt.subplots(
         1, len(analyses), figsize=(11, 4.8), sharey=True, squeeze=False, layout="constrained"

@@ -17,7 +17,7 @@ from experiments import stored
 from experiments.exact import exact_maxima
 from experiments.tightness_cases import Group, Settings
 from experiments.tightness_methods import Measurement, fingerprint
-from reachjax.witnesses import Simulations
+from reachjax.proofs.witnesses import Simulations
 
 ASCENTS = 4
 """From so many of the best samples for each facet."""

@@ -117,7 +117,7 @@ def draw_tubes(outcomes: Outcomes, path: Path) -> None:
     """Certified sets and simulations of one network, trained in each way."""
     import matplotlib.pyplot as plt
 
-    from reachjax.plotting import plot_set, plot_tube
+    from reachjax.tubes.plotting import plot_set, plot_tube
 
     chosen = _most_telling(outcomes)
     figure, axes = plt.subplots(
@@ -144,7 +144,7 @@ def draw_tubes(outcomes: Outcomes, path: Path) -> None:
 
 def _zoom(inset, tube: rj.ReachTube, ax) -> None:
     """The second set where it comes close to the constraint."""
-    from reachjax.plotting import plot_tube
+    from reachjax.tubes.plotting import plot_tube
 
     plot_tube(tube, inset, samples=10_000)
     box = tube.sets[2].bounding_box()

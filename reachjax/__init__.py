@@ -8,17 +8,28 @@ Turn on 64-bit floats before building networks and sets::
     import reachjax as rj
 """
 
-from reachjax.basis import ChangeOfBasis, change_of_basis
-from reachjax.certificates import (
-    AbstractCertificate,
-    Certificate,
-    EllipsoidCertificate,
-    MixedCertificate,
+from reachjax.loops import (
+    MLP,
+    AbstractActivation,
+    AffinePlant,
+    ClosedLoop,
+    ReLU,
+    runge_kutta,
+    zero_order_hold,
 )
-from reachjax.partitions import PartitionedTube, reach_partitioned
-from reachjax.reach import ReachTube, reach, reach_step
-from reachjax.relaxation import AbstractRelaxation, AllProducts, CuttingPlanes, LocalBounds, PaperQC
-from reachjax.requirements import shortfall
+from reachjax.programs.basis import ChangeOfBasis, change_of_basis
+from reachjax.programs.relaxations import (
+    AbstractRelaxation,
+    AllProducts,
+    CuttingPlanes,
+    LocalBounds,
+    PaperQC,
+)
+from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.ellipsoids import EllipsoidCertificate
+from reachjax.proofs.facets import Certificate
+from reachjax.proofs.mixed import MixedCertificate
+from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import (
     AbstractSet,
     AbstractTemplate,
@@ -31,7 +42,6 @@ from reachjax.sets import (
     Polytope,
     Template,
 )
-from reachjax.sizes import log_volume, log_widths, volume
 from reachjax.solvers import (
     SCS,
     AbstractSolver,
@@ -40,17 +50,6 @@ from reachjax.solvers import (
     Clarabel,
     CvxpySolver,
     InteriorPoint,
-    SolverStatus,
-)
-from reachjax.specs import verify
-from reachjax.systems import (
-    MLP,
-    AbstractActivation,
-    AffinePlant,
-    ClosedLoop,
-    ReLU,
-    runge_kutta,
-    zero_order_hold,
 )
 from reachjax.training import (
     PenaltySchedule,
@@ -59,7 +58,12 @@ from reachjax.training import (
     specification_penalty,
     volume_penalty,
 )
-from reachjax.verdicts import Counterexample, Verdict, VerdictStatus
+from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
+from reachjax.tubes.reach import ReachTube, reach, reach_step
+from reachjax.tubes.requirements import shortfall
+from reachjax.tubes.sizes import log_volume, log_widths, volume
+from reachjax.tubes.specs import verify
+from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
 
 __version__ = "0.1.0"
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.ascent import ascended
-from reachjax.witnesses import Simulations
+from reachjax.proofs.ascent import ascended
+from reachjax.proofs.witnesses import Simulations
 from tests.loops import autonomous, closed_loop, initial_set, random_loop
 from tests.networks import plant, simulate
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.basis import columns, loop_rows
-from reachjax.bounds import loop_bounds
+from reachjax.programs.basis import columns, loop_rows
+from reachjax.programs.bounds import loop_bounds
 from tests.networks import LoopData, dead_network, he_network, input_box, plant
 
 STATES = [1, 2, 3, 6]

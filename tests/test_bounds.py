@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.bounds import loop_bounds
+from reachjax.programs.bounds import loop_bounds
 from tests.networks import (
     LoopData,
     affine_network,

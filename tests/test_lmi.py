@@ -14,8 +14,8 @@ from experiments.reference import (
     polytope_qc,
     relu_qc,
 )
-from reachjax.lmi import weighted_products
-from reachjax.windows import step_program
+from reachjax.programs.lmi import weighted_products
+from reachjax.programs.windows import step_program
 from tests.loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, directions, simplex_region
 
@@ -175,7 +175,7 @@ def test_the_rounding_bound_of_the_products_covers_exact_arithmetic():
 
 
 def test_a_program_compiles_once_for_new_weights_sets_and_times():
-    from reachjax.windows import _extended
+    from reachjax.programs.windows import _extended
 
     data = random_loop(2, hidden=(4,), steps=3)
     template, relaxation = rj.Template.octagonal(2), rj.LocalBounds()

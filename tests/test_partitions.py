@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.cells import grid, halves
+from reachjax.tubes.cells import grid, halves
 from tests.loops import autonomous, closed_loop, random_loop, recursion
 
 RECURSION = {"relaxation": rj.LocalBounds(), "window": 1}

@@ -14,7 +14,7 @@ mpl.use("Agg")
 
 
 def test_the_outline_of_a_polytope_is_its_corners_in_order():
-    from reachjax.plotting import plot_set
+    from reachjax.tubes.plotting import plot_set
 
     ax = plot_set(rj.Polytope([[1, 1], [1, -1], [-1, 1], [-1, -1]], [1, 1, 1, 1]))
     outline = ax.patches[0].get_xy()[:-1]
@@ -31,7 +31,7 @@ def test_the_outline_of_a_polytope_is_its_corners_in_order():
 def test_a_tube_is_drawn_on_the_axes_given():
     import matplotlib.pyplot as plt
 
-    from reachjax.plotting import plot_tube
+    from reachjax.tubes.plotting import plot_tube
 
     net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2) / 2, np.zeros((2, 1))), net)
@@ -47,7 +47,7 @@ def outline(region, *coordinates):
     """The points drawn, and the Axes closed."""
     import matplotlib.pyplot as plt
 
-    from reachjax.plotting import plot_set
+    from reachjax.tubes.plotting import plot_set
 
     ax = plot_set(region, coordinates=coordinates or None)
     plt.close("all")
@@ -120,7 +120,7 @@ def loop_of(states):
 def test_a_tube_of_three_states_is_drawn_on_the_coordinates_given(template):
     import matplotlib.pyplot as plt
 
-    from reachjax.plotting import plot_tube
+    from reachjax.tubes.plotting import plot_tube
 
     X0 = rj.Ellipsoid([1.0, 2.0, 3.0], np.diag([0.25, 1.0, 4.0]))
     ax = plot_tube(recursion(loop_of(3), X0, 1, template), samples=50, coordinates=(2, 0))
@@ -132,7 +132,7 @@ def test_a_tube_of_three_states_is_drawn_on_the_coordinates_given(template):
 
 
 def test_what_cannot_be_drawn_is_refused():
-    from reachjax.plotting import plot_set, plot_tube
+    from reachjax.tubes.plotting import plot_set, plot_tube
 
     cube = rj.Box([0, 0, 0], [1, 1, 1])
     with pytest.raises(ValueError, match="dimension 3 arrived: choose the two coordinates"):

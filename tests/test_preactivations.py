@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.bounds import loop_bounds
-from reachjax.preactivations import bounds_over, known_inputs
+from reachjax.programs.bounds import loop_bounds
+from reachjax.programs.preactivations import bounds_over, known_inputs
 
 exactly = np.vectorize(Fraction, otypes=[object])
 

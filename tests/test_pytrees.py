@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.checks import Numbers
-from reachjax.pytrees import Replaceable, converted, pytree, static
+from reachjax.numerics.checks import Numbers
+from reachjax.numerics.pytrees import Replaceable, converted, pytree, static
 from tests.networks import he_network
 
 

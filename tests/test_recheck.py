@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.lmi import weighted_products
-from reachjax.recheck import interval_offsets, sound_offsets
-from reachjax.rounding import Ball
-from reachjax.windows import step_program
+from reachjax.numerics.rounding import Ball
+from reachjax.programs.lmi import weighted_products
+from reachjax.programs.windows import step_program
+from reachjax.proofs.recheck import interval_offsets, sound_offsets
 from tests.loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, directions, he_network, simulate
 

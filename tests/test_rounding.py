@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from reachjax.rounding import UNIT, Ball
+from reachjax.numerics.rounding import UNIT, Ball
 
 fractions = np.vectorize(Fraction, otypes=[object])
 

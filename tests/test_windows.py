@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.solvers import bounding_box
-from reachjax.windows import COLUMNS, Window
+from reachjax.programs.windows import COLUMNS, Window
+from reachjax.sets.geometry import bounding_box
 from tests.loops import closed_loop, initial_set, random_loop, recursion
 from tests.networks import box_region, simulate
 
@@ -68,7 +68,7 @@ def test_a_window_of_any_length_may_be_asked_for():
 
 
 def test_the_length_is_chosen_by_the_columns_that_are_needed(monkeypatch):
-    monkeypatch.setattr(importlib.import_module("reachjax.reach"), "LARGEST", 8)
+    monkeypatch.setattr(importlib.import_module("reachjax.tubes.reach"), "LARGEST", 8)
     data = random_loop(2, hidden=(5, 4), seed=2)
     tube = tube_of(data, rj.CuttingPlanes(), None)
     used = [int(tube.proof(t).program.used.sum()) for t in range(1, HORIZON + 1)]

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from reachjax.checks import Numbers, same_size
-from reachjax.pytrees import Replaceable
-from reachjax.rounding import gamma
+from reachjax.numerics.checks import Numbers, same_size
+from reachjax.numerics.pytrees import Replaceable
+from reachjax.numerics.rounding import gamma
 
 if TYPE_CHECKING:
     from reachjax.sets.box import Box

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from reachjax.checks import Numbers, is_concrete, within_time_axis
-from reachjax.pytrees import converted, pytree
-from reachjax.rounding import gamma
+from reachjax.numerics.checks import Numbers, is_concrete, within_time_axis
+from reachjax.numerics.pytrees import converted, pytree
+from reachjax.numerics.rounding import gamma
 from reachjax.sets.base import PolyhedralSet
 
 MOST_CORNERS = 2**16

@@ -16,9 +16,9 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from reachjax.checks import Numbers, is_concrete, same_size, whole_number
-from reachjax.pytrees import converted, pytree
-from reachjax.rounding import gamma
+from reachjax.numerics.checks import Numbers, is_concrete, same_size, whole_number
+from reachjax.numerics.pytrees import converted, pytree
+from reachjax.numerics.rounding import gamma
 from reachjax.sets import outward
 from reachjax.sets.base import AbstractSet
 from reachjax.sets.box import Box

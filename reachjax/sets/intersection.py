@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from reachjax.checks import is_concrete, require_kind, same_size
-from reachjax.pytrees import pytree
+from reachjax.numerics.checks import is_concrete, require_kind, same_size
+from reachjax.numerics.pytrees import pytree
 from reachjax.sets.base import AbstractSet, PolyhedralSet
 from reachjax.sets.box import Box
 from reachjax.sets.ellipsoid import Ellipsoid

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.optimize import linprog
 
-from reachjax.rounding import gamma
+from reachjax.numerics.rounding import gamma
 
 
 def balanced(A: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:

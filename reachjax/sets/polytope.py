@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from reachjax.checks import Numbers, is_concrete, same_size
-from reachjax.pytrees import converted, pytree
+from reachjax.numerics.checks import Numbers, is_concrete, same_size
+from reachjax.numerics.pytrees import converted, pytree
 from reachjax.sets import hulls, polyhedra
 from reachjax.sets.base import PolyhedralSet
 from reachjax.sets.box import Box

@@ -10,8 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.checks import Numbers, described, is_concrete, require_kind, same_size, whole_number
-from reachjax.pytrees import Replaceable, converted, pytree
+from reachjax.numerics.checks import (
+    Numbers,
+    described,
+    is_concrete,
+    require_kind,
+    same_size,
+    whole_number,
+)
+from reachjax.numerics.pytrees import Replaceable, converted, pytree
 from reachjax.sets import fit
 from reachjax.sets.base import MOST_DIMENSIONS, AbstractSet, PolyhedralSet
 from reachjax.sets.ellipsoid import Ellipsoid

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from reachjax.relaxation import Products
+from reachjax.programs.relaxations import Products
+from reachjax.programs.trimming import Trimmed, namespace
 from reachjax.solvers.generators import Generators
-from reachjax.solvers.trimming import Trimmed, namespace
 
 SLOTS = 2
 """Pairs that a multiplier may have without becoming a general generator."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
-from reachjax.checks import whole_number
-from reachjax.lmi import Program
+from reachjax.numerics.checks import whole_number
+from reachjax.programs.compact import compact
+from reachjax.programs.lmi import Program
+from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
-from reachjax.solvers.base import ANSWERS, AbstractSolver, Enclosure, Solution, SolverStatus
-from reachjax.solvers.compact import compact
+from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import Clarabel
 from reachjax.solvers.smoothing import CentralPath

@@ -20,8 +20,8 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import LinAlgError, solve_triangular
 
-from reachjax.solvers.compact import CompactProgram
-from reachjax.solvers.pairs import Pairs
+from reachjax.programs.compact import CompactProgram
+from reachjax.programs.pairs import Pairs
 from reachjax.solvers.primal_dual import DAMPING
 
 

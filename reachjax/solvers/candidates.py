@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from reachjax.lmi import Program
-from reachjax.relaxation import FactLayout, LocalBounds, Products
-from reachjax.solvers.trimming import namespace, trimmed
+from reachjax.programs.lmi import Program
+from reachjax.programs.relaxations import FactLayout, LocalBounds, Products
+from reachjax.programs.trimming import namespace, trimmed
 
 VIOLATED = 1e-6
 """Products more negative than this are, rows of facts and the basis being of unit size."""

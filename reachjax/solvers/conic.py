@@ -12,10 +12,11 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from reachjax.lmi import Program
+from reachjax.programs.compact import compact
+from reachjax.programs.lmi import Program
+from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
-from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, SolverStatus
-from reachjax.solvers.compact import compact
+from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.models import EllipsoidModel, FacetModel
 
 RESCALINGS = (1.0, 8.0, 0.125, 64.0, 1.0)

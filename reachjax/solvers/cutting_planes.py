@@ -16,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from reachjax.checks import is_concrete
-from reachjax.lmi import Program
-from reachjax.relaxation import CuttingPlanes, FactLayout, LocalBounds
+from reachjax.numerics.checks import is_concrete
+from reachjax.programs.lmi import Program
+from reachjax.programs.relaxations import CuttingPlanes, FactLayout, LocalBounds
+from reachjax.proofs.proposal import Solution
 from reachjax.sets import NormalForm
-from reachjax.solvers.base import AbstractSolver, Solution
+from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.candidates import NONE, VIOLATED, joint
 from reachjax.solvers.differentiable import enveloped, proved_offsets
 from reachjax.solvers.rounds import Witness, products_around, solved_in_rounds

@@ -32,11 +32,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from reachjax.lmi import Program, lagrangian
-from reachjax.solvers.accepted import accepted_offsets
-from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
+from reachjax.numerics.host import all_finite, on_host
+from reachjax.programs.lmi import Program, lagrangian
+from reachjax.proofs.accepted import accepted_offsets
+from reachjax.proofs.proposal import Solution, SolverStatus
+from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.cotangents import asked_for
-from reachjax.solvers.host import all_finite, on_host
 from reachjax.solvers.smoothing import CentralPath, smoothed_offsets
 
 

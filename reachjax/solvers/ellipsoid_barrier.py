@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
+from reachjax.programs.compact import THINNEST, CompactProgram
+from reachjax.programs.pairs import Pairs
 from reachjax.sets import NormalForm
 from reachjax.solvers.barrier import AbstractBarrier
-from reachjax.solvers.compact import THINNEST, CompactProgram
-from reachjax.solvers.pairs import Pairs
 
 
 class EllipsoidBarrier(AbstractBarrier):

@@ -20,14 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from reachjax.lmi import Program, form_rows, schur_lagrangian, with_successor
+from reachjax.numerics.host import all_finite, on_host, shapes_of
+from reachjax.programs.compact import compact
+from reachjax.programs.lmi import Program, form_rows, schur_lagrangian, with_successor
+from reachjax.proofs.accepted import accepted_enclosure, log_volume
+from reachjax.proofs.proposal import ANSWERS, Enclosure, SolverStatus
 from reachjax.sets import Ellipsoid, NormalForm
-from reachjax.solvers.accepted import accepted_enclosure, log_volume
-from reachjax.solvers.base import ANSWERS, AbstractSolver, Enclosure, SolverStatus
+from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.centring import Sensitivity, centred, sensitivity
-from reachjax.solvers.compact import compact
 from reachjax.solvers.cotangents import asked_for
-from reachjax.solvers.host import all_finite, on_host, shapes_of
 
 ATTEMPTS = 3
 """How often a program is solved, each time in better coordinates."""

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
+from reachjax.programs.compact import CompactProgram
+from reachjax.programs.pairs import Pairs
 from reachjax.solvers.barrier import AbstractBarrier
-from reachjax.solvers.compact import CompactProgram
-from reachjax.solvers.pairs import Pairs
 
 
 class FacetBarrier(AbstractBarrier):

@@ -7,14 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from reachjax.lmi import Program
-from reachjax.recheck import interval_offsets, sound_offsets
-from reachjax.solvers.accepted import ROUNDING
-from reachjax.solvers.base import Solution, SolverStatus
+from reachjax.numerics.host import all_finite
+from reachjax.programs.compact import CompactProgram, compact
+from reachjax.programs.lmi import Program
+from reachjax.proofs.accepted import ROUNDING
+from reachjax.proofs.proposal import Solution, SolverStatus
+from reachjax.proofs.recheck import interval_offsets, sound_offsets
 from reachjax.solvers.central_path import FROM_AFAR, LARGEST, PRICES, path_end, solved
-from reachjax.solvers.compact import CompactProgram, compact
 from reachjax.solvers.facet_barrier import FacetBarrier
-from reachjax.solvers.host import all_finite
 
 SHORT = 1e-6
 """A centre counts as found if its multipliers prove it to this part of the interval's radius."""

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from reachjax.solvers.base import SolverStatus
+from reachjax.proofs.proposal import SolverStatus
 from reachjax.solvers.generators import Generators
 from reachjax.solvers.primal_dual import Point, start, step
 

@@ -15,19 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.checks import is_concrete, require_double_precision, whole_number
-from reachjax.lmi import Program
+from reachjax.numerics.checks import is_concrete, require_double_precision, whole_number
+from reachjax.programs.lmi import Program
+from reachjax.programs.trimming import trimmed
+from reachjax.proofs.proposal import Enclosure, Solution
 from reachjax.sets import NormalForm
 from reachjax.solvers.arrangement import arranged, cut
-from reachjax.solvers.base import (
-    AbstractSolver,
-    Enclosure,
-    Solution,
-    require_positive,
-)
+from reachjax.solvers.base import AbstractSolver, require_positive
 from reachjax.solvers.centring import enclosed
 from reachjax.solvers.facets import solve_facets
-from reachjax.solvers.trimming import trimmed
 
 
 @dataclasses.dataclass(frozen=True)

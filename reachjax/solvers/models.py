@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
+from reachjax.programs.compact import THINNEST, CompactProgram
 from reachjax.sets import NormalForm
-from reachjax.solvers.compact import THINNEST, CompactProgram
 
 
 class Multipliers:

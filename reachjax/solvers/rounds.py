@@ -13,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from reachjax.lmi import Program
-from reachjax.recheck import interval_offsets, sound_offsets
-from reachjax.relaxation import CuttingPlanes, FactLayout, Products
+from reachjax.programs.lmi import Program
+from reachjax.programs.relaxations import CuttingPlanes, FactLayout, Products
+from reachjax.proofs.accepted import accepted_offsets
+from reachjax.proofs.proposal import Solution, SolverStatus
+from reachjax.proofs.recheck import interval_offsets, sound_offsets
 from reachjax.sets import NormalForm
-from reachjax.solvers.accepted import accepted_offsets
-from reachjax.solvers.base import AbstractSolver, Solution, SolverStatus
+from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.candidates import NONE, Candidates, joint
 from reachjax.solvers.differentiable import Judged
 

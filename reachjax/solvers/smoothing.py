@@ -22,16 +22,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from reachjax.lmi import Program, lagrangian
+from reachjax.numerics.host import on_host, shapes_of
+from reachjax.programs.lmi import Program, lagrangian
+from reachjax.programs.trimming import squared_sizes
+from reachjax.proofs.proposal import Enclosure, Solution
 from reachjax.sets import NormalForm
-from reachjax.solvers.base import AbstractSolver, Enclosure, Solution, require_positive
+from reachjax.solvers.base import AbstractSolver, require_positive
 from reachjax.solvers.centring import enclosed
 from reachjax.solvers.cotangents import asked_for
 from reachjax.solvers.facet_centres import Centres, facet_centres
-from reachjax.solvers.host import on_host, shapes_of
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.primal_dual import DAMPING
-from reachjax.solvers.trimming import squared_sizes
 
 
 @dataclasses.dataclass(frozen=True)

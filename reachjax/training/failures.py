@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from reachjax.checks import described, is_concrete
+from reachjax.numerics.checks import described, is_concrete
 
 if TYPE_CHECKING:
     import optax

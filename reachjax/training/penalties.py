@@ -12,13 +12,13 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from reachjax.checks import described, whole_number
-from reachjax.reach import reach
-from reachjax.relaxation import LocalBounds
-from reachjax.requirements import AvoidSets, check_margin, requirements, shortfall
+from reachjax.loops import ClosedLoop
+from reachjax.numerics.checks import described, whole_number
+from reachjax.programs.relaxations import LocalBounds
 from reachjax.sets import AbstractSet, AbstractTemplate, PolyhedralSet
-from reachjax.sizes import log_volume
-from reachjax.systems import ClosedLoop
+from reachjax.tubes.reach import reach
+from reachjax.tubes.requirements import AvoidSets, check_margin, requirements, shortfall
+from reachjax.tubes.sizes import log_volume
 
 STEPWISE = {"relaxation": LocalBounds(), "window": 1}
 """What penalties ask of `reach`: small programs of one size, compiled once."""

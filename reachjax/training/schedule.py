@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.checks import described, is_concrete, real_number, whole_number
-from reachjax.pytrees import Replaceable
+from reachjax.numerics.checks import described, is_concrete, real_number, whole_number
+from reachjax.numerics.pytrees import Replaceable
 
 
 @dataclasses.dataclass(frozen=True)

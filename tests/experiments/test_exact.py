@@ -14,7 +14,7 @@ from scipy.optimize import OptimizeResult
 import reachjax as rj
 from experiments import exact
 from experiments.exact import SHARP, exact_maxima, exact_maximum
-from reachjax.systems import AbstractActivation
+from reachjax.loops import AbstractActivation
 from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import (
     LoopData,

@@ -6,11 +6,11 @@ import pytest
 from scipy.linalg import eigvalsh
 
 import reachjax as rj
-from reachjax.recheck import interval_offsets
-from reachjax.solvers import accepted_offsets
-from reachjax.solvers.compact import compact
+from reachjax.programs.compact import compact
+from reachjax.programs.windows import step_program
+from reachjax.proofs.accepted import accepted_offsets
+from reachjax.proofs.recheck import interval_offsets
 from reachjax.solvers.conic import STATUSES
-from reachjax.windows import step_program
 from tests.loops import closed_loop, one_step, random_loop
 from tests.networks import box_region, directions, simulate
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.programs.windows import Window
 from reachjax.solvers.candidates import Candidates, joint
 from reachjax.solvers.rounds import solved_in_rounds
-from reachjax.windows import Window
 from tests.loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, saturating_network, simplex_region, simulate
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.lmi import lagrangian
-from reachjax.solvers import bounding_box, proved_offsets
-from reachjax.windows import step_program
+from reachjax.programs.lmi import lagrangian
+from reachjax.programs.windows import step_program
+from reachjax.sets.geometry import bounding_box
+from reachjax.solvers import proved_offsets
 from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import box_region, simplex_region
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.recheck import sound_level
+from reachjax.programs.windows import step_program
+from reachjax.proofs.accepted import accepted_enclosure
+from reachjax.proofs.proposal import Enclosure
+from reachjax.proofs.recheck import sound_level
 from reachjax.sets import NormalForm
-from reachjax.solvers import Enclosure, accepted_enclosure
-from reachjax.windows import step_program
 from tests.loops import closed_loop, random_loop, recursion
 from tests.solvers.test_differentiable import PARTS, along, central_difference, dot
 

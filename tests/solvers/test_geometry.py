@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.solvers import bounding_box, row_ranges, separation, support
+from reachjax.sets.geometry import bounding_box, row_ranges, separation, support
 from tests.networks import simplex_region
 
 

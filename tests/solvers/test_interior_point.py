@@ -9,23 +9,17 @@ import pytest
 from scipy.linalg import eigvalsh
 
 import reachjax as rj
-from reachjax.recheck import interval_offsets
+from reachjax.programs.compact import compact
+from reachjax.programs.trimming import trimmed
+from reachjax.programs.windows import step_program
+from reachjax.proofs.accepted import accepted_enclosure, accepted_offsets, log_volume
+from reachjax.proofs.proposal import ANSWERS
+from reachjax.proofs.recheck import interval_offsets
 from reachjax.sets import NormalForm
-from reachjax.solvers import (
-    accepted_enclosure,
-    accepted_offsets,
-    barrier,
-    centring,
-    interior_point,
-)
-from reachjax.solvers.accepted import log_volume
+from reachjax.solvers import barrier, centring, interior_point
 from reachjax.solvers.arrangement import arranged, bucket, cut
-from reachjax.solvers.base import ANSWERS
-from reachjax.solvers.compact import compact
 from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 from reachjax.solvers.factorisations import inverse_factor
-from reachjax.solvers.trimming import trimmed
-from reachjax.windows import step_program
 from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import (
     affine_network,

@@ -9,13 +9,13 @@ import pytest
 from scipy.optimize import brentq
 
 import reachjax as rj
-from reachjax.recheck import interval_offsets
+from reachjax.programs.compact import compact
+from reachjax.programs.windows import step_program
+from reachjax.proofs.recheck import interval_offsets
 from reachjax.solvers import facet_centres
 from reachjax.solvers.central_path import PRICES
-from reachjax.solvers.compact import compact
 from reachjax.solvers.primal_dual import DAMPING
 from reachjax.solvers.smoothing import smoothed_offsets
-from reachjax.windows import step_program
 from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import box_region, directions, simulate
 from tests.solvers.test_differentiable import along, planar, relative_error

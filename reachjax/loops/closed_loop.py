@@ -1,0 +1,145 @@
+"""The loop: a plant under a network whose output is projected onto an input box.
+
+The projection is two more ReLU layers (the paper's equation (proj_NN)):
+`v = max(pi(x) - u_low, 0) + u_low`, then `u = u_high - max(u_high - v, 0)`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from reachjax.loops.activations import ReLU, evaluate
+from reachjax.loops.networks import MLP, Unit
+from reachjax.loops.plants import AffinePlant
+from reachjax.numerics.checks import Numbers, require_kind, same_size, whole_number
+from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.sets import Box
+
+PROJECTION = ReLU()
+
+
+@pytree
+class ClosedLoop(Replaceable):
+    """`x[t+1] = A_t x[t] + B_t proj(pi(x[t])) + c_t`; sizes are checked here, once.
+
+    Args:
+        plant: the affine plant.
+        controller: the network `pi`.
+        input_box: what inputs are projected onto, constant or time-varying; `None`: no projection.
+
+    Raises:
+        TypeError: an argument is of another kind.
+        ValueError: numbers of states, inputs or time steps disagree.
+
+    Example:
+        >>> plant = AffinePlant([[1.0]], [[1.0]])
+        >>> net = MLP.from_layers([([[-2.0]], [0.0])])
+        >>> loop = ClosedLoop(plant, net, input_box=Box([-1.0], [1.0]))
+        >>> loop.simulate(jnp.array([2.5]), 3)[:, 0].tolist()
+        [2.5, 1.5, 0.5, -0.5]
+    """
+
+    plant: AffinePlant
+    controller: MLP
+    input_box: Box | None = None
+
+    def __post_init__(self):
+        for name, kind in (("plant", AffinePlant), ("controller", MLP), ("input_box", Box)):
+            value = getattr(self, name)
+            if name != "input_box" or value is not None:
+                require_kind(f"ClosedLoop.{name}", value, kind, f"of type {kind.__name__}")
+        plant, net = self.plant, self.controller
+        same_size(
+            "the plant's number of states is",
+            "the controller's number of inputs is",
+            (plant.states, net.inputs),
+        )
+        same_size(
+            "the plant's number of inputs is",
+            "the controller's number of outputs is",
+            (plant.inputs, net.outputs),
+        )
+        if self.input_box is not None:
+            same_size(
+                "the plant's number of inputs is",
+                "the dimension of input_box is",
+                (plant.inputs, self.input_box.dimension),
+            )
+            if None not in (plant.steps, self.input_box.steps):
+                same_size(
+                    "the plant's number of time steps is",
+                    "that of input_box is",
+                    (plant.steps, self.input_box.steps),
+                )
+
+    @property
+    def states(self) -> int:
+        """The number `n_x` of states."""
+        return self.plant.states
+
+    @property
+    def units(self) -> int:
+        """The number of nonlinear units: hidden neurons, and two for each projected input."""
+        hidden = sum(b.shape[0] for _, b in self.controller.layers[:-1])
+        return hidden + (0 if self.input_box is None else 2 * self.plant.inputs)
+
+    @property
+    def steps(self) -> int | None:
+        """How many steps a time-varying loop is given for; `None` when it is time-invariant."""
+        return self.plant.steps or (self.input_box.steps if self.input_box else None)
+
+    def input(self, x: Any, t: int | jax.Array = 0, unit: Unit = evaluate) -> Any:
+        """The projected input, for any kind of number and with `unit` at each nonlinear layer."""
+        u = self.controller.propagate(x, unit)
+        if self.input_box is not None:
+            box = self.input_box.at(t)
+            u = unit(PROJECTION, u - box.lower) + box.lower
+            u = box.upper - unit(PROJECTION, box.upper - u)
+        return u
+
+    def step(self, x: Any, t: int | jax.Array = 0, unit: Unit = evaluate) -> Any:
+        """The state at `t + 1`, for any kind of number and with `unit` at each nonlinear layer."""
+        return self.plant.propagate(x, self.input(x, t, unit), t)
+
+    def simulate(
+        self, x0: Float[ArrayLike, "*batch n"], horizon: int, start: int = 0
+    ) -> Float[Array, "*batch horizon+1 n"]:
+        """Trajectories from one initial state `(n,)` or from many `(batch, n)`, `x0` included.
+
+        Raises:
+            ValueError: `x0` has another dimension, or a time-varying loop ends before the horizon.
+        """
+        x0 = Numbers("(n_x,)", "(batch, n_x)")(x0, "x0")
+        same_size(
+            "the loop's number of states is", "the dimension of x0 is", (self.states, x0.shape[-1])
+        )
+        self.check_horizon(horizon, start)
+        return _simulate(self, x0, horizon, start)
+
+    def check_horizon(self, horizon: int, start: int = 0) -> None:
+        """Raise an error unless the loop is given for all of `start .. start + horizon`."""
+        horizon, start = whole_number("horizon", horizon, 1), whole_number("start", start, 0)
+        if self.steps is not None and start + horizon > self.steps:
+            raise ValueError(
+                f"the loop is given for {self.steps} time steps (t = 0 .. {self.steps - 1}), "
+                f"but start {start} and horizon {horizon} ask for t = {start} .. "
+                f"{start + horizon - 1}"
+            )
+
+
+@partial(jax.jit, static_argnames="horizon")
+def _simulate(loop: ClosedLoop, x0: Array, horizon: int, start: int) -> Array:
+    def trajectory(x):
+        def advance(x, t):
+            following = loop.step(x, t)
+            return following, following
+
+        _, states = jax.lax.scan(advance, x, start + jnp.arange(horizon))
+        return jnp.concatenate([x[None], states])
+
+    return trajectory(x0) if x0.ndim == 1 else jax.vmap(trajectory)(x0)

@@ -1,0 +1,145 @@
+"""Feed-forward networks, `x^{k+1} = phi(W^k x^k + b^k)`, `pi(x) = W^l x^l + b^l` (the paper's NN).
+
+The forward pass is written once, for any kind of number: `propagate` is given what to do at a
+nonlinear layer. With plain evaluation it is the network; with intervals or rows over a basis it
+yields bounds and the program that certifies the loop.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from jaxtyping import Array, ArrayLike, Float
+
+from reachjax.loops.activations import AbstractActivation, ReLU, evaluate
+from reachjax.numerics.checks import Numbers, same_size
+from reachjax.numerics.pytrees import Replaceable, converted, pytree, static
+
+Unit = Callable[[AbstractActivation, Any], Any]
+"""What is done at a nonlinear layer: `(activation, inputs) -> outputs`."""
+
+
+def _layers(value: Any, name: str = "layers") -> tuple[tuple[Array, Array], ...]:
+    """Pairs `(W, b)` whose shapes chain."""
+    if isinstance(value, Array | str) or not isinstance(value, Iterable):
+        raise TypeError(f"{name} must be pairs (W, b), but a {type(value).__name__} arrived")
+    layers = tuple(_layer(pair, f"{name}[{k}]") for k, pair in enumerate(value))
+    if not layers:
+        raise ValueError(f"{name} must hold at least one pair (W, b), but none arrived")
+    for k, ((before, _), (after, _)) in enumerate(itertools.pairwise(layers)):
+        if before.shape[0] != after.shape[1]:
+            raise ValueError(
+                f"{name}[{k + 1}] takes {after.shape[1]} inputs (columns of W), "
+                f"but {name}[{k}] has {before.shape[0]} outputs (rows of W)"
+            )
+    return layers
+
+
+def _layer(pair: Any, name: str) -> tuple[Array, Array]:
+    try:
+        W, b = pair
+    except (TypeError, ValueError):
+        kind = type(pair).__name__
+        raise TypeError(f"{name} must be a pair (W, b), but a {kind} arrived") from None
+    W = Numbers("(outputs, inputs)")(W, f"W of {name}")
+    b = Numbers("(outputs,)")(b, f"b of {name}")
+    if W.shape[0] != b.shape[0]:
+        raise ValueError(
+            f"W of {name} has {W.shape[0]} rows (outputs), but b has length {b.shape[0]}"
+        )
+    return W, b
+
+
+@pytree
+class MLP(Replaceable):
+    """A fully connected network with a linear last layer. Build it with `from_layers`.
+
+    Attributes:
+        layers: pairs `(W, b)` with `W` of shape `(outputs, inputs)` and `b` of shape `(outputs,)`.
+        activation: applied after every layer but the last.
+
+    Example:
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[1.0, 1.0]], [0.0])])
+        >>> net([-3.0]).tolist()  # |x|
+        [3.0]
+    """
+
+    layers: tuple[tuple[Float[Array, "out in"], Float[Array, " out"]], ...] = converted(
+        converter=_layers
+    )
+    activation: AbstractActivation = static(default=ReLU())
+
+    def __post_init__(self):
+        if not isinstance(self.activation, AbstractActivation):
+            raise TypeError(
+                f"MLP.activation must be an activation object such as reachjax.ReLU(), "
+                f"but {self.activation!r} arrived"
+            )
+
+    @classmethod
+    def from_layers(
+        cls,
+        layers: Sequence[tuple[ArrayLike, ArrayLike]],
+        activation: AbstractActivation = ReLU(),  # noqa: B008  (immutable)
+    ) -> MLP:
+        """A network from pairs `(W, b)`, `W` of shape `(outputs, inputs)`.
+
+        Raises:
+            TypeError: the activation is not an activation object, or a layer is not numeric.
+            ValueError: shapes do not chain, or an entry is not finite.
+        """
+        return cls(layers, activation)
+
+    @classmethod
+    def from_flax(
+        cls,
+        source: Any,
+        activation: AbstractActivation = ReLU(),  # noqa: B008
+        module: Any = None,
+    ) -> MLP:
+        """A network from a flax nnx module, or from the parameters of a linen module.
+
+        The parameters may be traced, so this may be called inside a loss.
+
+        Args:
+            source: an `nnx.Module` whose linear layers are applied in the order in which they
+                were assigned, or linen's `{"params": {"Dense_0": {"kernel", "bias"}, ...}}`.
+            activation: applied between the layers; linen's parameters do not tell which one it is,
+                and their names do not always tell the order of the layers.
+            module: the linen module itself: what is read is then compared with its output.
+
+        Raises:
+            TypeError: `source` is neither.
+            ValueError: it holds something else than a chain of linear layers, or computes something
+                else, or the order of its layers cannot be told.
+        """
+        from reachjax.loops.flax_layers import flax_layers
+
+        return cls(flax_layers(source, activation, module), activation)
+
+    @property
+    def inputs(self) -> int:
+        """The number of inputs."""
+        return self.layers[0][0].shape[1]
+
+    @property
+    def outputs(self) -> int:
+        """The number of outputs."""
+        return self.layers[-1][0].shape[0]
+
+    def propagate(self, x: Any, unit: Unit) -> Any:
+        """The forward pass over any kind of number, with `unit` at each nonlinear layer."""
+        for W, b in self.layers[:-1]:
+            x = unit(self.activation, W @ x + b)
+        W, b = self.layers[-1]
+        return W @ x + b
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """The output for one input vector; `jax.vmap(net)` takes a batch."""
+        x = Numbers("(n,)")(x, "x")
+        same_size(
+            "the network's number of inputs is", "the dimension of x is", (self.inputs, len(x))
+        )
+        return self.propagate(x, evaluate)

@@ -1,0 +1,89 @@
+"""Plants: affine, time-invariant or time-varying, `x[t+1] = A_t x[t] + B_t u[t] + c_t`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from reachjax.numerics.checks import Numbers, within_time_axis
+from reachjax.numerics.pytrees import Replaceable, converted, pytree
+
+
+@pytree
+class AffinePlant(Replaceable):
+    """The paper's system (LTV). A leading time axis on any of the three makes it time-varying.
+
+    Args:
+        A: `(n_x, n_x)` or `(time, n_x, n_x)`.
+        B: `(n_x, n_u)` or `(time, n_x, n_u)`.
+        c: `(n_x,)` or `(time, n_x)`, in the units of the state; zero when left out.
+
+    Raises:
+        ValueError: shapes disagree, time axes differ in length, or an entry is not finite.
+
+    Example:
+        >>> plant = AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
+        >>> plant.propagate(jnp.array([1.0, 1.0]), jnp.array([-1.0])).tolist()
+        [1.5, 0.0]
+    """
+
+    A: Float[Array, "*time n n"] = converted(converter=Numbers("(n_x, n_x)", "(time, n_x, n_x)"))
+    B: Float[Array, "*time n m"] = converted(converter=Numbers("(n_x, n_u)", "(time, n_x, n_u)"))
+    c: Float[Array, "*time n"] = converted(converter=Numbers("(n_x,)", "(time, n_x)"), default=None)
+
+    def __post_init__(self):
+        n = self.A.shape[-1]
+        if self.c is None:
+            self._set(c=jnp.zeros(n))
+        for name, axis in (("A", -2), ("B", -2), ("c", -1)):
+            shape = getattr(self, name).shape
+            if shape[axis] != n:
+                raise ValueError(
+                    f"AffinePlant.{name} must have {n} rows, one for each of the states that "
+                    f"A's columns stand for, but its shape is {shape}"
+                )
+        times = {name: array.shape[0] for name, array in self._varying().items()}
+        if len(set(times.values())) > 1:
+            raise ValueError(
+                f"the time axes of AffinePlant must have one length, but these arrived: {times}"
+            )
+
+    def _varying(self) -> dict[str, Any]:
+        constant = {"A": 2, "B": 2, "c": 1}
+        arrays = {name: getattr(self, name) for name in constant}
+        return {name: a for name, a in arrays.items() if a.ndim > constant[name]}
+
+    @property
+    def states(self) -> int:
+        """The number `n_x` of states."""
+        return self.A.shape[-1]
+
+    @property
+    def inputs(self) -> int:
+        """The number `n_u` of inputs."""
+        return self.B.shape[-1]
+
+    @property
+    def steps(self) -> int | None:
+        """The number of times a time-varying plant is given for; `None` when time-invariant."""
+        return next((array.shape[0] for array in self._varying().values()), None)
+
+    def at(self, t: int | jax.Array) -> tuple[Array, Array, Array]:
+        """`(A_t, B_t, c_t)`.
+
+        Raises:
+            ValueError: the plant is not given for this time (where the time is a plain number).
+        """
+        varying = self._varying()
+        if self.steps is not None:
+            within_time_axis("AffinePlant", t, self.steps)
+        A, B, c = (varying[k][t] if k in varying else getattr(self, k) for k in ("A", "B", "c"))
+        return A, B, c
+
+    def propagate(self, x: Any, u: Any, t: int | jax.Array = 0) -> Any:
+        """The successor of `x` under input `u`, for any kind of number."""
+        A, B, c = self.at(t)
+        return A @ x + B @ u + c

@@ -1,0 +1,1 @@
+"""Checks, pytrees, rounding, and the seam to the host."""

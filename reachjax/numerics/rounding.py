@@ -1,0 +1,104 @@
+"""Midpoint-radius arithmetic: numbers with a bound on how far they can be from the exact ones.
+
+A `Ball` stands for every exact array `a` with `|a - mid| <= rad`, entry by entry. Its operations
+enlarge `rad` by what rounding can add: a sum of `k` products of floating-point numbers is off by
+at most `gamma(k) |W| |x|` in whatever order it is formed (Higham, Accuracy and Stability of
+Numerical Algorithms, section 3.1; Rump, Fast and parallel interval arithmetic, BIT 1999). The same
+arithmetic therefore serves two purposes: intervals of values, and rounding errors of coefficients.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import jax.numpy as jnp
+
+from reachjax.numerics.pytrees import pytree
+
+UNIT = 2.0**-53
+"""The unit roundoff of float64."""
+
+
+def gamma(operations: int) -> float:
+    """Relative error bound of `operations` rounded operations, with some to spare."""
+    count = (operations + 8) * UNIT
+    return count / (1.0 - count)
+
+
+@pytree
+class Ball:
+    """Arrays `mid` and `rad >= 0` of one shape: all `a` with `|a - mid| <= rad`."""
+
+    mid: Any
+    rad: Any
+
+    # numpy arrays on the left leave `array @ ball` and `array - ball` to this class
+    __array_ufunc__ = None
+
+    @classmethod
+    def exact(cls, mid) -> Self:
+        """Numbers taken as they are: a ball of radius zero."""
+        return cls(mid, jnp.zeros_like(mid))
+
+    @property
+    def lower(self):
+        """A lower bound of every entry."""
+        return self.mid - self.rad * (1 + gamma(2)) - gamma(2) * abs(self.mid)
+
+    @property
+    def upper(self):
+        """An upper bound of every entry."""
+        return self.mid + self.rad * (1 + gamma(2)) + gamma(2) * abs(self.mid)
+
+    @classmethod
+    def between(cls, lower, upper) -> Self:
+        """A ball that surely holds `[lower, upper]`; a single point is held exactly.
+
+        A compiler may evaluate an expression in several places and round it differently in each,
+        so the radius holds for every rounding of the midpoint.
+        """
+        mid = lower + (upper - lower) / 2
+        rad = jnp.maximum(upper - mid, mid - lower) * (1 + gamma(4)) + gamma(4) * abs(mid)
+        return cls(mid, jnp.where(lower == upper, 0.0, rad))
+
+    def lift(self, other) -> Ball:
+        """`other` as a ball of this kind; plain numbers are taken to be exact."""
+        return other if isinstance(other, Ball) else type(self).exact(other)
+
+    def _rebuilt(self, mid, rad, rounding) -> Self:
+        return type(self)(mid, (rad + rounding) * (1 + gamma(4)))
+
+    def __rmatmul__(self, matrix) -> Self:
+        """`matrix @ self` for an exact matrix."""
+        error = gamma(matrix.shape[-1])
+        size, weights = abs(self.mid), abs(matrix)
+        return self._rebuilt(
+            matrix @ self.mid, weights @ (self.rad * (1 + error)), error * (weights @ size)
+        )
+
+    def __matmul__(self, matrix) -> Self:
+        """`self @ matrix` for an exact matrix."""
+        error = gamma(matrix.shape[0])
+        size, weights = abs(self.mid), abs(matrix)
+        return self._rebuilt(
+            self.mid @ matrix, (self.rad * (1 + error)) @ weights, error * (size @ weights)
+        )
+
+    def __add__(self, other) -> Self:
+        other = self.lift(other)
+        mid = self.mid + other.mid
+        return self._rebuilt(mid, self.rad + other.rad, gamma(1) * abs(mid))
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Self:
+        return type(self)(-self.mid, self.rad)
+
+    def __sub__(self, other) -> Self:
+        return self + (-self.lift(other))
+
+    def __rsub__(self, other) -> Self:
+        return self.lift(other) + (-self)
+
+    def __getitem__(self, index) -> Self:
+        return type(self)(self.mid[index], self.rad[index])

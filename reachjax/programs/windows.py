@@ -1,0 +1,262 @@
+"""Windows: the loop unrolled over its last steps, from a set of states, over one basis.
+
+The basis is `[x[t], z[t], ..., z[t + w - 1], 1]`: a state and the outputs of the units of `w`
+steps. States after `x[t]` are rows over it, and the sets that are known to hold them add facts. A
+window of one step is the paper's recursion; one that begins at the initial set forgets nothing.
+
+A window grows by one step at a time, by functions that are compiled once. Units that bounds prove
+to be affine leave the basis; outside of `jax.jit` their columns can be left out as well
+(`compact`), so that a window of many steps has as many columns as it has units that switch.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from reachjax.loops import ClosedLoop
+from reachjax.numerics.pytrees import Replaceable, pytree, static
+from reachjax.numerics.rounding import Ball
+from reachjax.programs.basis import Rows, columns, loop_rows
+from reachjax.programs.bounds import LoopBounds, loop_bounds
+from reachjax.programs.lmi import Program
+from reachjax.programs.preactivations import bounds_over, known_inputs, rounded
+from reachjax.programs.relaxations import AbstractRelaxation, FactLayout
+from reachjax.programs.scaling import scaled_states, scaled_units
+from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection
+
+COLUMNS = 16
+"""The columns of a compact basis come in multiples of this many."""
+
+
+@pytree
+class Window(Replaceable):
+    """Some steps of the loop from a set of states, as rows over the scaled basis.
+
+    Attributes:
+        facts: those of each step: of its set, then of its units.
+        cone: `(r, n)`, rows of the first set's cone fact.
+        state: `(n_x, n)`, the state after these steps, over the basis itself.
+        transform: `(n, n)`, `T` with `xi = T eta`, the entries of `eta` being in `[-1, 1]`.
+        facets: how many facets the set of each step has.
+        units: of the loop.
+        start: the time of the first set.
+        taken: how many columns are.
+        prune: whether units that bounds prove to be affine leave the basis.
+        linear: whether bounds are those of supports and linear relaxations.
+        compact: whether units that left the basis take no columns either.
+    """
+
+    facts: tuple[Rows, ...]
+    cone: Rows
+    state: Rows
+    transform: Float[Array, "n n"]
+    facets: tuple[int, ...] = static()
+    units: int = static()
+    start: int = static()
+    taken: int = static()
+    prune: bool = static()
+    linear: bool = static()
+    compact: bool = static()
+
+    @classmethod
+    def beginning(
+        cls,
+        loop: ClosedLoop,
+        X: AbstractSet,
+        box: Box,
+        t: int,
+        relaxation: AbstractRelaxation,
+        compact: bool = False,
+    ) -> Window:
+        """No step yet.
+
+        Args:
+            loop: the closed loop.
+            X: the set of states at time `t`.
+            box: a box around it.
+            t: the time.
+            relaxation: whether units that bounds prove to be affine leave the basis, and by which
+                bounds.
+            compact: whether their columns are left out as well, which needs concrete numbers.
+        """
+        prune, linear = relaxation.remove_stable, relaxation.linear_bounds
+        state, cone, T = _first(X.cone_facts(), box, _ball(rounded(X, box)))
+        return cls(
+            facts=(),
+            cone=cone,
+            state=state,
+            transform=T,
+            facets=(),
+            units=loop.units,
+            start=int(t),
+            taken=loop.states,
+            prune=prune,
+            linear=linear,
+            compact=compact and prune,
+        )
+
+    def __len__(self) -> int:
+        return len(self.facts)
+
+    @property
+    def layout(self) -> FactLayout:
+        """Where each kind of fact stands among those of the program."""
+        return FactLayout(self.facets, self.units, len(self.cone.mid))
+
+    def extended(
+        self, loop: ClosedLoop, X: AbstractSet, box: Box, known: Ball | None = None
+    ) -> Window:
+        """One step more.
+
+        Args:
+            loop: the closed loop.
+            X: a set that surely holds the state after the steps so far; the first set at first.
+            box: a box around it.
+            known: bounds of the inputs of the first units, if there are any besides these.
+        """
+        t, around = self.start + len(self), rounded(X, box)
+        sharp = self.prune and (self.linear or not isinstance(around, Box))
+        bounds = _bounds(loop, around if sharp else None, box, t, known_inputs(self.units, known))
+        places, taken = self._places(bounds)
+        grown = self._padded(taken + 1)
+        units, state, T = _extended(
+            loop, grown.state, grown.transform, bounds, t, places, self.prune
+        )
+        block = _block(X, grown.state, units, T)
+        return grown.replace(
+            facts=(*grown.facts, block),
+            state=state,
+            transform=T,
+            facets=(*self.facets, len(block.mid) - 4 * self.units),
+            taken=taken,
+        )
+
+    def program(self, directions: Float[Array, "f n_x"], relaxation: AbstractRelaxation) -> Program:
+        """Theorem 1 for every facet of the states after these steps.
+
+        With the identity for directions, the objective rows are the state: the program of an
+        ellipsoid.
+
+        Args:
+            directions: one row for each facet.
+            relaxation: which products of facts are used.
+        """
+        one, objective = _ends(directions, self.state, self.transform)
+        facts = _joined(one, *self.facts, self.cone)
+        return Program(facts, objective, relaxation.products(self.layout), self.transform)
+
+    def _places(self, bounds: LoopBounds) -> tuple[Int[np.ndarray, " k"], int]:
+        """The column of each unit of one more step, and how many are taken then."""
+        if not self.compact:
+            return self.taken + np.arange(self.units), self.taken + self.units
+        passing, blocking = jax.device_get(jax.lax.stop_gradient((bounds.passing, bounds.blocking)))
+        stays = ~(passing | blocking)
+        places = np.where(stays, self.taken + np.cumsum(stays) - 1, -1)
+        return places, self.taken + int(stays.sum())
+
+    def _padded(self, needed: int) -> Window:
+        """The same with at least so many columns; new ones are empty."""
+        more = (-(-needed // COLUMNS) * COLUMNS if self.compact else needed) - len(self.transform)
+        if more <= 0:
+            return self
+        rows = self.facts, self.cone, self.state
+        (facts, cone, state), T = _widened(rows, self.transform, more)
+        return self.replace(facts=facts, cone=cone, state=state, transform=T)
+
+
+def step_program(
+    loop: ClosedLoop,
+    X: AbstractSet,
+    box: Box,
+    directions: Float[Array, "f n_x"],
+    t: int,
+    relaxation: AbstractRelaxation,
+) -> Program:
+    """Theorem 1 for every facet of the successors of `X` at time `t`: a window of one step."""
+    window = Window.beginning(loop, X, box, t, relaxation)
+    return window.extended(loop, X, box).program(directions, relaxation)
+
+
+def _ball(around: Box | Ellipsoid | Intersection) -> Ellipsoid | None:
+    if isinstance(around, Box):
+        return None
+    return around.ellipsoid if isinstance(around, Intersection) else around
+
+
+@jax.jit
+def _first(
+    cone_facts: Float[Array, "r n_x+1"], box: Box, ball: Ellipsoid | None
+) -> tuple[Rows, Rows, Float[Array, "n_x+1 n_x+1"]]:
+    """Rows of the state, scaled rows of its cone fact, and the scaling."""
+    state, T = columns(0, box.dimension, box.dimension + 1), scaled_states(box, ball)
+    return state, _holding(cone_facts, state) @ T, T
+
+
+@jax.jit
+def _bounds(
+    loop: ClosedLoop,
+    around: Box | Ellipsoid | Intersection | None,
+    box: Box,
+    t: int,
+    known: Ball,
+) -> LoopBounds:
+    """Bounds of one step: by intervals alone, or by supports of a set and linear relaxations."""
+    if around is None:
+        return loop_bounds(loop, box, t)
+    return bounds_over(loop, around, box, t, known)
+
+
+@partial(jax.jit, static_argnames="prune")
+def _extended(
+    loop: ClosedLoop,
+    state: Rows,
+    T: Float[Array, "n n"],
+    bounds: LoopBounds,
+    t: int,
+    places: Int[Array | np.ndarray, " k"],
+    prune: bool,
+) -> tuple[Rows, Rows, Float[Array, "n n"]]:
+    """Scaled facts of the units of one step, the state after it, and the scaling with these."""
+    rows = loop_rows(loop, state, places, t, bounds, prune)
+    T = scaled_units(T, places, bounds, prune)
+    return _joined(*rows.facts) @ T, rows.successor, T
+
+
+@jax.jit
+def _block(X: AbstractSet, state: Rows, units: Rows, T: Float[Array, "n n"]) -> Rows:
+    """Scaled facts of one step: of its set, then of its units."""
+    return _joined(_holding(X.facts(), state) @ T, units)
+
+
+@jax.jit
+def _ends(
+    directions: Float[Array, "f n_x"], state: Rows, T: Float[Array, "n n"]
+) -> tuple[Rows, Rows]:
+    """The constant, which is the first fact, and the objective, over the scaled basis."""
+    return columns(len(T) - 1, 1, len(T)), (directions @ state) @ T
+
+
+def _joined(*parts: Rows) -> Rows:
+    return jax.tree.map(lambda *part: jnp.concatenate(part), *parts)
+
+
+def _holding(facts: Float[Array, "m n_x+1"], state: Rows) -> Rows:
+    """Facts of states as rows over the basis."""
+    return facts[:, :-1] @ state + facts[:, -1]
+
+
+@partial(jax.jit, static_argnames="more")
+def _widened(rows: Any, T: Float[Array, "n n"], more: int) -> tuple[Any, Float[Array, "n+m n+m"]]:
+    """All rows and the scaling, with empty columns before the last."""
+
+    def wider(part: Float[Array, "k n"]) -> Float[Array, "k n+m"]:
+        empty = jnp.zeros((len(part), more))
+        return jnp.concatenate([part[:, :-1], empty, part[:, -1:]], axis=1)
+
+    return jax.tree.map(wider, rows), wider(wider(T).T).T

@@ -1,0 +1,1 @@
+"""What is trusted: the recheck and its certificates; proposals and witnesses beside them."""

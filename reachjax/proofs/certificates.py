@@ -1,0 +1,67 @@
+"""What a bound rests on, kept so that anyone can check it again.
+
+A certificate holds the program of one step, the multipliers that prove its bounds, and the dual
+moment matrices: where one has rank one, it is the worst trajectory itself. Witnesses are simulated
+trajectories; the true support of the reachable set lies between witness and bound.
+"""
+
+from __future__ import annotations
+
+import abc
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.programs.lmi import Program
+from reachjax.proofs.proposal import SolverStatus
+
+
+@pytree
+class AbstractCertificate(Replaceable, abc.ABC):
+    """What the proof of one step's set has, whatever the set.
+
+    Attributes:
+        program: facts, products and objective rows over the scaled basis.
+        multipliers: `(f, K)`, one row for each semidefinite program.
+        moments: `(f, n, n)`, dual matrices over the unscaled basis with corner 1; NaN where the
+            solver gave none.
+        codes: `(f,)`, how the solver ended, as values of `SolverStatus`.
+        bounds: `(f,)`, what was proved.
+        witnesses: `(f,)`, the largest simulated values of what is bounded.
+        witness_states: `(f, n_x)`, the initial states that attain them.
+        seconds: `(f,)`, solver time.
+    """
+
+    program: Program
+    multipliers: Float[Array | np.ndarray, "f K"]
+    moments: Float[Array | np.ndarray, "f n n"]
+    codes: Int[Array | np.ndarray, " f"]
+    bounds: Float[Array | np.ndarray, " f"]
+    witnesses: Float[Array | np.ndarray, " f"]
+    witness_states: Float[Array | np.ndarray, "f n_x"]
+    seconds: Float[Array | np.ndarray, " f"]
+
+    @property
+    def statuses(self) -> tuple[SolverStatus, ...]:
+        """How the solver ended on each program; each has a sentence of `advice`."""
+        return tuple(SolverStatus(int(code)) for code in self.codes)
+
+    @property
+    def gaps(self) -> Float[Array | np.ndarray, " f"]:
+        """`bounds - witnesses`: how much tightness may be left; negative by rounding at most."""
+        return self.bounds - self.witnesses
+
+    @abc.abstractmethod
+    def recheck(self, multipliers: Float[np.ndarray, "f K"] | None = None) -> np.ndarray:
+        """Prove the bounds anew, from the program and these or other multipliers."""
+
+    def _proposed(self, multipliers: Float[np.ndarray, "f K"] | None) -> Float[np.ndarray, "f K"]:
+        """These multipliers, or the certificate's own."""
+        proposed = np.asarray(self.multipliers if multipliers is None else multipliers)
+        if proposed.shape != self.multipliers.shape:
+            raise ValueError(
+                f"multipliers must have shape {self.multipliers.shape} (programs, products), "
+                f"but {proposed.shape} arrived"
+            )
+        return proposed

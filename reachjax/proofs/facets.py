@@ -1,0 +1,73 @@
+"""Proofs of facets."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.numerics.pytrees import pytree
+from reachjax.programs.lmi import Program
+from reachjax.proofs.accepted import accepted_offsets
+from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.proposal import Solution
+
+
+@pytree
+class Certificate(AbstractCertificate):
+    """Proof of the offsets of one step, `directions x[t] <= bounds`: one program a facet.
+
+    Attributes:
+        solver_offsets: `(f,)`, what the solver itself claimed; not bounds.
+    """
+
+    solver_offsets: Float[Array | np.ndarray, " f"]
+
+    @classmethod
+    def from_solution(
+        cls, program: Program, bounds: Float[Array, " f"], solution: Solution
+    ) -> Certificate:
+        """What was proved with what a solver proposed; witnesses are not known yet (NaN)."""
+        facets = len(solution.offsets)
+        T = program.transform
+        return cls(
+            program=program,
+            multipliers=solution.multipliers,
+            moments=T @ solution.moments @ T.T,
+            codes=solution.statuses,
+            solver_offsets=solution.offsets,
+            bounds=bounds,
+            witnesses=np.full(facets, np.nan),
+            witness_states=np.full((facets, 0), np.nan),
+            seconds=solution.seconds,
+        )
+
+    def __repr__(self) -> str:
+        return f"Certificate(facets={len(self.bounds)}, products={self.multipliers.shape[-1]})"
+
+    def recheck(
+        self, multipliers: Float[np.ndarray, "f K"] | None = None
+    ) -> Float[np.ndarray, " f"]:
+        """Prove the offsets anew, from the program and these or other multipliers.
+
+        Sound for any multipliers: negative ones are clipped where the sign matters, and what
+        the matrix inequality misses is paid for.
+
+        Raises:
+            ValueError: the multipliers contain NaN or infinity, or have another shape.
+
+        Example:
+            >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach_step
+            >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+            >>> _, certificate = reach_step(loop, Box([1.0], [2.0]), Template.box(1))
+            >>> certificate.recheck().round(6).tolist()
+            [1.0, -0.5]
+            >>> garbage = -certificate.multipliers
+            >>> bool((certificate.recheck(garbage) >= [1.0, -0.5]).all())
+            True
+        """
+        proposed = self._proposed(multipliers)
+        program, back = jax.device_get(self.program), np.linalg.pinv(self.program.transform)
+        moments = back @ np.asarray(self.moments) @ back.T
+        solution = Solution(self.solver_offsets, proposed, moments, self.codes, self.seconds)
+        return accepted_offsets(program, solution)[0]

@@ -1,0 +1,163 @@
+"""Offsets that hold whatever multipliers a solver returned.
+
+For a facet, write the matrix of `lmi` as `[N v; v' s - 2b]` over the scaled basis `eta`, whose
+entries lie in `[-1, 1]`. For every `eps >= 0` that makes `N - eps I` negative definite,
+
+    2 a . x+  <=  s + v' (eps I - N)^-1 v + eps (n - 1)
+
+on the set, so the best `eps` gives the smallest offset that these multipliers prove. It is found in
+floating point and then proved: `eps I - M + theta I` is shown to be positive semidefinite by a
+Cholesky factorisation that runs to completion (Rump, Verification of positive definiteness, BIT
+2006), with the rounding errors of `M` itself bounded entry by entry; what is missing costs
+`theta n / 2`. Where the arithmetic overflows, interval arithmetic is the answer. For an ellipsoid
+the same steps bound `|A x+ + b|^2`.
+
+Everything here is numpy on the host.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import root_scalar
+
+from reachjax.numerics.rounding import UNIT, Ball, gamma
+from reachjax.programs.lmi import Program, form_rows, weighted_products
+from reachjax.sets import NormalForm
+
+
+def sound_offsets(program: Program, multipliers: np.ndarray) -> np.ndarray:
+    """The smallest offset `(f,)` that each facet's multipliers `(f, K)` are shown to prove.
+
+    Signed multipliers that are negative are taken as zero.
+
+    Raises:
+        ValueError: the multipliers have another shape, or contain NaN or infinity.
+    """
+    facets, count = program.objective.mid.shape[0], program.products.free.shape[0]
+    multipliers = np.asarray(multipliers, dtype=float)
+    if multipliers.shape != (facets, count):
+        raise ValueError(
+            f"multipliers must have shape {(facets, count)} (facets, products), "
+            f"but {multipliers.shape} arrived"
+        )
+    broken = ~np.isfinite(multipliers).all(axis=1)
+    if broken.any():
+        raise ValueError(
+            f"multipliers of facet {int(np.argmax(broken))} contain NaN or infinity: "
+            "they prove nothing"
+        )
+    p = program.objective
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow ends in the interval bound
+        by_intervals = interval_offsets(program)
+        return np.array(
+            [
+                _proved(program, multipliers[i], _bordered(p.mid[i], p.rad[i]), by_intervals[i])
+                for i in range(facets)
+            ]
+        )
+
+
+def interval_offsets(program: Program) -> np.ndarray:
+    """Offsets `(f,)` by interval arithmetic alone: `|eta_i| <= 1` in the objective rows."""
+    p = program.objective
+    size = abs(p.mid[:, :-1]).sum(axis=1) + p.rad.sum(axis=1)
+    rounding = gamma(p.mid.shape[1]) * (size + abs(p.mid[:, -1]))
+    return p.mid[:, -1] + size + 2 * rounding
+
+
+def sound_level(program: Program, multipliers: np.ndarray, form: NormalForm) -> float:
+    """A number that `|A x+ + b|` surely never exceeds, from any multipliers `(K,)`.
+
+    Signed multipliers that are negative are taken as zero. Without good ones it is the root of the
+    sum of the squares of `A x+ + b` by intervals.
+
+    Raises:
+        ValueError: the multipliers have another shape, or contain NaN or infinity.
+    """
+    shape = program.products.free.shape
+    multipliers = np.asarray(multipliers, dtype=float)
+    if multipliers.shape != shape or not np.isfinite(multipliers).all():
+        raise ValueError(
+            f"multipliers must be finite and have shape {shape} (products,), "
+            f"but {multipliers.shape} arrived, {np.isfinite(multipliers).sum()} of them finite"
+        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        V = form_rows(program, form)
+        q, n = V.mid.shape
+        largest = (abs(V.mid).sum(axis=1) + V.rad.sum(axis=1)) * (1 + gamma(n))
+        by_intervals = float(np.sum(largest**2)) * (1 + gamma(q)) / 2
+        # |V|^2 = xi' V' V xi, of which the recheck bounds the half
+        size, squares = abs(V.mid), V.mid.T @ V.mid
+        error = gamma(q + 4) * (size.T @ size) + V.rad.T @ (size + V.rad) + size.T @ V.rad
+        half = _proved(program, multipliers, Ball(squares, error * (1 + gamma(8))), by_intervals)
+    return float(np.sqrt(max(2 * np.fmin(half, by_intervals), 0.0)) * (1 + gamma(4)))
+
+
+def _proved(program: Program, multipliers: np.ndarray, goal: Ball, by_intervals: float) -> float:
+    """The smallest `b` shown for `F' Gamma F + goal - 2 b e e'`: see this module's docstring."""
+    signed = np.where(program.products.free, multipliers, np.maximum(multipliers, 0.0))
+    used = np.ix_(program.used, program.used)
+    products = weighted_products(program, signed)
+    mid = (products.mid + goal.mid)[used]
+    rad = ((products.rad + goal.rad)[used] + gamma(4) * abs(mid)) * (1 + gamma(4))
+    if not (np.isfinite(mid).all() and np.isfinite(rad).all()):
+        return float(by_intervals)
+    offset, shift = _best_offset(mid)
+    error = float(rad.sum(axis=1).max()) * (1 + gamma(len(mid)))  # spectral norm <= row sums
+    slack = _proved_slack(mid, offset, shift)
+    n = len(mid)
+    cost = (shift * (n - 1) + (slack + error) * n) / 2
+    proved = offset + cost + gamma(4) * (abs(offset) + cost)
+    return proved if np.isfinite(proved) else float(by_intervals)
+
+
+def _bordered(mid: np.ndarray, rad: np.ndarray) -> Ball:
+    """`p e' + e p'`."""
+    last = np.eye(len(mid))[-1]
+    return Ball(*(np.outer(part, last) + np.outer(last, part) for part in (mid, rad)))
+
+
+def _best_offset(matrix: np.ndarray) -> tuple[float, float]:
+    """The offset `b` and the shift `eps` that minimise the bound of this module's docstring.
+
+    Its derivative in `eps` is `(n - 1 - |(eps I - N)^-1 v|^2) / 2`, which grows with `eps`.
+    """
+    s, v, N = matrix[-1, -1], matrix[-1, :-1], matrix[:-1, :-1]
+    if len(v) == 0:
+        return s / 2, 0.0
+    values, vectors = np.linalg.eigh(N)
+    w = vectors.T @ v
+    tiny = len(v) * UNIT * max(abs(values).max(), abs(v).max(), np.finfo(float).tiny)
+    least = max(0.0, values[-1] + tiny)
+    most = least + tiny + np.linalg.norm(w) / np.sqrt(len(v))
+
+    def excess(shift: float) -> float:
+        return float(np.sum((w / (shift - values)) ** 2) - len(v))
+
+    if excess(least) > 0 > excess(most):
+        shift = root_scalar(excess, bracket=(least, most), xtol=1e-6 * tiny, rtol=1e-12).root
+    else:
+        shift = least
+    return (s + float(np.sum(w**2 / (shift - values)))) / 2, float(shift)
+
+
+def _proved_slack(matrix: np.ndarray, offset: float, shift: float) -> float:
+    """A `slack >= 0` for which `diag(shift I, 2 offset) - matrix + slack I` surely is semidefinite.
+
+    A Cholesky factorisation that completes for `P - c I`, with `c` at least
+    `gamma_{n+1} trace(P) / (1 - gamma_{n+1})`, shows that `P` is positive semidefinite.
+    """
+    n = len(matrix)
+    P = -matrix + np.diag(np.r_[np.full(n - 1, shift), 2 * offset])
+    formed = gamma(2) * (abs(matrix).max() + abs(shift) + 2 * abs(offset)) * 2
+    size = abs(np.diag(P)).sum() + np.finfo(float).tiny
+    slack = 0.0
+    for _ in range(60):
+        margin = 2 * gamma(n + 1) * (size + n * slack)
+        try:
+            np.linalg.cholesky(P + (slack - margin) * np.eye(n))
+        except np.linalg.LinAlgError:
+            slack = max(4 * slack, 8 * margin)
+        else:
+            return slack + formed
+    return np.inf

@@ -1,0 +1,134 @@
+"""Simulated trajectories as lower bounds of what is reachable.
+
+A witness is an initial state whose trajectory attains a value of a direction: no sound offset can
+be smaller. Candidates are the corners of the initial set, points drawn from it, and what gradient
+ascent finds from these and from the states that the dual of a semidefinite program proposes.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from reachjax.loops import ClosedLoop
+from reachjax.proofs.ascent import ascended
+from reachjax.sets import AbstractSet, Ellipsoid, Intersection, PolyhedralSet
+from reachjax.sets.base import MOST_DIMENSIONS
+
+BLOCK = 1024
+"""Trajectories are evaluated in multiples of so many, for which code is compiled once."""
+
+PULL = 1 - 1e-12
+"""How far a rounded point is brought towards the middle of the set."""
+
+
+def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, "c n_x"]:
+    """Corners of the set, in few dimensions, and `count` points drawn from it.
+
+    Where the set has a round part, half of the points are on the surface, just inside.
+    """
+    key = jax.random.key(seed)
+    states = X0.sample(key, count)
+    if isinstance(X0, Ellipsoid | Intersection):
+        middle = X0.center if isinstance(X0, Ellipsoid) else states.mean(axis=0)
+        surface = middle + PULL * (X0.sample_boundary(key, count) - middle)
+        states = states.at[::2].set(surface[::2])
+    states = jnp.concatenate([_corners(X0), states])
+    states, inside = jax.device_get(_brought_inside(X0, states))
+    return states[inside] if inside.any() else states  # a flat set contains none exactly
+
+
+@jax.jit
+def _brought_inside(
+    X0: AbstractSet, states: Float[Array, "c n_x"]
+) -> tuple[Float[Array, "c n_x"], Bool[Array, " c"]]:
+    """States inside the set, and whether they are now.
+
+    Corners and points of triangulations are rounded: left as they are, a witness could lie.
+    """
+    center = states.mean(axis=0)
+    states = jnp.where(X0.contains(states)[:, None], states, center + PULL * (states - center))
+    return states, X0.contains(states)
+
+
+def _corners(X0: AbstractSet) -> Float[Array, "v n_x"]:
+    """Corners of the set's facets; none of an ellipsoid, or where there are too many to list."""
+    none = jnp.zeros((0, X0.dimension))
+    polytope = X0.polytope if isinstance(X0, Intersection) else X0
+    if not isinstance(polytope, PolyhedralSet) or X0.dimension > MOST_DIMENSIONS:
+        return none
+    try:
+        corners = polytope.vertices()
+    except RuntimeError:  # too thin to have corners: do without
+        return none
+    return corners[X0.ellipsoid.contains(corners)] if isinstance(X0, Intersection) else corners
+
+
+class Simulations:
+    """Trajectories from an initial set, and the largest values that they attain.
+
+    They begin at corners and samples; those that gradient ascent finds are added.
+
+    Args:
+        loop: the closed loop.
+        X0: the set of initial states.
+        horizon: how many steps are simulated.
+        start: the time of the initial set.
+        samples: how many trajectories, besides those from corners.
+        seed: of the samples.
+    """
+
+    def __init__(
+        self, loop: ClosedLoop, X0: AbstractSet, horizon: int, start: int, samples: int, seed: int
+    ):
+        self._loop, self._X0, self._start, self._horizon = loop, X0, start, horizon
+        self._box = X0.bounding_box()
+        states = initial_states(X0, samples, seed)
+        self._states, self._middle = states, states.mean(axis=0)
+        self._trajectories = np.asarray(loop.simulate(states, horizon, start))
+
+    def climb(
+        self,
+        k: int,
+        region: AbstractSet,
+        which: Int[np.ndarray, " m"],
+        states: Float[np.ndarray, "m n_x"],
+    ) -> None:
+        """Seek larger values after `k` steps by gradient ascent.
+
+        Args:
+            k: the number of steps.
+            region: a set that bounds `m` values.
+            which: of these values each ascent seeks.
+            states: where it begins; those that are no numbers begin at the middle of the samples.
+        """
+        known = np.isfinite(states).all(axis=1, keepdims=True)
+        begin = np.where(known, states, self._middle)
+        fixed = self._loop, self._X0, self._box, self._middle
+        found = ascended(*fixed, begin, region, which, k, self._horizon, self._start)
+        trajectories = self._loop.simulate(found, self._horizon, self._start)
+        inside = np.asarray(self._X0.contains(found)) & np.isfinite(trajectories).all(axis=(1, 2))
+        self._states = np.concatenate([self._states, np.asarray(found)[inside]])
+        self._trajectories = np.concatenate([self._trajectories, np.asarray(trajectories)[inside]])
+
+    def _values(self, k: int, region: AbstractSet) -> Float[np.ndarray, "c m"]:
+        """What a set bounds, at each trajectory after `k` steps."""
+        points = self._trajectories[:, k]
+        padded = np.resize(points, (-(-len(points) // BLOCK) * BLOCK, points.shape[1]))
+        return np.asarray(region.bounded_values(padded))[: len(points)]
+
+    def attained(
+        self, k: int, region: AbstractSet
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n_x"]]:
+        """The largest values `(m,)` of what a set bounds, after `k` steps, and initial states."""
+        values = self._values(k, region)
+        return values.max(axis=0), self._states[values.argmax(axis=0)]
+
+    def best(
+        self, k: int, region: AbstractSet, which: int, count: int
+    ) -> Float[np.ndarray, "count n_x"]:
+        """The initial states of the largest values of one of the things that a set bounds."""
+        order = np.argsort(-self._values(k, region)[:, which], stable=True)
+        return self._states[np.resize(order[:count], count)]

@@ -1,0 +1,164 @@
+"""Pictures of sets and tubes: Axes in, Axes out. matplotlib is imported when it is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet
+from reachjax.tubes.partitions import PartitionedTube
+from reachjax.tubes.reach import ReachTube
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SET = {"facecolor": "none", "edgecolor": "tab:red", "linewidth": 1.4}
+OUTLINE = 200
+"""Points of an ellipse's outline."""
+
+SAMPLES = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
+
+
+def plot_set(
+    region: AbstractSet,
+    ax: Axes | None = None,
+    coordinates: tuple[int, int] | None = None,
+    **style: Any,
+) -> Axes:
+    """Draw the outline of a bounded set, or of its shadow on two coordinates.
+
+    Of an intersection, it is what the shadows of its two parts have in common.
+
+    Args:
+        region: a set of two or more dimensions.
+        ax: where to draw; a new figure by default.
+        coordinates: the two to draw, counted from 0: the horizontal axis, then the vertical one. A
+            set of more than two dimensions needs them.
+        style: keyword arguments of `matplotlib.patches.Polygon`.
+
+    Raises:
+        ValueError: the set has one dimension, or is unbounded, or the coordinates are not two of
+            its own.
+
+    Example:
+        >>> from reachjax import Box
+        >>> ax = plot_set(Box([0, 1, 2], [1, 3, 5]), coordinates=(2, 0))
+        >>> ax.dataLim.extents.tolist()
+        [2.0, 0.0, 5.0, 1.0]
+    """
+    if coordinates is None and region.dimension > 2:
+        raise ValueError(
+            f"a set of dimension {region.dimension} arrived: choose the two coordinates to draw, "
+            "such as coordinates=(0, 1)"
+        )
+    i, j = _two_of(region.dimension, (0, 1) if coordinates is None else coordinates)
+    from matplotlib.patches import Polygon
+
+    ax = _axes(ax)
+    ax.add_patch(Polygon(_outline(region, i, j), closed=True, **{**SET, **style}))
+    ax.autoscale_view()
+    return ax
+
+
+def _two_of(dimension: int, coordinates: Any) -> tuple[int, int]:
+    """Two different coordinates of a space, or an error that says what was wrong."""
+    if dimension < 2:
+        raise ValueError(f"two or more dimensions can be drawn, but {dimension} arrived")
+    chosen = tuple(coordinates) if np.ndim(coordinates) == 1 else ()
+    known = [i for i in range(dimension) if i in chosen]
+    if len(chosen) != 2 or len(known) != 2:
+        raise ValueError(
+            f"coordinates must be two different ones of 0 .. {dimension - 1}, "
+            f"but {coordinates!r} arrived"
+        )
+    return int(chosen[0]), int(chosen[1])
+
+
+def _outline(region: AbstractSet, i: int, j: int) -> np.ndarray:
+    """Points around a set's shadow on two coordinates, in order."""
+    if isinstance(region, Intersection):
+        return _cut(_outline(region.polytope, i, j), region.ellipsoid.projection(i, j))
+    if isinstance(region, Ellipsoid):
+        shadow = region.projection(i, j)
+        return np.asarray(shadow.center) + _circle() @ np.linalg.cholesky(shadow.shape).T
+    if isinstance(region, Box):
+        box = region.bounding_box()  # a box of many dimensions has too many corners to list
+        region = Box(box.lower[np.array([i, j])], box.upper[np.array([i, j])])
+        i, j = 0, 1
+    assert isinstance(region, PolyhedralSet)
+    corners = np.asarray(region.vertices())[:, [i, j]]
+    try:
+        return corners[ConvexHull(corners).vertices]
+    except QhullError:  # on a line: its two ends
+        return corners[np.lexsort(corners.T)[[0, -1]]]
+
+
+def _circle() -> np.ndarray:
+    angles = np.linspace(0, 2 * np.pi, OUTLINE, endpoint=False)
+    return np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def _cut(corners: np.ndarray, ellipse: Ellipsoid) -> np.ndarray:
+    """What the tangents of an ellipse leave of a convex polygon, corners in order."""
+    A, b = (np.asarray(part) for part in ellipse.normal_form)
+    for tangent in _circle():
+        room = 1 - corners @ (tangent @ A) - tangent @ b
+        after, left = np.roll(corners, -1, axis=0), np.roll(room, -1)
+        crossing = room * left < 0
+        share = np.where(crossing, room / np.where(crossing, room - left, 1.0), 0.0)
+        between = corners + share[:, None] * (after - corners)
+        either = np.stack([corners, between], axis=1).reshape(-1, 2)
+        corners = either[np.stack([room >= 0, crossing], axis=1).ravel()]
+    return corners
+
+
+def plot_tube(
+    tube: ReachTube | PartitionedTube,
+    ax: Axes | None = None,
+    samples: int = 2000,
+    coordinates: tuple[int, int] = (0, 1),
+) -> Axes:
+    """Draw the sets of a tube over simulated states: shadows, where there are more than two.
+
+    Args:
+        tube: of a loop with two or more states.
+        ax: where to draw; a new figure by default.
+        samples: how many trajectories to show; of a partitioned tube so many from each cell.
+        coordinates: the two states to draw, counted from 0: the horizontal axis, then the vertical
+            one.
+
+    Raises:
+        ValueError: the loop has one state, or the coordinates are not two of its states.
+    """
+    first, *others = tube.tubes if isinstance(tube, PartitionedTube) else (tube,)
+    i, j = _two_of(first.loop.states, coordinates)
+    ax = _axes(ax)
+    _plot_cell(first, ax, samples, i, j, ("simulated", "initial set", "certified"))
+    for cell in others:
+        _plot_cell(cell, ax, samples, i, j, (None, None, None))
+    ax.set_xlabel(f"$x_{{{i + 1}}}$")
+    ax.set_ylabel(f"$x_{{{j + 1}}}$")
+    return ax
+
+
+def _plot_cell(
+    tube: ReachTube, ax: Axes, samples: int, i: int, j: int, labels: Sequence[str | None]
+) -> None:
+    """The sets of one tube over its simulated states, with an entry each in the legend."""
+    simulated, initial, certified = labels
+    trajectories = np.asarray(tube.simulate(samples))[:, :, [i, j]]
+    for t, region in enumerate(tube.sets):
+        ax.scatter(*trajectories[:, t].T, **SAMPLES, label=None if t else simulated)
+        first = {"edgecolor": "black", "label": initial}
+        plot_set(region, ax, (i, j), **({"label": None if t > 1 else certified} if t else first))
+
+
+def _axes(ax: Axes | None) -> Axes:
+    if ax is not None:
+        return ax
+    import matplotlib.pyplot as plt
+
+    return plt.subplots()[1]

@@ -1,0 +1,281 @@
+"""Reachable sets, step by step (the paper's section IV).
+
+One step: facts of the set, facts of the units, rows of the successor, the program, a solver, the
+recheck. A tube repeats it, each set being the next one's set of states (equation (seq_SDP)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.numerics.checks import (
+    is_concrete,
+    require_bar,
+    require_double_precision,
+    require_kind,
+    same_size,
+    whole_number,
+)
+from reachjax.numerics.pytrees import Replaceable, pytree, static
+from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
+from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.witnesses import Simulations, initial_states
+from reachjax.sets import AbstractSet, AbstractTemplate
+from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.steps import Setting, Step, boxed
+from reachjax.tubes.successors import successors
+
+Progress = Callable[[Iterable[int]], Iterable[int]]
+"""Wraps the iteration over time steps, such as `tqdm.tqdm` or `rich.progress.track`."""
+
+SAMPLES = 1000
+
+LARGEST = 64
+"""The most columns of a window whose length is chosen."""
+
+EXAMPLES = {
+    ClosedLoop: "a ClosedLoop",
+    AbstractSet: "a set such as Box(lower, upper) or Polytope(A, b)",
+    AbstractTemplate: "a template, such as Template.box(n) or EllipsoidTemplate()",
+    AbstractRelaxation: "a relaxation object, such as CuttingPlanes()",
+    AbstractSolver: "a solver object, such as Auto()",
+}
+
+
+@pytree
+class ReachTube(Replaceable):
+    """Sets that surely contain every state of the loop, one for each time.
+
+    Attributes:
+        loop: the loop they were computed for.
+        template: what the sets look like: facet directions, ellipsoids, or both.
+        sets: `sets[t]` for `t = 0 .. horizon`; `sets[0]` is the initial set.
+        certificates: `certificates[t]` for `t = 1 .. horizon`; the first entry is `None`.
+        start: the time of the initial set, for time-varying loops.
+    """
+
+    loop: ClosedLoop
+    template: AbstractTemplate
+    sets: tuple[AbstractSet, ...]
+    certificates: tuple[AbstractCertificate | None, ...]
+    start: int = static(default=0)
+
+    def __repr__(self) -> str:
+        sets = self.template.summary
+        return f"ReachTube(horizon={self.horizon}, {sets}, states={self.loop.states})"
+
+    @property
+    def horizon(self) -> int:
+        """The number of steps."""
+        return len(self.sets) - 1
+
+    def proof(self, t: int) -> AbstractCertificate:
+        """The certificate of `sets[t]`.
+
+        Raises:
+            ValueError: there is none for this time (the initial set needs none).
+        """
+        certificate = self.certificates[t] if 0 < t <= self.horizon else None
+        if certificate is None:
+            raise ValueError(f"certificates are for t = 1 .. {self.horizon}, but {t} was asked for")
+        return certificate
+
+    def simulate(self, samples: int = SAMPLES, seed: int = 0) -> Float[Array, "c h+1 n_x"]:
+        """Trajectories from corners of the initial set and `samples` points drawn from it."""
+        states = initial_states(self.sets[0], samples, seed)
+        return self.loop.simulate(states, self.horizon, self.start)
+
+
+def reach_step(
+    loop: ClosedLoop,
+    X: AbstractSet,
+    template: AbstractTemplate,
+    *,
+    t: int = 0,
+    relaxation: AbstractRelaxation = CuttingPlanes(),  # noqa: B008  (immutable)
+    solver: AbstractSolver = Auto(),  # noqa: B008
+    samples: int = SAMPLES,
+    seed: int = 0,
+) -> tuple[AbstractSet, AbstractCertificate]:
+    """A set that surely contains every successor of a set, and its certificate.
+
+    Args:
+        loop: the closed loop.
+        X: the set of states at time `t`.
+        template: what the sets look like: facet directions, ellipsoids, or both.
+        t: the time, for time-varying loops.
+        relaxation: which products of facts are used.
+        solver: what solves the semidefinite programs.
+        samples: how many states are simulated for witnesses, besides the corners.
+        seed: of the samples.
+
+    Raises:
+        RuntimeError: JAX's 64-bit floats are off.
+        TypeError: an argument is of another kind.
+        ValueError: dimensions disagree, the set is empty or unbounded, or `t` is beyond the loop.
+
+    Source: theorem 1 and problems (sdp::poly), (sdp::ellips) of Hu, Fazlyab, Morari, Pappas
+    (CDC 2020).
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box, Template
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> following, certificate = reach_step(loop, Box([1.0], [2.0]), Template.box(1))
+        >>> following.b.round(6).tolist()  # x+ = 0.6 x, written as x <= 1.2 and -x <= -0.6
+        [1.2, -0.6]
+    """
+    tube = reach(loop, X, 1, template, relaxation, 1, solver, start=t, samples=samples, seed=seed)
+    return tube.sets[1], tube.proof(1)
+
+
+def reach(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    horizon: int,
+    template: AbstractTemplate,
+    relaxation: AbstractRelaxation = CuttingPlanes(),  # noqa: B008  (immutable)
+    window: int | None = None,
+    solver: AbstractSolver = Auto(),  # noqa: B008
+    *,
+    start: int = 0,
+    samples: int = SAMPLES,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> ReachTube:
+    """Sets that surely contain every state of the loop at times `1 .. horizon`.
+
+    Args:
+        loop: the closed loop.
+        X0: the set of initial states.
+        horizon: the number `N` of steps.
+        template: what every set looks like: facet directions, ellipsoids, or both.
+        relaxation: which products of facts are used.
+        window: over how many steps each program reaches back, as far as there are steps: 1 is the
+            paper's recursion, the horizon goes back to `X0` in one shot. Longer ones are tighter,
+            and their programs larger. None: the longest that the solver bears, chosen from numbers,
+            so inside `jax.jit` give one.
+        solver: what solves the semidefinite programs.
+        start: the time of `X0`, for time-varying loops.
+        samples: how many trajectories are simulated for witnesses, besides those from corners. None
+            are inside `jax.jit`: witnesses and gaps are NaN there.
+        seed: of the samples.
+        progress: wraps the iteration over steps to show a progress bar, such as `tqdm.tqdm`; inside
+            `jax.jit` it sees them once, while the loop is traced.
+
+    Raises:
+        RuntimeError: JAX's 64-bit floats are off.
+        TypeError: an argument is of another kind.
+        ValueError: dimensions disagree, `X0` is empty or unbounded, the window is no positive
+            number, or None inside `jax.jit`, a time-varying loop ends before the horizon, states
+            overflow, or `progress` leaves out steps. What depends on traced values is NaN instead,
+            inside `jax.jit`.
+
+    The offsets of the sets have first derivatives in everything but facet normals (reverse mode):
+    in the loop's weights, plant and input box, and in a box's ends or a polytope's offsets. In the
+    normals of `X0` and of the template the derivative is NaN where a bound of a coordinate, or of
+    an input of the first layer, is attained on a whole face. Centre and shape of ellipsoids have
+    them too, in all of the above and in the centre and shape of an ellipsoid `X0`. They are NaN
+    where a program was not solved.
+
+    Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box, Template
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> tube = reach(loop, Box([1.0], [2.0]), 3, Template.box(1))
+        >>> [round(region.volume(), 6) for region in tube.sets[1:]]
+        [0.6, 0.36, 0.216]
+        >>> bool((tube.proof(3).gaps >= 0).all())
+        True
+    """
+    _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
+    boxed(X0, "X0")
+    fixed = jax.lax.stop_gradient((loop, X0))
+    simulations = None
+    if is_concrete(fixed):
+        simulations = Simulations(*fixed, horizon, start, samples, seed)
+    setting = Setting(
+        loop=loop,
+        start=start,
+        relaxation=relaxation,
+        solver=solver,
+        limit=LARGEST if window is None else None,
+        compact=window != 1 and is_concrete(fixed, jax.lax.stop_gradient(template)),
+        simulations=simulations,
+    )
+    sets, certificates, steps = [X0], [], []
+    numbers = range(horizon)
+    for _, k in zip(numbers if progress is None else progress(numbers), numbers, strict=False):
+        before = steps if window is None else steps[max(0, k + 1 - window) :]
+        proof = certificates[-1] if certificates else None
+        steps.append(Step(setting, sets[-1], k, tuple(before), proof))
+        following, certificate = successors(steps[-1], template.at(k + 1))
+        sets.append(following)
+        certificates.append(certificate)
+    if len(steps) < horizon:
+        raise ValueError(
+            f"progress must pass on each of the {horizon} steps, but {len(steps)} arrived"
+        )
+    if simulations is not None and is_concrete(certificates):
+        certificates = _with_witnesses(certificates, sets, simulations, steps)
+    return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
+
+
+def _with_witnesses(
+    certificates: list[AbstractCertificate],
+    sets: list[AbstractSet],
+    simulations: Simulations,
+    steps: list[Step],
+) -> list[AbstractCertificate]:
+    """Simulate what the certificates bound, from the initial set."""
+    for k, certificate in enumerate(certificates, start=1):
+        if len(steps[k - 1].window) == k:
+            states = np.asarray(certificate.moments)[:, : sets[0].dimension, -1]
+            simulations.climb(k, sets[k], np.arange(len(states)), states)
+    found = [simulations.attained(k, sets[k]) for k in range(1, len(sets))]
+    return [
+        certificate.replace(witnesses=values, witness_states=states)
+        for certificate, (values, states) in zip(certificates, found, strict=True)
+    ]
+
+
+def _check(
+    loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress
+) -> None:
+    for name, value, kind in (
+        ("loop", loop, ClosedLoop),
+        ("X0", X0, AbstractSet),
+        ("template", template, AbstractTemplate),
+        ("relaxation", relaxation, AbstractRelaxation),
+        ("solver", solver, AbstractSolver),
+    ):
+        require_kind(name, value, kind, EXAMPLES[kind])
+    require_double_precision(loop=loop, X0=X0, template=template)
+    same_size(
+        "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)
+    )
+    same_size(
+        "the loop's number of states is",
+        "the dimension of template is",
+        (loop.states, template.dimension or loop.states),
+    )
+    loop.check_horizon(horizon, start)
+    if template.steps is not None and template.steps < horizon:
+        raise ValueError(f"template is given for {template.steps} steps, but horizon is {horizon}")
+    require_bar(progress)
+    whole_number("samples", samples, 1)
+    whole_number("seed", seed, 0)
+    if window is not None:
+        whole_number("window", window, 1)
+    elif not is_concrete(jax.lax.stop_gradient((loop, X0, template))):
+        raise ValueError(
+            "window=None is chosen from numbers: inside jax.jit, vmap or scan give a number, such "
+            "as window=1"
+        )

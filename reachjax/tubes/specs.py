@@ -1,0 +1,120 @@
+"""Reach-avoid specifications, decided from a tube (the paper's equations (reach_avoid)).
+
+Certified margins prove a requirement. Trajectories are simulated in search of a counterexample; one
+of them refutes it only if it surely begins in the initial set and breaks it whatever rounding did.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from reachjax.numerics.checks import whole_number
+from reachjax.numerics.rounding import gamma
+from reachjax.programs.bounds import successor_box
+from reachjax.proofs.proposal import SolverStatus
+from reachjax.sets import AbstractSet, Box, PolyhedralSet
+from reachjax.tubes.partitions import BESIDE, PartitionedTube
+from reachjax.tubes.reach import ReachTube
+from reachjax.tubes.requirements import AvoidSets, Requirement, of_tube
+from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus, of_cells
+
+SUSPECTS = 5
+"""So many of the worst trajectories of each requirement are examined with their rounding."""
+
+
+def verify(
+    tube: ReachTube | PartitionedTube,
+    goal: PolyhedralSet | None = None,
+    avoid: AvoidSets | None = None,
+    safe: PolyhedralSet | None = None,
+    *,
+    samples: int = 10_000,
+    seed: int = 0,
+) -> Verdict:
+    """Decide a reach-avoid specification from a tube.
+
+    Args:
+        tube: certified sets for `t = 0 .. horizon`; of a partitioned tube, those of every cell.
+        goal: where every state must be at the horizon.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
+            time to a sequence.
+        safe: where every state must be at all times (its complement is avoided).
+        samples: how many trajectories are simulated in search of a counterexample, besides those
+            from corners and witnesses; so many from each cell.
+        seed: of the samples.
+
+    Raises:
+        TypeError: a set is of a kind without facets.
+        ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
+
+    Source: equations (reach_avoid) and (reach_avoid_approx) of the paper.
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> tube = reach(loop, Box([1.0], [2.0]), 3, Template.box(1))
+        >>> verify(tube, goal=Box([0.0], [0.5]), safe=Box([0.0], [2.0])).status.name
+        'PROVED'
+        >>> verify(tube, goal=Box([0.0], [0.4])).counterexample.states.ravel().round(3).tolist()
+        [2.0, 1.2, 0.72, 0.432]
+    """
+    whole_number("samples", samples, 1)
+    whole_number("seed", seed, 0)
+    if isinstance(tube, PartitionedTube):
+        cells = [(each, of_tube(each, goal, avoid, safe)) for each in tube.tubes]
+        return of_cells([_decided(*cell, samples, seed, tube.X0) for cell in cells])
+    return _decided(tube, of_tube(tube, goal, avoid, safe), samples, seed, tube.sets[0])
+
+
+def _decided(
+    tube: ReachTube, required: list[Requirement], samples: int, seed: int, X0: AbstractSet
+) -> Verdict:
+    """What a tube proves, or a trajectory from `X0` refutes."""
+    proofs = [tube.proof(t) for t in range(1, tube.horizon + 1)]
+    unsolved = sum(s is not SolverStatus.SOLVED for proof in proofs for s in proof.statuses)
+    states = jnp.concatenate([proof.witness_states for proof in proofs])
+    witnessed = tube.loop.simulate(states, tube.horizon, tube.start)
+    trajectories = np.concatenate([witnessed, tube.simulate(samples, seed)])
+    if X0 is not tube.sets[0]:  # a cell may hold points beside the initial set
+        trajectories = trajectories[np.asarray(X0.contains(trajectories[:, 0], BESIDE))]
+    margins: dict[str, np.ndarray] = {}
+    simulated: dict[str, np.ndarray] = {}
+    proved, suspects = True, []
+    for item in required:
+        blank = np.full(tube.horizon + 1, np.nan)
+        margin, rooms = float(item.margins(tube).min()), item.simulated(trajectories)
+        margins.setdefault(item.name, blank.copy())[item.time] = margin
+        simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min(initial=np.inf)
+        proved = proved and item.proved(margin)
+        worst = np.argsort(rooms)[:SUSPECTS]
+        suspects += [(rooms[k], item, trajectories[k]) for k in worst if rooms[k] <= 0]
+    for room, item, states in sorted(suspects, key=lambda suspect: suspect[0]):
+        if X0.surely_contains(states[0]) and _surely_broken(tube, item, states[0]):
+            if proved:
+                raise RuntimeError("a proved specification is broken: please report this defect")
+            example = _counterexample(tube, room, item, states)
+            return Verdict(VerdictStatus.REFUTED, margins, simulated, example, unsolved)
+    status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
+    return Verdict(status, margins, simulated, None, unsolved)
+
+
+def _surely_broken(tube: ReachTube, item: Requirement, x0: np.ndarray) -> bool:
+    """Whether the exact trajectory from `x0` breaks a requirement, rounding accounted for."""
+    reached = Box(x0, x0)
+    for t in range(item.time):
+        reached = successor_box(tube.loop, reached, tube.start + t)
+    x, spread = np.asarray(reached.center), np.asarray(reached.widths)
+    C, d = (np.asarray(part) for part in item.region.facets)
+    error = abs(C) @ spread + gamma(len(x)) * (abs(C) @ abs(x) + abs(d))
+    if item.inside:
+        return bool(np.any(d - C @ x + error < 0))
+    return bool(np.all(d - C @ x - error >= 0))
+
+
+def _counterexample(
+    tube: ReachTube, room: float, item: Requirement, states: np.ndarray
+) -> Counterexample:
+    inputs = [tube.loop.input(jnp.asarray(x), tube.start + t) for t, x in enumerate(states[:-1])]
+    return Counterexample(item.name, item.time, -float(room), states, np.stack(inputs))

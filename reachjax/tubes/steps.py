@@ -1,0 +1,171 @@
+"""One step of the loop: its set of states, and the window of earlier steps that it ends."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from reachjax.loops import ClosedLoop
+from reachjax.numerics.checks import is_concrete
+from reachjax.numerics.rounding import Ball
+from reachjax.programs.lmi import Program
+from reachjax.programs.relaxations import AbstractRelaxation
+from reachjax.programs.windows import Window
+from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.facets import Certificate
+from reachjax.proofs.witnesses import Simulations
+from reachjax.sets import AbstractSet, Box, Polytope, Template
+from reachjax.sets.geometry import bounding_box, row_ranges
+from reachjax.solvers import AbstractSolver
+from reachjax.solvers.candidates import NONE
+
+
+def boxed(X: AbstractSet, name: str) -> Box:
+    """A box around a set; one that is too large for numbers may seem empty or unbounded.
+
+    Raises:
+        ValueError: the set, which the error calls by this name, is empty or unbounded.
+    """
+    try:
+        return bounding_box(X)
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} cannot be used: {error}") from None
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What all steps of a tube have in common.
+
+    Attributes:
+        loop: the closed loop.
+        start: the time of the initial set.
+        relaxation: which products of facts are used.
+        solver: what solves the semidefinite programs.
+        limit: how many columns a window of more than one step may have; None if any number.
+        compact: whether units that are affine take no columns of the basis.
+        simulations: trajectories from the initial set; None where numbers are traced.
+    """
+
+    loop: ClosedLoop
+    start: int
+    relaxation: AbstractRelaxation
+    solver: AbstractSolver
+    limit: int | None
+    compact: bool
+    simulations: Simulations | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One step of the loop.
+
+    Attributes:
+        setting: the tube's.
+        X: the set of states.
+        k: how many steps after the initial set.
+        before: the steps that its window reaches back over, if it may have as many.
+        proof: of the set of states; None of the initial set.
+    """
+
+    setting: Setting
+    X: AbstractSet
+    k: int
+    before: tuple[Step, ...]
+    proof: AbstractCertificate | None = None
+
+    @property
+    def t(self) -> int:
+        """The time of the set of states."""
+        return self.setting.start + self.k
+
+    @cached_property
+    def box(self) -> Box:
+        """A box around the set; one that is too large for numbers may seem empty or unbounded.
+
+        Raises:
+            ValueError: the set is empty or unbounded.
+        """
+        return boxed(self.X, f"the certified set at t = {self.t}" if self.k else "X0")
+
+    @cached_property
+    def window(self) -> Window:
+        """The window that this step ends: the longest one that stays in the limit."""
+        limit = self.setting.limit
+        # a window that had to be shorter a step ago has to be now
+        first = max(0, len(self.before) - len(self.before[-1].window)) if self.before else 0
+        while True:
+            window = self._reaching_back(self.before[first:])
+            if limit is None or window.taken <= limit or len(window) == 1:
+                return window
+            first += 1
+
+    def _reaching_back(self, before: tuple[Step, ...]) -> Window:
+        """The window over these steps and this one."""
+        if before and len(before[-1].window) == len(before):
+            return self._added_to(before[-1].window)
+        first, *others = (*before, self)
+        setting = self.setting
+        window = Window.beginning(
+            setting.loop, first.X, first.box, first.t, setting.relaxation, setting.compact
+        )
+        for step in (first, *others):
+            window = step._added_to(window)
+        return window
+
+    def _added_to(self, window: Window) -> Window:
+        return window.extended(self.setting.loop, self.X, self.box, self.first_inputs)
+
+    @cached_property
+    def first_inputs(self) -> Ball | None:
+        """The ranges of the first layer's inputs over the set; None where its box says as much."""
+        layers = self.setting.loop.controller.layers
+        if (
+            not (self.setting.relaxation.linear_bounds and isinstance(self.X, Polytope))
+            or len(layers) < 2
+        ):
+            return None
+        W, b = layers[0]
+        return _inputs(*row_ranges(self.X, W), b)
+
+    @property
+    def offered(self) -> Int[np.ndarray, "p 2"]:
+        """Products that prove the set of states, where this window begins with the same facts."""
+        grown = bool(self.before) and len(self.window) == len(self.before[-1].window) + 1
+        if not grown or not isinstance(self.proof, Certificate):
+            return NONE
+        products = self.proof.program.products
+        weights = jax.lax.stop_gradient(self.proof.multipliers)
+        if not is_concrete(products, weights):
+            return NONE
+        pairs = np.stack([products.left, products.right], axis=1)
+        return pairs[np.any(np.asarray(weights) > 0, axis=0)[np.asarray(products.multiplier)]]
+
+    def program(self, directions: Float[Array, "f n_x"]) -> Program:
+        """Theorem 1 with these directions of the successor for an objective."""
+        return self.window.program(directions, self.setting.relaxation)
+
+    def attained(self, template: Template, facet: int, column: Float[np.ndarray, " n"]) -> float:
+        """What simulations attain of a facet of the successors.
+
+        Among them are ascents from the best ones and, where the window begins at the initial set,
+        from the state that a moment's last column holds.
+        """
+        simulations = self.setting.simulations
+        assert simulations is not None
+        facets, n, k = len(template), self.setting.loop.states, self.k + 1
+        region = jax.lax.stop_gradient(template.polytope(jnp.zeros(facets)))
+        starts = simulations.best(k, region, facet, facets)
+        if len(self.window) == k:
+            starts[-1] = column[:n]
+        simulations.climb(k, region, np.full(facets, facet), starts)
+        return float(simulations.attained(k, region)[0][facet])
+
+
+@jax.jit  # so that the interval arithmetic is compiled as one
+def _inputs(lower: Float[Array, " k"], upper: Float[Array, " k"], b: Float[Array, " k"]) -> Ball:
+    return Ball.between(lower, upper) + b

@@ -58,6 +58,41 @@ class Pairs(NamedTuple):
             shared += self.sharing[:, here] @ crossed
         return (self.sharing @ shared.T) / 2
 
+    def schur(
+        self, X: np.ndarray, W: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`<G_k, X>` and `<G_k, W>` `(K,)`, and `<G_k, X G_l W>` `(K, K)`, for symmetric `X`, `W`.
+
+        With the Gram matrices `A = F X F'` and `B = F W F'` of the rows, two pairs `(l, r)` and
+        `(p, q)` have
+
+            <sym(l' r), X sym(p' q) W>  =  (A_lp B_rq + A_lq B_rp + A_rp B_lq + A_rq B_lp) / 4.
+        """
+        left, right = self.left, self.right
+        A, B = self.rows @ X @ self.rows.T, self.rows @ W @ self.rows.T
+        A_left, A_right, B_left, B_right = A[:, left], A[:, right], B[:, left], B[:, right]
+        shared = np.zeros(self.sharing.shape)
+        for first in range(0, len(left), CHUNK):
+            here = slice(first, first + CHUNK)
+            p, q = left[here], right[here]
+            crossed = A_left[p] * B_right[q]
+            crossed += A_right[p] * B_left[q]
+            crossed += A_left[q] * B_right[p]
+            crossed += A_right[q] * B_left[p]
+            shared += self.sharing[:, here] @ crossed
+        paired = (self.sharing @ gram[left, right] for gram in (A, B))
+        return *paired, (self.sharing @ shared.T) / 4
+
+    def with_square(self, row: np.ndarray, weight: float) -> Pairs:
+        """With one more matrix, `weight` times a row's square."""
+        m = len(self.rows)
+        return Pairs(
+            rows=np.vstack([self.rows, row]),
+            left=np.append(self.left, m),
+            right=np.append(self.right, m),
+            sharing=sp.csr_array(sp.block_diag([self.sharing, [[weight]]])),
+        )
+
     def columns(self) -> sp.csc_array:
         """The flattened matrices, sparse `(n * n, K)`."""
         n, blocks = self.rows.shape[1], []

@@ -236,7 +236,7 @@ class CuttingPlanes(AbstractRelaxation):
     Begins with those of `LocalBounds(repeated=False)`. The moment matrix of each facet's program
     shows which other products it violates; the worst are added, and the program is solved again.
     About as tight as `AllProducts` with a tenth of the products, and never looser than
-    `LocalBounds`; inside `jax.jit` only where the rounds leave none of its products violated.
+    `LocalBounds`, whose products it has inside `jax.jit`, where the dual is not seen.
 
     Args:
         rounds: how often products are added, at most.

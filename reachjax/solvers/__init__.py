@@ -7,13 +7,11 @@ from reachjax.solvers.differentiable import proved_offsets
 from reachjax.solvers.enclosures import proved_ellipsoid, proved_size
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import SCS, Clarabel, CvxpySolver
-from reachjax.solvers.smoothing import CentralPath
 
 __all__ = [
     "SCS",
     "AbstractSolver",
     "Auto",
-    "CentralPath",
     "Clarabel",
     "CvxpySolver",
     "InteriorPoint",

@@ -12,7 +12,6 @@ from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import Clarabel
-from reachjax.solvers.smoothing import CentralPath
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +33,7 @@ class Auto(AbstractSolver):
 
     Raises:
         TypeError: an option is of another kind.
-        ValueError: the limit is negative, or a solver is `CentralPath`.
+        ValueError: the limit is negative.
 
     Example:
         >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach_step
@@ -54,11 +53,6 @@ class Auto(AbstractSolver):
                 raise TypeError(
                     f"Auto.{name} must be a solver, but {getattr(self, name)!r} arrived"
                 )
-            if isinstance(getattr(self, name), CentralPath):
-                raise ValueError(
-                    f"Auto.{name} must solve to optimality, but {getattr(self, name)!r} arrived: "
-                    "give that as the solver itself"
-                )
         whole_number("Auto.limit", self.limit, 0)
 
     def choice(self, program: Program) -> AbstractSolver:
@@ -69,10 +63,6 @@ class Auto(AbstractSolver):
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet."""
         return self.choice(program).solve(program)
-
-    def propose(self, program: Program) -> Solution:
-        """Propose multipliers for every facet; traced where the program is."""
-        return self.choice(program).propose(program)
 
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
         """Propose the smallest ellipsoid around the successors, and its multipliers.

@@ -39,9 +39,8 @@ class AbstractSolver(abc.ABC):
     def propose(self, program: Program) -> Solution:
         """Propose multipliers for every facet of a program of JAX arrays, traced ones too.
 
-        A solver that runs in numpy is called on the host; one that is written in JAX says here how
-        it is traced, since no JAX call may be made from a callback. A program that holds NaN or
-        infinity gets a blank proposal.
+        The solver is called on the host, where no JAX call may be made. A program that holds NaN
+        or infinity gets a blank proposal.
         """
         facets, size = program.objective.mid.shape
         blank = Solution.blank(facets, len(program.products.free), size)
@@ -50,11 +49,6 @@ class AbstractSolver(abc.ABC):
             return self.solve(program) if all_finite(program) else blank
 
         return on_host(solve, shapes_of(blank), program)
-
-    @property
-    def for_rounds(self) -> AbstractSolver:
-        """What solves programs to which products are added round by round."""
-        return self
 
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
         """Propose the smallest ellipsoid around the successors, and its multipliers.

@@ -19,7 +19,7 @@ width loses them.
 
 **Kinks.** Where a facet only touches, a neuron becomes stable, or an optimal point is not unique,
 an offset has a kink: the derivative is then one of its generalised gradients, and central
-differences see another. Those of `CentralPath` have none (`smoothing`). Second derivatives and
+differences see another.  Second derivatives and
 forward mode do not exist; JAX raises an error.
 """
 
@@ -38,7 +38,6 @@ from reachjax.proofs.accepted import accepted_offsets
 from reachjax.proofs.proposal import Solution, SolverStatus
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.cotangents import asked_for
-from reachjax.solvers.smoothing import CentralPath, smoothed_offsets
 
 
 class Judged(NamedTuple):
@@ -58,13 +57,9 @@ class Judged(NamedTuple):
 def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Array, " f"], Solution]:
     """Solve for every facet and prove the offsets; differentiable in the program's rows.
 
-    Optimal offsets, or those of the central path where that is asked for.
-
     Returns:
         The proved offsets `(f,)`, and what the solver proposed (which has no derivative).
     """
-    if isinstance(solver, CentralPath):
-        return smoothed_offsets(program, solver.weight)
     fixed = jax.lax.stop_gradient(program)
     solution = solver.propose(fixed)
     offsets = jax.ShapeDtypeStruct(solution.offsets.shape, float)

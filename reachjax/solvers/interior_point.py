@@ -1,36 +1,26 @@
-"""A primal-dual interior-point method made for the program of a facet, in JAX.
-
-Cones of general conic solvers hold a dense block of `n (n + 1) / 2` rows for a matrix inequality of
-size `n`. Here a multiplier's matrix is a product of two rows, so Gram matrices of rows are enough
-(`generators`), and an iteration costs `O(n^3)`. It runs on plain arrays and inside `jax.jit`,
-`jax.grad` and `jax.lax.scan` alike; ellipsoids are sought on the host (`centring`).
-"""
+"""The library's own interior-point methods: facets (`primal_dual`) and ellipsoids (`centring`)."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from reachjax.numerics.checks import is_concrete, require_double_precision, whole_number
+from reachjax.numerics.checks import whole_number
+from reachjax.programs.compact import compact
 from reachjax.programs.lmi import Program
-from reachjax.programs.trimming import trimmed
 from reachjax.proofs.proposal import Enclosure, Solution
 from reachjax.sets import NormalForm
-from reachjax.solvers.arrangement import arranged, cut
 from reachjax.solvers.base import AbstractSolver, require_positive
 from reachjax.solvers.centring import enclosed
-from reachjax.solvers.facets import solve_facets
+from reachjax.solvers.primal_dual import FacetProgram, minimised
 
 
 @dataclasses.dataclass(frozen=True)
 class InteriorPoint(AbstractSolver):
-    """The library's own interior-point method: JAX, and fast where there are many neurons.
+    """The library's own interior-point method: numpy, and fast where there are many neurons.
 
-    It compiles once for each of a few padded sizes; on the CPU facets are solved one by one.
     Ellipsoids are sought along their central path, which the options have no part in.
 
     Args:
@@ -59,59 +49,25 @@ class InteriorPoint(AbstractSolver):
         whole_number("InteriorPoint.max_iterations", self.max_iterations, 1)
 
     def solve(self, program: Program) -> Solution:
-        """Propose multipliers for every facet, from a program cut to what it uses.
-
-        Raises:
-            RuntimeError: JAX's 64-bit floats are off.
-        """
-        require_double_precision()
+        """Propose multipliers for every facet."""
         facets, size = program.objective.mid.shape
         solution = Solution.blank(facets, len(program.products.free), size)
-        given = trimmed(program)
-        layout = cut(arranged(given, program.products))
-        generators, count = jax.device_put(layout.generators), len(layout.columns)
-        used = np.ix_(layout.columns, layout.columns)
-        for here in _batches(facets):
+        reduced = compact(program)
+        used = np.ix_(reduced.columns, reduced.columns)
+        for i, row in enumerate(reduced.objective):
             began = time.perf_counter()
-            rows = layout.objective[here]
-            found = jax.device_get(_run(generators, rows, self.tolerance, self.max_iterations))
-            solution.seconds[here] = (time.perf_counter() - began) / len(rows)
-            solution.statuses[here] = found.status
-            solution.offsets[here] = given.centers[here] + given.units[here] * found.offset
-            factors = 2 * given.units[here, None] * layout.scale
-            multipliers = factors * found.multipliers[:, : len(layout.scale)]
-            solution.multipliers[here, layout.order] = multipliers
-            for i, moment in zip(range(facets)[here], found.moment, strict=True):
-                if np.isfinite(moment).all():
-                    solution.moments[i] = 0.0
-                    solution.moments[i][used] = moment[-count:, -count:]
+            facet = FacetProgram(reduced.generators, reduced.free, row)
+            found = minimised(facet, self.tolerance, self.max_iterations)
+            solution.seconds[i] = time.perf_counter() - began
+            solution.statuses[i] = found.status
+            solution.offsets[i] = reduced.centers[i] + reduced.units[i] * found.offset
+            # twice: the method's objective is half of `p e' + e p'`
+            multipliers = 2 * reduced.units[i] * found.multipliers / reduced.norms
+            solution.multipliers[i, reduced.kept] = multipliers
+            if np.isfinite(found.moment).all():
+                solution.moments[i] = 0.0
+                solution.moments[i][used] = found.moment
         return solution
-
-    def propose(self, program: Program) -> Solution:
-        """Propose multipliers for every facet; traced where the program is, at its full shape.
-
-        Inside `jax.jit` one multiplier at most may weigh more than two products (an ellipsoid's
-        does); others are left out there. Seconds are NaN.
-        """
-        if is_concrete(program):
-            return super().propose(program)
-        given = trimmed(program)
-        extra = len(program.products.left) - len(program.products.free)
-        layout = arranged(given, program.products, 1 + (extra > 0), int(extra > 1))
-        found = solve_facets(
-            layout.generators, layout.objective, self.tolerance, self.max_iterations
-        )
-        count = len(layout.order)
-        factors = 2 * given.units[:, None] * layout.scale
-        ordered = jnp.where(jnp.isfinite(factors), factors, 0.0) * found.multipliers[:, :count]
-        used = 1 - layout.generators.idle
-        return Solution(
-            offsets=given.centers + given.units * found.offset,
-            multipliers=jnp.zeros_like(ordered).at[:, layout.order].set(ordered),
-            moments=found.moment * used[:, None] * used,
-            statuses=found.status,
-            seconds=jnp.full_like(given.units, jnp.nan),
-        )
 
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
         """Propose the smallest ellipsoid around the successors, and its multipliers.
@@ -119,13 +75,3 @@ class InteriorPoint(AbstractSolver):
         Its central path is followed to its end, on the host (`barrier`).
         """
         return enclosed(program, form)
-
-
-_run = jax.jit(solve_facets)
-
-
-def _batches(facets: int) -> list[slice]:
-    """One facet at a time on a CPU, which compiles once for any number of them; else all."""
-    if jax.default_backend() == "cpu":
-        return [slice(i, i + 1) for i in range(facets)]
-    return [slice(0, facets)]

@@ -18,10 +18,10 @@ import numpy as np
 from reachjax.numerics.host import all_finite
 from reachjax.programs.compact import compact
 from reachjax.programs.lmi import Program, with_successor
-from reachjax.proofs.proposal import Enclosure, SolverStatus
 from reachjax.sets import NormalForm
 from reachjax.solvers.central_path import FROM_AFAR, LARGEST, Centre, path_end, solved
 from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
+from reachjax.solvers.proposals import Enclosure, SolverStatus
 
 WEIGHTS = (1e-6, 1e-7, 1e-8)
 """Barrier weights `mu`, followed downwards. At the last one the logarithm of the volume is off by

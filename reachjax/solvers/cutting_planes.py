@@ -19,11 +19,12 @@ from jaxtyping import Array, Float, Int
 from reachjax.numerics.checks import is_concrete
 from reachjax.programs.lmi import Program
 from reachjax.programs.relaxations import CuttingPlanes, FactLayout, LocalBounds
-from reachjax.proofs.proposal import Solution
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.candidates import NONE, VIOLATED, joint
 from reachjax.solvers.differentiable import enveloped, proved_offsets
+from reachjax.solvers.faults import traced_proposal
+from reachjax.solvers.proposals import Solution
 from reachjax.solvers.rounds import Witness, products_around, solved_in_rounds
 from reachjax.solvers.smoothing import CentralPath
 
@@ -110,7 +111,8 @@ def with_cuts(
 
     def more(number, carry):
         pairs, missing = carry
-        moments = solver.propose(fixed.replace(products=joint(program.products, pairs))).moments
+        given = fixed.replace(products=joint(program.products, pairs))
+        moments = traced_proposal(solver, given).moments
         values = rows @ jnp.where(jnp.isfinite(moments), moments, 0.0) @ rows.T
         violation = jnp.where(missing, -values.min(axis=0), 0.0)
         worst, where = jax.lax.top_k(violation.ravel(), batch)

@@ -11,10 +11,11 @@ from reachjax.numerics.host import all_finite
 from reachjax.programs.compact import CompactProgram, compact
 from reachjax.programs.lmi import Program
 from reachjax.proofs.accepted import ROUNDING
-from reachjax.proofs.proposal import Solution, SolverStatus
 from reachjax.proofs.recheck import interval_offsets, sound_offsets
 from reachjax.solvers.central_path import FROM_AFAR, LARGEST, PRICES, path_end, solved
 from reachjax.solvers.facet_barrier import FacetBarrier
+from reachjax.solvers.proposals import Solution, SolverStatus
+from reachjax.solvers.slopes import Held, held_offsets
 
 SHORT = 1e-6
 """A centre counts as found if its multipliers prove it to this part of the interval's radius."""
@@ -45,6 +46,8 @@ class Centres(NamedTuple):
             proved.
         weights: `(f,)`, `mu`.
         slopes: of the centres; finite where these are.
+        held: `(f, K)` and `(f, n, n)`, multipliers and moments of the Lagrangian whose derivative
+            is that of the offsets elsewhere (`slopes.held_offsets`); NaN for all without numbers.
         solution: the same as a proposal.
     """
 
@@ -52,6 +55,7 @@ class Centres(NamedTuple):
     centres: np.ndarray
     weights: np.ndarray
     slopes: Slopes
+    held: Held
     solution: Solution
 
     @classmethod
@@ -62,7 +66,8 @@ class Centres(NamedTuple):
         vectors, matrices = np.full((facets, count), np.nan), np.full((facets, size, size), np.nan)
         slopes = Slopes(vectors, matrices, vectors.copy(), matrices.copy())
         offsets, centres, weights = np.full((3, facets), np.nan)
-        return cls(offsets, centres, weights, slopes, Solution.blank(facets, count, size))
+        held = vectors.copy(), matrices.copy()
+        return cls(offsets, centres, weights, slopes, held, Solution.blank(facets, count, size))
 
 
 def facet_centres(program: Program, weight: float) -> Centres:
@@ -96,7 +101,8 @@ def _proved(program: Program, reduced: CompactProgram, found: Centres) -> Centre
     multipliers = reduced.units[:, None] * np.where(answered[:, None], slopes.multipliers, 0.0)
     offsets = reduced.centers + reduced.units * found.centres
     by_intervals = interval_offsets(program)
-    proved = np.fmin(sound_offsets(program, multipliers), by_intervals)
+    by_multipliers = sound_offsets(program, multipliers)
+    proved = np.fmin(by_multipliers, by_intervals)
     slack = SHORT * (by_intervals - reduced.centers) + ROUNDING * abs(by_intervals)
     borne_out = proved <= offsets + slack  # False where there is no centre
     statuses = np.where(
@@ -105,6 +111,7 @@ def _proved(program: Program, reduced: CompactProgram, found: Centres) -> Centre
     return found._replace(
         offsets=np.where(borne_out, np.fmax(proved, offsets), proved),
         centres=np.where(borne_out, found.centres, np.nan),
+        held=held_offsets(program, multipliers, by_multipliers < by_intervals),
         solution=solution._replace(
             offsets=offsets,
             multipliers=multipliers,

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from reachjax.proofs.proposal import SolverStatus
 from reachjax.solvers.generators import Generators
 from reachjax.solvers.primal_dual import Point, start, step
+from reachjax.solvers.proposals import SolverStatus
 
 FURTHER = 1e-3
 """Iterates go on to this part of the tolerance, as long as they gain."""

@@ -18,12 +18,12 @@ import numpy as np
 from reachjax.numerics.checks import is_concrete, require_double_precision, whole_number
 from reachjax.programs.lmi import Program
 from reachjax.programs.trimming import trimmed
-from reachjax.proofs.proposal import Enclosure, Solution
 from reachjax.sets import NormalForm
 from reachjax.solvers.arrangement import arranged, cut
 from reachjax.solvers.base import AbstractSolver, require_positive
 from reachjax.solvers.centring import enclosed
 from reachjax.solvers.facets import solve_facets
+from reachjax.solvers.proposals import Enclosure, Solution
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +65,7 @@ class InteriorPoint(AbstractSolver):
             RuntimeError: JAX's 64-bit floats are off.
         """
         require_double_precision()
-        facets, size = program.objective.mid.shape
-        solution = Solution.blank(facets, len(program.products.free), size)
+        facets, solution = len(program.objective.mid), Solution.blank_for(program)
         given = trimmed(program)
         layout = cut(arranged(given, program.products))
         generators, count = jax.device_put(layout.generators), len(layout.columns)

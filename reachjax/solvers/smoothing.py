@@ -25,7 +25,6 @@ from jaxtyping import Array, Float
 from reachjax.numerics.host import on_host, shapes_of
 from reachjax.programs.lmi import Program, lagrangian
 from reachjax.programs.trimming import squared_sizes
-from reachjax.proofs.proposal import Enclosure, Solution
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver, require_positive
 from reachjax.solvers.centring import enclosed
@@ -33,6 +32,7 @@ from reachjax.solvers.cotangents import asked_for
 from reachjax.solvers.facet_centres import Centres, facet_centres
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.primal_dual import DAMPING
+from reachjax.solvers.proposals import Enclosure, Solution
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ class CentralPath(AbstractSolver):
             basis: a number that does not change inside `jax.jit`. The barrier weight is this over
             the number of basis entries and multipliers. From 1e-4 to 1 is sensible: at larger ones
             offsets are looser than interval bounds, at smaller ones some paths are lost (status
-            `INACCURATE`, what is proved, and no derivative).
+            `INACCURATE`, and what is proved with its own derivative).
 
     Programs of more than 1500 multipliers are refused (status `FAILED`, interval bounds).
 
@@ -95,8 +95,8 @@ def smoothed_offsets(program: Program, weight: float) -> tuple[Float[Array, " f"
         weight: as `CentralPath` has it.
 
     Returns:
-        The offsets `(f,)`, and what is proposed (which has no derivative). The derivative is NaN
-        where a centre is not found.
+        The offsets `(f,)`, and what is proposed (which has no derivative). Where a centre is not
+        found the derivative is that of what is proved instead.
     """
     found: Any = _smoothed(weight, program.facts.mid, program.objective.mid, program)
     return found.offsets, found.solution
@@ -118,9 +118,10 @@ def _backward(weight, residual, cotangents):
     program, found = residual
     known = jnp.isfinite(found.centres)
     slopes = jax.tree.map(
-        lambda part: jnp.where(known.reshape(-1, *[1] * (part.ndim - 1)), part, jnp.nan),
+        lambda part: jnp.where(known.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0),
         found.slopes,
     )
+    centres = jnp.where(known, found.centres, 0.0)
 
     def value(facts, objective):
         center, linear = objective[:, -1], objective.at[:, -1].set(0.0)
@@ -137,11 +138,13 @@ def _backward(weight, residual, cotangents):
         together = slopes.multipliers * slopes.multipliers_slope
         slope -= DAMPING * found.weights * (together @ squared_sizes(program.products, facts))
         held = jax.lax.stop_gradient(size)
-        return (
+        centre = (
             center
-            + jnp.where(varies, size * found.centres, 0.0)
+            + jnp.where(varies, size * centres, 0.0)
             + held * (slope - jax.lax.stop_gradient(slope))
         )
+        proved = lagrangian(program.with_midpoints(facts, objective), *found.held)
+        return jnp.where(known, centre, proved)
 
     pull: Any = jax.vjp(value, program.facts.mid, program.objective.mid)[1]
     asked = asked_for((cotangents.slopes, cotangents.solution))

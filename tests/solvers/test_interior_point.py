@@ -13,13 +13,13 @@ from reachjax.programs.compact import compact
 from reachjax.programs.trimming import trimmed
 from reachjax.programs.windows import step_program
 from reachjax.proofs.accepted import accepted_enclosure, accepted_offsets, log_volume
-from reachjax.proofs.proposal import ANSWERS
 from reachjax.proofs.recheck import interval_offsets
 from reachjax.sets import NormalForm
 from reachjax.solvers import barrier, centring, interior_point
 from reachjax.solvers.arrangement import arranged, bucket, cut
 from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 from reachjax.solvers.factorisations import inverse_factor
+from reachjax.solvers.proposals import ANSWERS
 from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import (
     affine_network,

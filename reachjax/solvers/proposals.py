@@ -1,0 +1,117 @@
+"""What a solver gives back: how it ended, and a proposal for facets or for an ellipsoid.
+
+Whatever the status, a solution is only a proposal: bounds come from `recheck`. A solver that fails
+proposes zero multipliers, which prove the interval bound and no more.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from reachjax.programs.lmi import Program
+from reachjax.sets import NormalForm
+
+
+class SolverStatus(enum.IntEnum):
+    """How a solver ended. "Almost solved" is not solved, and "solved" is not proof."""
+
+    SOLVED = 0
+    INACCURATE = 1
+    INFEASIBLE = 2
+    UNBOUNDED = 3
+    LIMIT = 4
+    FAILED = 5
+
+    @property
+    def advice(self) -> str:
+        """One sentence on what this means and what to do."""
+        return _ADVICE[self]
+
+
+ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
+"""The ends after which there is a proposal."""
+
+_ADVICE = {
+    SolverStatus.SOLVED: "solved to the tolerance asked for",
+    SolverStatus.INACCURATE: "the tolerance was not reached: the bound is sound, perhaps loose; "
+    "ask for a looser tolerance or try another solver",
+    SolverStatus.INFEASIBLE: "reported infeasible, which a bounded set rules out: the data are "
+    "badly scaled for this solver; the interval bound was used",
+    SolverStatus.UNBOUNDED: "reported unbounded: the set of states is empty, or a shape was given "
+    "and all successors are one point; the interval bound was used",
+    SolverStatus.LIMIT: "stopped at the limit of iterations or time: the bound is sound, perhaps "
+    "loose; raise the limit",
+    SolverStatus.FAILED: "broke down without an answer: the interval bound was used; "
+    "try another solver or relaxation",
+}
+
+
+class Solution(NamedTuple):
+    """What a solver proposes for the facets of one program; arrays only.
+
+    Attributes:
+        offsets: `(f,)`, its own optimal values, NaN where it has none. Not bounds.
+        multipliers: `(f, K)`, zero where it has none.
+        moments: `(f, n, n)`, the dual matrices over the scaled basis with corner 1, NaN where
+            it has none.
+        statuses: `(f,)`, values of `SolverStatus`.
+        seconds: `(f,)`, wall time of each facet.
+    """
+
+    offsets: Float[Array | np.ndarray, " f"]
+    multipliers: Float[Array | np.ndarray, "f K"]
+    moments: Float[Array | np.ndarray, "f n n"]
+    statuses: Int[Array | np.ndarray, " f"]
+    seconds: Float[Array | np.ndarray, " f"]
+
+    @classmethod
+    def blank(cls, facets: int, multipliers: int, size: int) -> Solution:
+        """No proposal yet: zero multipliers, everything else missing."""
+        return cls(
+            offsets=np.full(facets, np.nan),
+            multipliers=np.zeros((facets, multipliers)),
+            moments=np.full((facets, size, size), np.nan),
+            statuses=np.full(facets, int(SolverStatus.FAILED)),
+            seconds=np.zeros(facets),
+        )
+
+    @classmethod
+    def blank_for(cls, program: Program) -> Solution:
+        """No proposal yet for the facets of a program."""
+        facets, size = program.objective.mid.shape
+        return cls.blank(facets, len(program.products.free), size)
+
+
+class Enclosure(NamedTuple):
+    """What a solver proposes for an ellipsoid around the successors; arrays only.
+
+    Attributes:
+        form: `A (q, q)` and `b (q,)`: it proposes `|A x + b| <= 1`; NaN where it has none.
+        multipliers: `(K,)`, zero where it has none.
+        moments: `(n + q, n + q)`, the dual matrix of the Schur complement over the scaled basis,
+            NaN where it has none.
+        status: a value of `SolverStatus`.
+        seconds: wall time.
+    """
+
+    form: NormalForm
+    multipliers: Float[Array | np.ndarray, " K"]
+    moments: Float[Array | np.ndarray, "n+q n+q"]
+    status: Int[Array | np.ndarray, ""]
+    seconds: Float[Array | np.ndarray, ""]
+
+    @classmethod
+    def blank(cls, program: Program) -> Enclosure:
+        """No proposal yet: zero multipliers, everything else missing."""
+        q, n = program.objective.mid.shape
+        return cls(
+            form=NormalForm(np.full((q, q), np.nan), np.full(q, np.nan)),
+            multipliers=np.zeros(program.products.free.shape[0]),
+            moments=np.full((n + q, n + q), np.nan),
+            status=np.array(int(SolverStatus.FAILED)),
+            seconds=np.array(0.0),
+        )

@@ -55,6 +55,7 @@ from reachjax.training import (
     failures,
     skip_failures,
     specification_penalty,
+    unsolved,
     volume_penalty,
 )
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
@@ -116,6 +117,7 @@ __all__ = [
     "shortfall",
     "skip_failures",
     "specification_penalty",
+    "unsolved",
     "verify",
     "volume",
     "volume_penalty",

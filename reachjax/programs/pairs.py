@@ -58,9 +58,7 @@ class Pairs(NamedTuple):
             shared += self.sharing[:, here] @ crossed
         return (self.sharing @ shared.T) / 2
 
-    def schur(
-        self, X: np.ndarray, W: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def schur(self, X: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`<G_k, X>` and `<G_k, W>` `(K,)`, and `<G_k, X G_l W>` `(K, K)`, for symmetric `X`, `W`.
 
         With the Gram matrices `A = F X F'` and `B = F W F'` of the rows, two pairs `(l, r)` and

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from reachjax.numerics.rounding import gamma
 from reachjax.programs.compact import TINY, CompactProgram, compact
 from reachjax.programs.lmi import Program, form_rows
 from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution
 from reachjax.proofs.recheck import interval_offsets, sound_level, sound_offsets
+from reachjax.proofs.slopes import held_offsets
 from reachjax.sets import NormalForm
 
 SHORTFALL = 1e-3
@@ -20,29 +23,67 @@ ROUNDING = 1e-12
 """What rounding may add to a claim, as a part of its size."""
 
 
-def accepted_offsets(
-    program: Program, solution: Solution
-) -> tuple[Float[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
-    """The rechecked offsets, never below what the relaxation itself gives.
+class Judged(NamedTuple):
+    """What a solver proposed for the facets of a program, and what that proves.
+
+    Attributes:
+        offsets: `(f,)`, proved.
+        optimal: `(f,)`, which of them are the relaxation's optimal values.
+        multipliers: `(f, K)` and
+        moments: `(f, n, n)` of the Lagrangian (`lmi.lagrangian`) whose derivative is the offsets'.
+        solution: what the solver proposed.
+    """
+
+    offsets: Float[Array | np.ndarray, " f"]
+    optimal: Bool[Array | np.ndarray, " f"]
+    multipliers: Float[Array | np.ndarray, "f K"]
+    moments: Float[Array | np.ndarray, "f n n"]
+    solution: Solution
+
+
+def judged(program: Program, solution: Solution) -> Judged:
+    """The rechecked offsets, never below what the relaxation itself gives, and their derivative.
 
     The recheck knows that the basis is bounded, so it may prove less than the program's optimal
     value. Where the solver has that value, the offset stays there: it means what the relaxation's
-    name says, and its derivative is the program's. A claim is that value if the multipliers prove
-    it and the moments attain it. Elsewhere the offset is what is proved, by multipliers or by
-    intervals.
+    name says. A claim is that value if the multipliers prove it and the moments attain it.
+    Elsewhere the offset is what is proved, by multipliers or by intervals.
 
-    Returns:
-        The offsets, and for each whether it is the relaxation's optimal value.
+    The derivative is the program's where multipliers and moments bear the claim out, whatever the
+    solver calls it. Elsewhere it is that of what is proved, multipliers being held (`slopes`).
+
+    Args:
+        program: of finite numbers.
+        solution: of finite multipliers.
     """
     by_intervals = interval_offsets(program)
-    offsets = np.fmin(sound_offsets(program, np.asarray(solution.multipliers)), by_intervals)
+    multipliers = np.asarray(solution.multipliers)
+    by_multipliers = sound_offsets(program, multipliers)
+    offsets = np.fmin(by_multipliers, by_intervals)
     claims = np.asarray(solution.offsets)
-    answered = np.isin(solution.statuses, ANSWERS) & np.isfinite(claims)
     size = by_intervals - np.asarray(program.objective.mid)[:, -1]
     slack = SHORTFALL * size + ROUNDING * (abs(by_intervals) + size)
     proved = offsets <= claims + slack  # False where the claim is NaN
-    optimal = answered & proved & (_attained(program, solution) >= claims - slack)
-    return np.where(optimal, np.fmax(offsets, claims), offsets), optimal
+    borne_out = proved & np.isfinite(claims) & (_attained(program, solution) >= claims - slack)
+    optimal = np.isin(solution.statuses, ANSWERS) & borne_out
+    slope, moments = multipliers.copy(), np.array(solution.moments)
+    held, used = np.flatnonzero(~borne_out), by_multipliers < by_intervals
+    slope[held], moments[held] = held_offsets(program.seeking(held), multipliers[held], used[held])
+    return Judged(
+        offsets=np.where(optimal, np.fmax(offsets, claims), offsets),
+        optimal=optimal,
+        multipliers=slope,
+        moments=moments,
+        solution=solution,
+    )
+
+
+def accepted_offsets(
+    program: Program, solution: Solution
+) -> tuple[Float[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
+    """The rechecked offsets, and for each whether it is the relaxation's optimal value."""
+    found = judged(program, solution)
+    return np.asarray(found.offsets), np.asarray(found.optimal)
 
 
 def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
@@ -90,7 +131,7 @@ def accepted_enclosure(
     optimal = False
     if level <= 1 + SHORTFALL:
         answered = int(enclosure.status) in ANSWERS
-        dual = given is not None and _largest_factor(program, enclosure) <= 1 + SHORTFALL
+        dual = given is not None and largest_factor(program, enclosure) <= 1 + SHORTFALL
         optimal = centred or (answered and (level >= 1 - SHORTFALL or dual))
     if optimal:
         level = max(1.0, level)
@@ -103,7 +144,7 @@ def accepted_enclosure(
     return form, np.array(level), np.array(optimal)
 
 
-def _largest_factor(program: Program, enclosure: Enclosure) -> float:
+def largest_factor(program: Program, enclosure: Enclosure) -> float:
     """What no factor on the proposed `A` and `b` exceeds; infinite if nothing is shown.
 
     With `X` positive semidefinite and `<X, G_k>` of the right signs, `[e e' - G, f V'; f V, I]` is

@@ -4,38 +4,43 @@ from __future__ import annotations
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.lmi import Program
 from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.proposal import Enclosure
 from reachjax.proofs.recheck import sound_level
-from reachjax.sets import Ellipsoid, NormalForm
+from reachjax.sets import NormalForm
 
 
 @pytree
 class EllipsoidCertificate(AbstractCertificate):
-    """Proof of the ellipsoid of one step, `|A x[t] + b| <= 1`: one program, so `f = 1`.
+    """Proof of the ellipsoid of one step, `|A x[t] + b| <= s`: one program, so `f = 1`.
 
-    What is bounded, by 1, is `|A x[t] + b|`.
+    The set holds that ellipsoid; what is bounded, by 1, is `|A x[t] + b| / s`. `A` and `b` are
+    those of the proof: from centre and shape of the set others would follow, in which the same
+    numbers round otherwise.
 
     Attributes:
-        form: `A` and `b` of the set.
+        form: `A` and `b`.
+        level: `s`.
     """
 
     form: NormalForm
+    level: Float[Array | np.ndarray, ""]
 
     @classmethod
     def from_enclosure(
-        cls, program: Program, region: Ellipsoid, enclosure: Enclosure
+        cls, program: Program, form: NormalForm, level: Array, enclosure: Enclosure
     ) -> EllipsoidCertificate:
         """What was proved with what a solver proposed; witnesses are not known yet (NaN)."""
         T, n = program.transform, len(program.transform)
         moments = enclosure.moments[:n, :n] / enclosure.moments[n - 1, n - 1]
         return cls(
             program=program,
-            form=region.normal_form,
+            form=form,
+            level=level,
             multipliers=enclosure.multipliers[None],
             moments=(T @ moments @ T.T)[None],
             codes=enclosure.status[None],
@@ -51,9 +56,9 @@ class EllipsoidCertificate(AbstractCertificate):
     def recheck(
         self, multipliers: Float[np.ndarray, "1 K"] | None = None
     ) -> Float[np.ndarray, " 1"]:
-        """What `|A x + b|` surely does not exceed, by these or other multipliers.
+        """What `|A x + b| / s` surely does not exceed, by these or other multipliers.
 
-        Sound for any multipliers; for the certificate's own it is 1 at most, but for rounding.
+        Sound for any multipliers; for the certificate's own it is 1 at most.
 
         Raises:
             ValueError: the multipliers contain NaN or infinity, or have another shape.
@@ -67,5 +72,5 @@ class EllipsoidCertificate(AbstractCertificate):
             ([[0.25]], [1.0])
         """
         proposed = self._proposed(multipliers)
-        form = jax.device_get(self.form)
-        return np.array([sound_level(jax.device_get(self.program), proposed[0], form)])
+        program, form, level = jax.device_get((self.program, self.form, self.level))
+        return np.array([sound_level(program, proposed[0], form) / level])

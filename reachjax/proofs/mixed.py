@@ -29,11 +29,13 @@ class MixedCertificate(AbstractCertificate):
 
     Attributes:
         solver_offsets: `(m,)`, what the solver itself claimed for the facets; not bounds.
-        form: `A` and `b` of the ellipsoid `|A x[t] + b| <= 1`.
+        form: `A` and `b` of the ellipsoid `|A x[t] + b| <= s`.
+        level: `s`.
     """
 
     solver_offsets: Float[Array | np.ndarray, " m"]
     form: NormalForm
+    level: Float[Array | np.ndarray, ""]
 
     @classmethod
     def joining(
@@ -53,7 +55,13 @@ class MixedCertificate(AbstractCertificate):
             name: jnp.concatenate([getattr(facets, name), getattr(ellipsoid, name)])
             for name in STACKED
         }
-        return cls(program, **stacked, solver_offsets=facets.solver_offsets, form=ellipsoid.form)
+        return cls(
+            program,
+            **stacked,
+            solver_offsets=facets.solver_offsets,
+            form=ellipsoid.form,
+            level=ellipsoid.level,
+        )
 
     @property
     def parts(self) -> tuple[Certificate, EllipsoidCertificate]:
@@ -68,7 +76,7 @@ class MixedCertificate(AbstractCertificate):
         )
         return (
             Certificate(**first, solver_offsets=self.solver_offsets),
-            EllipsoidCertificate(**second, form=self.form),
+            EllipsoidCertificate(**second, form=self.form, level=self.level),
         )
 
     def __repr__(self) -> str:
@@ -78,7 +86,7 @@ class MixedCertificate(AbstractCertificate):
     def recheck(
         self, multipliers: Float[np.ndarray, "m+1 K"] | None = None
     ) -> Float[np.ndarray, " m+1"]:
-        """Prove the offsets, and what `|A x + b|` does not exceed, as the parts' proofs do.
+        """Prove the offsets, and what `|A x + b| / s` does not exceed, as the parts' proofs do.
 
         Sound for any multipliers.
 

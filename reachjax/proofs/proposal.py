@@ -1,4 +1,4 @@
-"""What a solver proposes: multipliers, moments and a status; nothing of it is trusted.
+"""What a solver gives back: how it ended, and a proposal for facets or for an ellipsoid.
 
 Whatever the status, a solution is only a proposal: bounds come from `recheck`. A solver that fails
 proposes zero multipliers, which prove the interval bound and no more.
@@ -34,7 +34,6 @@ class SolverStatus(enum.IntEnum):
 
 ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
 """The ends after which there is a proposal."""
-
 
 _ADVICE = {
     SolverStatus.SOLVED: "solved to the tolerance asked for",
@@ -79,6 +78,12 @@ class Solution(NamedTuple):
             statuses=np.full(facets, int(SolverStatus.FAILED)),
             seconds=np.zeros(facets),
         )
+
+    @classmethod
+    def blank_for(cls, program: Program) -> Solution:
+        """No proposal yet for the facets of a program."""
+        facets, size = program.objective.mid.shape
+        return cls.blank(facets, len(program.products.free), size)
 
 
 class Enclosure(NamedTuple):

@@ -51,7 +51,7 @@ def sound_offsets(program: Program, multipliers: np.ndarray) -> np.ndarray:
         by_intervals = interval_offsets(program)
         return np.array(
             [
-                _proved(program, multipliers[i], _bordered(p.mid[i], p.rad[i]), by_intervals[i])
+                _proved(program, multipliers[i], bordered(p.mid[i], p.rad[i]), by_intervals[i])
                 for i in range(facets)
             ]
         )
@@ -83,26 +83,31 @@ def sound_level(program: Program, multipliers: np.ndarray, form: NormalForm) -> 
         )
     with np.errstate(over="ignore", invalid="ignore"):
         V = form_rows(program, form)
-        q, n = V.mid.shape
-        largest = (abs(V.mid).sum(axis=1) + V.rad.sum(axis=1)) * (1 + gamma(n))
-        by_intervals = float(np.sum(largest**2)) * (1 + gamma(q)) / 2
-        # |V|^2 = xi' V' V xi, of which the recheck bounds the half
-        size, squares = abs(V.mid), V.mid.T @ V.mid
-        error = gamma(q + 4) * (size.T @ size) + V.rad.T @ (size + V.rad) + size.T @ V.rad
-        half = _proved(program, multipliers, Ball(squares, error * (1 + gamma(8))), by_intervals)
+        by_intervals = half_square_by_intervals(V)
+        half = _proved(program, multipliers, squared(V), by_intervals)
     return float(np.sqrt(max(2 * np.fmin(half, by_intervals), 0.0)) * (1 + gamma(4)))
+
+
+def half_square_by_intervals(V: Ball) -> float:
+    """What `|V eta|^2 / 2` does not exceed, by interval arithmetic alone."""
+    q, n = V.mid.shape
+    largest = (abs(V.mid).sum(axis=1) + V.rad.sum(axis=1)) * (1 + gamma(n))
+    return float(np.sum(largest**2)) * (1 + gamma(q)) / 2
+
+
+def squared(V: Ball) -> Ball:
+    """`V' V`: `|V eta|^2 = eta' V' V eta`, of which the recheck bounds the half."""
+    size, squares = abs(V.mid), V.mid.T @ V.mid
+    error = gamma(len(V.mid) + 4) * (size.T @ size) + V.rad.T @ (size + V.rad) + size.T @ V.rad
+    return Ball(squares, error * (1 + gamma(8)))
 
 
 def _proved(program: Program, multipliers: np.ndarray, goal: Ball, by_intervals: float) -> float:
     """The smallest `b` shown for `F' Gamma F + goal - 2 b e e'`: see this module's docstring."""
-    signed = np.where(program.products.free, multipliers, np.maximum(multipliers, 0.0))
-    used = np.ix_(program.used, program.used)
-    products = weighted_products(program, signed)
-    mid = (products.mid + goal.mid)[used]
-    rad = ((products.rad + goal.rad)[used] + gamma(4) * abs(mid)) * (1 + gamma(4))
+    mid, rad = matrix(program, multipliers, goal)
     if not (np.isfinite(mid).all() and np.isfinite(rad).all()):
         return float(by_intervals)
-    offset, shift = _best_offset(mid)
+    offset, shift = best_offset(mid)
     error = float(rad.sum(axis=1).max()) * (1 + gamma(len(mid)))  # spectral norm <= row sums
     slack = _proved_slack(mid, offset, shift)
     n = len(mid)
@@ -111,13 +116,44 @@ def _proved(program: Program, multipliers: np.ndarray, goal: Ball, by_intervals:
     return proved if np.isfinite(proved) else float(by_intervals)
 
 
-def _bordered(mid: np.ndarray, rad: np.ndarray) -> Ball:
+def matrix(program: Program, multipliers: np.ndarray, goal: Ball) -> tuple[np.ndarray, np.ndarray]:
+    """`F' Gamma F + goal` over the columns used, and a bound of its rounding errors.
+
+    Products without weight are left out, which add nothing but to the bound of rounding: so it does
+    not matter to what is proved which others a program has.
+    """
+    signed = clipped(program, multipliers)
+    used = np.ix_(program.used, program.used)
+    products = weighted_products(_weighing(program, signed), signed)
+    mid = (products.mid + goal.mid)[used]
+    return mid, ((products.rad + goal.rad)[used] + gamma(4) * abs(mid)) * (1 + gamma(4))
+
+
+def clipped(program: Program, multipliers: np.ndarray) -> np.ndarray:
+    """The multipliers as they count: negative ones are zero where the sign matters."""
+    return np.where(program.products.free, multipliers, np.maximum(multipliers, 0.0))
+
+
+def _weighing(program: Program, multipliers: np.ndarray) -> Program:
+    """The program with those pairs of facts alone that have a weight."""
+    products = program.products
+    there = np.asarray(multipliers)[products.multiplier] != 0
+    left, right, sign, owner = (
+        np.asarray(part)[there]
+        for part in (products.left, products.right, products.sign, products.multiplier)
+    )
+    return program.replace(
+        products=products.replace(left=left, right=right, sign=sign, multiplier=owner)
+    )
+
+
+def bordered(mid: np.ndarray, rad: np.ndarray) -> Ball:
     """`p e' + e p'`."""
     last = np.eye(len(mid))[-1]
     return Ball(*(np.outer(part, last) + np.outer(last, part) for part in (mid, rad)))
 
 
-def _best_offset(matrix: np.ndarray) -> tuple[float, float]:
+def best_offset(matrix: np.ndarray) -> tuple[float, float]:
     """The offset `b` and the shift `eps` that minimise the bound of this module's docstring.
 
     Its derivative in `eps` is `(n - 1 - |(eps I - N)^-1 v|^2) / 2`, which grows with `eps`.

@@ -3,9 +3,8 @@
 All are optimal values of linear programs, or volumes, found in numpy on the host together with
 their slopes: hold the multipliers `y` and the optimal point `x` fixed and differentiate the
 Lagrangian (the envelope theorem). Where a maximum is attained at more than one point, the slope is
-one of several generalised gradients; only the bounding box and the ranges of rows say NaN to the
-derivative in a facet's normal there, because they are among many ingredients of a step, and
-generalised gradients of ingredients do not add up to one of the whole.
+one of several generalised gradients: of a box's facet with respect to its normal, say, that at one
+of the facet's corners.
 
 A set that is empty, unbounded or too thin raises an error on plain arrays. Inside `jax.jit`, where
 it may come from weights that went astray in training, its values and slopes are NaN.
@@ -61,8 +60,8 @@ def support(X: AbstractSet, directions: Float[Array, "m n"]) -> Float[Array, " m
 def row_ranges(
     X: Polytope, rows: Float[Array, "m n"]
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Least and largest values of rows, rounded outward; derivatives as of the bounding box."""
-    ends = _values(_ends, 2 * len(rows), X.A, X.b, jnp.concatenate([-rows, rows]))
+    """Least and largest values of rows, rounded outward; differentiable, also inside `jax.jit`."""
+    ends = _values(_support, 2 * len(rows), X.A, X.b, jnp.concatenate([-rows, rows]))
     return -ends[: len(rows)], jnp.maximum(-ends[: len(rows)], ends[len(rows) :])
 
 
@@ -124,19 +123,7 @@ _linearised.defvjp(_forward, _backward)
 
 def _box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, Slopes]:
     lower, upper, Y, points = polyhedra.bounding_box_and_multipliers(A, b)
-    return np.concatenate([-lower, upper]), (_at_vertices(Y, points), Y)
-
-
-def _ends(A: np.ndarray, b: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, Slopes]:
-    values, Y, points = polyhedra.support_and_multipliers(A, b, D)
-    return values, (_at_vertices(Y, points), Y, _own(points))
-
-
-def _at_vertices(Y: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Derivatives of maxima in the normals; NaN where a whole face attains one."""
-    a_vertex = (Y > 0).sum(axis=1, keepdims=True) >= points.shape[1]
-    weights = np.where(a_vertex | (Y == 0), Y, np.nan)
-    return -weights[:, :, None] * points[:, None, :]
+    return np.concatenate([-lower, upper]), (-Y[:, :, None] * points[:, None, :], Y)
 
 
 def _support(A: np.ndarray, b: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, Slopes]:

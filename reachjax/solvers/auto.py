@@ -10,6 +10,7 @@ from reachjax.programs.lmi import Program
 from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
+from reachjax.solvers.faults import proposed_enclosure
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import Clarabel
 
@@ -75,10 +76,10 @@ class Auto(AbstractSolver):
             first, second, enough = self.large, self.small, (SolverStatus.SOLVED,)
         else:  # an inaccurate ellipsoid is centred anyhow
             first, second, enough = self.small, self.large, ANSWERS
-        found = first.enclose(program, form)
+        found = proposed_enclosure(first, program, form)
         if found.status in enough:
             return found
-        other = second.enclose(program, form)
+        other = proposed_enclosure(second, program, form)
         return other if other.status in ANSWERS else found
 
 

@@ -1,4 +1,4 @@
-"""What a solver is: it takes a program and proposes multipliers."""
+"""What a solver is: from a program to a proposal."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import dataclasses
 import numbers
 from typing import Any
 
-from reachjax.numerics.host import all_finite, on_host, shapes_of
 from reachjax.programs.lmi import Program
 from reachjax.proofs.proposal import Enclosure, Solution
 from reachjax.sets import NormalForm
+from reachjax.solvers.faults import UnsupportedError
 
 
 def require_positive(solver: Any) -> None:
@@ -30,25 +30,15 @@ def require_positive(solver: Any) -> None:
 
 
 class AbstractSolver(abc.ABC):
-    """Solves the programs of one step. Hashable and immutable: its options are its fields."""
+    """Solves the programs of one step. Hashable and immutable: its options are its fields.
+
+    `solve` is all that one needs; nothing that it does breaks a bound. An exception, or an answer
+    that is no `Solution` of the right shapes, is a failed proposal and gives a warning.
+    """
 
     @abc.abstractmethod
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet of a program whose leaves are numpy arrays."""
-
-    def propose(self, program: Program) -> Solution:
-        """Propose multipliers for every facet of a program of JAX arrays, traced ones too.
-
-        The solver is called on the host, where no JAX call may be made. A program that holds NaN
-        or infinity gets a blank proposal.
-        """
-        facets, size = program.objective.mid.shape
-        blank = Solution.blank(facets, len(program.products.free), size)
-
-        def solve(program: Program) -> Solution:
-            return self.solve(program) if all_finite(program) else blank
-
-        return on_host(solve, shapes_of(blank), program)
 
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
         """Propose the smallest ellipsoid around the successors, and its multipliers.
@@ -60,4 +50,4 @@ class AbstractSolver(abc.ABC):
         Raises:
             NotImplementedError: this solver does not know ellipsoids.
         """
-        raise NotImplementedError(f"{type(self).__name__} solves for facets, not for ellipsoids")
+        raise UnsupportedError(f"{type(self).__name__} solves for facets, not for ellipsoids")

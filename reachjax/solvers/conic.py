@@ -17,6 +17,7 @@ from reachjax.programs.lmi import Program
 from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
+from reachjax.solvers.faults import UnknownOptionError, UnknownSolverError
 from reachjax.solvers.models import EllipsoidModel, FacetModel
 
 RESCALINGS = (1.0, 8.0, 0.125, 64.0, 1.0)
@@ -73,8 +74,7 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
         _require_installed(name)
         reduced = compact(program)
         model = FacetModel(reduced)
-        facets, size = program.objective.mid.shape
-        solution = Solution.blank(facets, len(program.products.free), size)
+        solution = Solution.blank_for(program)
         for i, (row, center, unit) in enumerate(
             zip(reduced.objective, reduced.centers, reduced.units, strict=True)
         ):
@@ -143,7 +143,7 @@ def _installed() -> list[str]:
 
 def _require_installed(name: str) -> None:
     if name not in _installed():
-        raise ValueError(
+        raise UnknownSolverError(
             f"the solver {name!r} is not among those that cvxpy finds here: "
             f"{', '.join(_installed())}"
         )
@@ -161,10 +161,12 @@ def _run(problem: Any, name: str, options: dict) -> SolverStatus:
             problem.solve(solver=name, **options)
         except cp.SolverError as error:
             if "cannot solve" in str(error):  # not "failed": it takes no such cones
-                raise ValueError(
+                raise UnknownSolverError(
                     f"the solver {name!r} cannot solve semidefinite programs"
                 ) from None
             return SolverStatus.FAILED
+        except TypeError as error:
+            raise UnknownOptionError(str(error)) from error
         except Exception:
             raise
         except BaseException as error:  # a panic of compiled code is no Exception

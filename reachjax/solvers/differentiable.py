@@ -6,10 +6,13 @@ moments fixed and differentiate the Lagrangian,
     d b = <X / 2, d(F' Gamma F + p e' + e p')>,
 
 with `X` the dual moment matrix; ordinary automatic differentiation carries it on through rows,
-bounds and earlier steps. What the recheck adds to an offset is not differentiated. The derivative
-is NaN unless the solver reports `SOLVED` with an optimal value that its multipliers prove and its
-moments attain, so that no number of a failed solve reaches an optimiser. What a solver proposes
-(multipliers, moments, its own offsets) has no derivative: asking for one gives NaN.
+bounds and earlier steps. What the recheck adds to an optimal value is not differentiated.
+
+**Without an optimum.** The derivative is that of the bound that is reported, whatever the status:
+where multipliers and moments do not bear out an optimal value, of what the multipliers prove, these
+being held, and where they prove nothing of use, of the interval bound (`slopes`). It is NaN where
+there is no bound at all. What a solver proposes (multipliers, moments, its own offsets) has no
+derivative: asking for one gives NaN.
 
 **Accuracy.** The derivative is as good as the solver: with the default solvers, which go on to
 1e-9, the tests hold it to 1e-3 of fourth-order differences, over one step and over five. At 1e-6
@@ -25,33 +28,21 @@ forward mode do not exist; JAX raises an error.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from reachjax.numerics.host import all_finite, on_host
+from reachjax.numerics.host import all_finite, on_host, shapes_of
 from reachjax.programs.lmi import Program, lagrangian
-from reachjax.proofs.accepted import accepted_offsets
-from reachjax.proofs.proposal import Solution, SolverStatus
+from reachjax.proofs.accepted import Judged, judged
+from reachjax.proofs.proposal import Solution
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.cotangents import asked_for
-
-
-class Judged(NamedTuple):
-    """What a solver proposed for the facets of a program, and what that proves.
-
-    Attributes:
-        offsets: `(f,)`, proved.
-        optimal: `(f,)`, which of them are the relaxation's optimal values.
-        solution: what the solver proposed.
-    """
-
-    offsets: Float[Array | np.ndarray, " f"]
-    optimal: Bool[Array | np.ndarray, " f"]
-    solution: Solution
+from reachjax.solvers.faults import proposed
 
 
 def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Array, " f"], Solution]:
@@ -61,11 +52,8 @@ def proved_offsets(program: Program, solver: AbstractSolver) -> tuple[Float[Arra
         The proved offsets `(f,)`, and what the solver proposed (which has no derivative).
     """
     fixed = jax.lax.stop_gradient(program)
-    solution = solver.propose(fixed)
-    offsets = jax.ShapeDtypeStruct(solution.offsets.shape, float)
-    optimal = jax.ShapeDtypeStruct(solution.offsets.shape, bool)
-    proved, optimal = on_host(_judged, (offsets, optimal), (fixed, solution))
-    return enveloped(program, Judged(proved, optimal, solution))
+    shapes = shapes_of(_unknown(Solution.blank_for(fixed)))
+    return enveloped(program, on_host(partial(_solved, solver), shapes, fixed))
 
 
 def enveloped(program: Program, judged: Judged) -> tuple[Float[Array, " f"], Solution]:
@@ -86,10 +74,7 @@ def _enveloped(facts, objective, program, judged) -> tuple[Array, Solution]:
 def _forward(facts, objective, program, judged):
     # not `judged` itself: multipliers change with the program, so a second derivative has to fail
     result: Any = _enveloped(facts, objective, program, judged)
-    _, solution = result
-    trusted = judged.optimal & (solution.statuses == SolverStatus.SOLVED)
-    moments = jnp.where(trusted[:, None, None], solution.moments, jnp.nan)
-    return result, (program, solution.multipliers, moments)
+    return result, (program, judged.multipliers, judged.moments)
 
 
 def _backward(residual, cotangents):
@@ -106,10 +91,20 @@ def _backward(residual, cotangents):
 _enveloped.defvjp(_forward, _backward)
 
 
-def _judged(argument: tuple[Program, Solution]) -> tuple[np.ndarray, np.ndarray]:
-    """The offsets that a proposal proves, and which of them are optimal; NaN without numbers."""
-    program, solution = argument
-    if all_finite(program):
-        return accepted_offsets(program, solution)
-    facets = len(solution.offsets)
-    return np.full(facets, np.nan), np.zeros(facets, dtype=bool)
+def _solved(solver: AbstractSolver, program: Program) -> Judged:
+    """What is proposed and proved on the host; of a program without numbers nothing."""
+    if not all_finite(program):
+        return _unknown(Solution.blank_for(program))
+    return judged(program, proposed(solver, program))
+
+
+def _unknown(solution: Solution) -> Judged:
+    """Nothing is proved: NaN."""
+    unknown = np.full(len(solution.offsets), np.nan)
+    return Judged(
+        offsets=unknown,
+        optimal=np.zeros(len(unknown), dtype=bool),
+        multipliers=np.full(solution.multipliers.shape, np.nan),
+        moments=np.full(solution.moments.shape, np.nan),
+        solution=solution,
+    )

@@ -6,8 +6,12 @@ gives the derivative, as for offsets.
 **Any shape.** The ellipsoid is an optimal *point*. What is reported is the point on the central
 path nearby, at a small barrier weight, and its derivative (see `centring`).
 
-In both cases the derivative is NaN where the solver has no optimum that its multipliers bear out,
-and what the recheck adds to an ellipsoid is not differentiated.
+What the recheck adds to an optimum is not differentiated.
+
+**Without an optimum.** Where there is none that the numbers bear out, or the path is not found, the
+derivative is that of what is reported all the same: the level that the multipliers, or intervals,
+prove for the form, which itself moves with the box around the successors (`slopes`). It is NaN
+where there is no bound at all.
 """
 
 from __future__ import annotations
@@ -23,37 +27,41 @@ from jaxtyping import Array
 from reachjax.numerics.host import all_finite, on_host, shapes_of
 from reachjax.programs.compact import compact
 from reachjax.programs.lmi import Program, form_rows, schur_lagrangian, with_successor
-from reachjax.proofs.accepted import accepted_enclosure, log_volume
+from reachjax.proofs.accepted import SHORTFALL, accepted_enclosure, largest_factor, log_volume
 from reachjax.proofs.proposal import ANSWERS, Enclosure, SolverStatus
-from reachjax.sets import Ellipsoid, NormalForm
+from reachjax.proofs.slopes import held_level
+from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.centring import Sensitivity, centred, sensitivity
 from reachjax.solvers.cotangents import asked_for
+from reachjax.solvers.faults import proposed_enclosure
 
 ATTEMPTS = 3
 """How often a program is solved, each time in better coordinates."""
 
 
-def proved_ellipsoid(program: Program, solver: AbstractSolver) -> tuple[Ellipsoid, Enclosure]:
+Proved = tuple[NormalForm, Array, Enclosure]
+"""`A` and `b`, the level `s` of what is proved, `|A x + b| <= s`, and what the solver proposed,
+which has no derivative and whose multipliers prove the level."""
+
+
+def proved_ellipsoid(program: Program, solver: AbstractSolver) -> Proved:
     """The minimum-volume ellipsoid of a program, differentiable in the program's rows.
 
     Args:
         program: whose objective rows are the successor's.
         solver: what solves it.
-
-    Returns:
-        The ellipsoid, and what the solver proposed (which has no derivative).
     """
     result: Any = _ellipsoid(solver, program.facts.mid, program.objective.mid, program)
     form, level, _, enclosure, _ = result
-    return _reported(form, level, enclosure)
+    return *_sized(form, level), enclosure
 
 
-def _reported(form: NormalForm, level: Array, enclosure: Enclosure) -> tuple[Ellipsoid, Enclosure]:
-    """The ellipsoid that was proved, and multipliers that prove it (the proof is homogeneous)."""
-    level = jax.lax.stop_gradient(level)
-    proof = enclosure._replace(multipliers=enclosure.multipliers / level**2)
-    return Ellipsoid.enclosing(form, level), proof
+def _sized(form: NormalForm, level: Array) -> tuple[NormalForm, Array]:
+    """The same, of which the form alone has a derivative: it takes on that of the level."""
+    held = jax.lax.stop_gradient(level)
+    moving = held / level  # 1
+    return NormalForm(moving * form.A, moving * form.b), held
 
 
 def _enclose(
@@ -89,7 +97,7 @@ def _enclose(
 
 def _proposed(solver: AbstractSolver, program: Program) -> tuple[Enclosure, bool]:
     """The solver's ellipsoid, moved to the central path, and whether that was reached."""
-    enclosure = solver.enclose(program)
+    enclosure = proposed_enclosure(solver, program)
     if int(enclosure.status) not in ANSWERS:
         return enclosure, False
     found = centred(program, np.asarray(enclosure.multipliers), enclosure.form)
@@ -107,12 +115,12 @@ def _fit(
     if not all_finite(argument):
         unknown = np.array(np.nan)
         return unknown, unknown, np.array(False), Enclosure.blank(program)
-    enclosure = solver.enclose(program, given)
+    enclosure = proposed_enclosure(solver, program, given)
     factor = np.sum(enclosure.form.A * given.A) / np.sum(given.A**2)
     proposed = NormalForm(factor * given.A, factor * given.b)
     enclosure = enclosure._replace(form=proposed)
     form, level, optimal = accepted_enclosure(program, enclosure, given)
-    optimal &= enclosure.status == SolverStatus.SOLVED
+    optimal &= largest_factor(program, enclosure) <= 1 + SHORTFALL  # the moments are of use
     return np.where(form is proposed, factor, 1.0), level, optimal, enclosure
 
 
@@ -137,43 +145,72 @@ def _ellipsoid_forward(solver, facts, objective, program):
 
 def _ellipsoid_backward(solver, residual, cotangents):
     program, form, optimal, multipliers, frame = residual
-    trusted = optimal & ~asked_for(cotangents[3])
-    multipliers = jnp.where(trusted, multipliers, jnp.nan)  # nothing is sought for these
+    sought = jnp.where(optimal, multipliers, jnp.nan)  # nothing is sought for these
     shapes = shapes_of(Sensitivity.unknown(program))
-    arguments = (program, multipliers, form, cotangents[0], frame)
-    held: Any = on_host(lambda given: sensitivity(*given), shapes, arguments)
+    arguments = (program, sought, form, cotangents[0], frame)
+    path: Any = on_host(lambda given: sensitivity(*given), shapes, arguments)
+    held: Any = _held_level(program, multipliers, form)
 
-    def value(facts, objective):
+    def on_path(facts, objective):
         rows = program.with_midpoints(facts, objective)
-        at_centre = schur_lagrangian(rows, held.multipliers, held.form, held.moments)
+        at_centre = schur_lagrangian(rows, path.multipliers, path.form, path.moments)
         return at_centre - schur_lagrangian(
-            rows, held.multipliers_slope, held.form_slope, held.moments_slope
+            rows, path.multipliers_slope, path.form_slope, path.moments_slope
         )
 
-    slopes = jax.grad(value, (0, 1))(program.facts.mid, program.objective.mid)
-    return *(jnp.where(trusted, slope, jnp.nan) for slope in slopes), None
+    def with_box(facts, objective):
+        rows, moved = program.with_midpoints(facts, objective), _with_box(form, program, objective)
+        level = cotangents[1] * schur_lagrangian(rows, held[0], moved, held[1])
+        return level + jnp.sum(cotangents[0].A * moved.A) + jnp.sum(cotangents[0].b * moved.b)
+
+    first, other = (
+        jax.grad(value, (0, 1))(program.facts.mid, program.objective.mid)
+        for value in (on_path, with_box)
+    )
+    found = jnp.array([jnp.isfinite(slope).all() for slope in first]).all()
+    asked = asked_for(cotangents[3])
+    slopes = (jnp.where(found, *pair) for pair in zip(first, other, strict=True))
+    return *(jnp.where(asked, jnp.nan, slope) for slope in slopes), None
+
+
+def _held_level(program: Program, multipliers: Array, form: NormalForm) -> Any:
+    """Multipliers and moments of the Lagrangian whose derivative is the level's, these held."""
+
+    def found(given):
+        return held_level(*given) if all_finite(given) else (blank.multipliers, blank.moments)
+
+    blank = Enclosure.blank(program)
+    blank = blank._replace(multipliers=blank.multipliers * np.nan)
+    shapes = shapes_of((blank.multipliers, blank.moments))
+    return on_host(found, shapes, (program, multipliers, form))
+
+
+def _with_box(form: NormalForm, program: Program, objective: Array) -> NormalForm:
+    """The form, moving with the centre and the widths of the box around the successors."""
+    width = abs(program.objective.mid[:, :-1]).sum(axis=1)
+    varies = width > 0
+    size = jnp.where(varies, width, 1.0)
+    now = jnp.sum(jnp.where(varies[:, None], abs(objective[:, :-1]), 0.0), axis=1)
+    A = form.A * (size / jnp.where(varies, now, 1.0))
+    center = program.objective.mid[:, -1]
+    return NormalForm(A, form.b + form.A @ center - A @ objective[:, -1])
 
 
 _ellipsoid.defvjp(_ellipsoid_forward, _ellipsoid_backward)
 
 
-def proved_size(
-    program: Program, given: NormalForm, solver: AbstractSolver
-) -> tuple[Ellipsoid, Enclosure]:
+def proved_size(program: Program, given: NormalForm, solver: AbstractSolver) -> Proved:
     """The smallest ellipsoid of a given centre and shape, differentiable in rows and shape.
 
     Args:
         program: whose objective rows are the successor's.
         given: the ellipsoid up to a factor on `A` and `b`.
         solver: what solves it.
-
-    Returns:
-        The ellipsoid, and what the solver proposed (which has no derivative).
     """
     result: Any = _size(solver, program.facts.mid, program.objective.mid, given, program)
     factor, level, _, enclosure = result
     scaled = NormalForm(factor * given.A, factor * given.b)
-    return _reported(scaled, level, enclosure)
+    return *_sized(scaled, level), enclosure
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -190,20 +227,28 @@ def _size_forward(solver, facts, objective, given, program):
 
 def _size_backward(solver, residual, cotangents):
     program, given, factor, optimal, enclosure = residual
-    trusted = optimal & ~asked_for(cotangents[3])
-    n = len(program.transform)
-    moments = enclosure.moments
+    n, moments = len(program.transform), enclosure.moments
+    scaled = NormalForm(factor * given.A, factor * given.b)
+    held: Any = _held_level(program, enclosure.multipliers, scaled)
     # stationarity in the factor gives the dual its scale, whatever the solver's objective was
     unit = -2 * jnp.sum(moments[n:, :n] * form_rows(program, given).mid)
+    factors = (enclosure.multipliers, jnp.where(optimal, moments, 0.0))
 
-    def value(facts, objective, given):
+    def value(facts, objective, given, multipliers, moments):
         scaled = NormalForm(factor * given.A, factor * given.b)
         rows = program.with_midpoints(facts, objective)
-        return schur_lagrangian(rows, enclosure.multipliers, scaled, moments) / unit
+        return schur_lagrangian(rows, multipliers, scaled, moments)
 
-    slopes = jax.grad(value, (0, 1, 2))(program.facts.mid, program.objective.mid, given)
-    weight = jnp.where(trusted, cotangents[0], jnp.nan)
-    return *jax.tree.map(lambda slope: weight * slope, slopes), None
+    slopes = jax.grad(value, (0, 1, 2))
+    place = program.facts.mid, program.objective.mid, given
+    optima, others = slopes(*place, *factors), slopes(*place, *held)
+    asked = asked_for(cotangents[3])
+
+    def weighed(optimum, other):
+        slope = jnp.where(optimal, cotangents[0] / unit * optimum, cotangents[1] * other)
+        return jnp.where(asked, jnp.nan, slope)
+
+    return *jax.tree.map(weighed, optima, others), None
 
 
 _size.defvjp(_size_forward, _size_backward)

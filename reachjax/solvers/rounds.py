@@ -15,13 +15,13 @@ from jaxtyping import Bool, Float, Int
 
 from reachjax.programs.lmi import Program
 from reachjax.programs.relaxations import CuttingPlanes, FactLayout, Products
-from reachjax.proofs.accepted import accepted_offsets
+from reachjax.proofs.accepted import Judged, judged
 from reachjax.proofs.proposal import Solution, SolverStatus
 from reachjax.proofs.recheck import interval_offsets, sound_offsets
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.candidates import NONE, Candidates, joint
-from reachjax.solvers.differentiable import Judged
+from reachjax.solvers.faults import proposed, proposed_enclosure
 
 IDLE = 1e-7
 """Multipliers below this part of the largest are at zero."""
@@ -94,7 +94,7 @@ def products_around(
 
     def solve(pairs: np.ndarray) -> _Round:
         given = program.replace(products=joint(candidates.core, pairs))
-        enclosure = solver.enclose(given, form)
+        enclosure = proposed_enclosure(solver, given, form)
         moments = np.asarray(enclosure.moments)
         moment = moments[:n, :n] / moments[n - 1, n - 1]
         return _Round(moment, _idle(np.asarray(enclosure.multipliers), len(pairs)), False)
@@ -120,14 +120,23 @@ class _Result(NamedTuple):
     """One facet's best round: the products added, and what was proved with them."""
 
     pairs: Int[np.ndarray, "p 2"]
-    offset: float
-    optimal: bool
-    solution: Solution
+    judged: Judged
 
     @property
-    def differentiable(self) -> bool:
+    def solution(self) -> Solution:
+        """What the solver proposed."""
+        return self.judged.solution
+
+    @property
+    def offset(self) -> float:
+        """What is proved."""
+        return float(self.judged.offsets[0])
+
+    @property
+    def is_optimal(self) -> bool:
         """Whether the offset is the solver's optimum, to its tolerance."""
-        return self.optimal and int(self.solution.statuses[0]) == SolverStatus.SOLVED
+        solved = int(self.solution.statuses[0]) == SolverStatus.SOLVED
+        return solved and bool(self.judged.optimal[0])
 
     @property
     def of_use(self) -> Int[np.ndarray, "q 2"]:
@@ -186,9 +195,8 @@ def _facet(
 
     def solve(pairs: np.ndarray) -> _Round:
         given = program.replace(products=joint(candidates.core, pairs))
-        solution = solver.solve(given)
-        (offset,), (optimal,) = accepted_offsets(given, solution)
-        results.append(_Result(pairs, float(offset), bool(optimal), solution))
+        solution = proposed(solver, given)
+        results.append(_Result(pairs, judged(given, solution)))
         moment = np.asarray(solution.moments[0])
         idle = _idle(np.asarray(solution.multipliers[0]), len(pairs))
         if attained is None:
@@ -200,9 +208,10 @@ def _facet(
     _in_rounds(candidates, cuts, pairs, solve)
     least = min(result.offset for result in results)
     near = [result for result in results if result.offset <= least + NEAR * size]
-    best = max(near, key=lambda result: result.differentiable)  # the first that is, if any is
+    best = max(near, key=lambda result: result.is_optimal)  # the first that is, if any is
     seconds = np.sum([result.solution.seconds for result in results], axis=0)
-    return best._replace(solution=best.solution._replace(seconds=seconds))
+    spent = best.judged._replace(solution=best.solution._replace(seconds=seconds))
+    return best._replace(judged=spent)
 
 
 def _joined(program: Program, candidates: Candidates, found: list[_Result]) -> Rounds:
@@ -212,17 +221,23 @@ def _joined(program: Program, candidates: Candidates, found: list[_Result]) -> R
     products, core = joint(candidates.core, pairs), len(candidates.core.free)
     size = len(program.transform)
     solution = Solution.blank(len(found), len(products.free), size)
+    held = np.zeros_like(solution.multipliers)
     for i, result in enumerate(found):
         mine = result.solution
         places = np.array([number[tuple(pair)] for pair in result.pairs], dtype=int)
-        solution.multipliers[i, :core] = mine.multipliers[0, :core]
-        solution.multipliers[i, core + places] = mine.multipliers[0, core:]
+        there = np.r_[np.arange(core), core + places]
+        solution.multipliers[i, there] = mine.multipliers[0]
+        held[i, there] = result.judged.multipliers[0]
         solution.offsets[i], solution.statuses[i] = mine.offsets[0], mine.statuses[0]
         solution.moments[i], solution.seconds[i] = mine.moments[0], mine.seconds[0]
-    # proved with all products, whose sums round a little more
+    # proved with all products, which are in another order and so round otherwise
     whole = program.replace(products=products)
-    multipliers = np.asarray(solution.multipliers)
-    again = np.fmin(sound_offsets(whole, multipliers), interval_offsets(whole))
-    offsets = np.fmax(np.array([result.offset for result in found]), again)
-    optimal = np.array([result.optimal for result in found])
-    return Rounds(products, Judged(offsets, optimal, solution))
+    again = np.fmin(sound_offsets(whole, solution.multipliers), interval_offsets(whole))
+    joined = Judged(
+        offsets=np.fmax(np.array([result.offset for result in found]), again),
+        optimal=np.array([result.judged.optimal[0] for result in found]),
+        multipliers=held,
+        moments=np.concatenate([result.judged.moments for result in found]),
+        solution=solution,
+    )
+    return Rounds(products, joined)

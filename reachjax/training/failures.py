@@ -1,33 +1,45 @@
-"""Steps at which no program was solved: skipped, and counted."""
+"""Failures in a training loop: steps without a gradient, skipped and counted; unsolved programs."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
-from reachjax.numerics.checks import described, is_concrete
+from reachjax.numerics.checks import described, is_concrete, whole_number
+from reachjax.proofs.proposal import SolverStatus
+from reachjax.tubes.reach import ReachTube
 
 if TYPE_CHECKING:
     import optax
 
 FOREVER = 2**31 - 1
-"""So many failed steps in a row are skipped: all of them (optax counts in 32 bits)."""
+"""So many failed steps in a row optax skips: all of them (it counts in 32 bits)."""
 
 
 def skip_failures(
-    optimizer: optax.GradientTransformation,
-) -> optax.GradientTransformation:
+    optimizer: optax.GradientTransformation, limit: int = 10
+) -> optax.GradientTransformationExtraArgs:
     """An optimiser that skips, and counts, the steps whose gradient is not finite.
 
     At such a step weights and optimiser state stay as they are. `failures(state)` is the count.
 
+    Where the loss is the same at every step, so are the weights after a step that is skipped, and
+    all later steps are skipped too. So more than `limit` of them in a row are an error: a
+    `RuntimeError` of the call, and inside `jax.jit` of what the compiled function returns, which
+    JAX raises when it is waited for or handed to the next step.
+
     Args:
         optimizer: any optax optimiser.
+        limit: how many steps in a row may be skipped.
 
     Raises:
         ImportError: optax is not installed.
-        TypeError: the optimiser is not one of optax.
+        TypeError: the optimiser is not one of optax, or the limit is no whole number.
+        ValueError: the limit is negative.
 
     Example:
         >>> import jax.numpy as jnp
@@ -49,11 +61,53 @@ def skip_failures(
             "optimizer must be an optax optimiser, such as optax.adam(1e-3), "
             f"but {described(optimizer)} arrived"
         )
-    return optax.apply_if_finite(optimizer, max_consecutive_errors=FOREVER)
+    limit = whole_number("limit", limit, 0)
+    skipping = optax.apply_if_finite(optimizer, max_consecutive_errors=FOREVER)
+
+    def update(updates, state, params=None, **extra_args):
+        updates, state = skipping.update(updates, state, params, **extra_args)
+        count: Any = state.notfinite_count  # pyright: ignore[reportAttributeAccessIssue]
+        # the state holds what the check returns, so that no compiler can leave the check out
+        return updates, state._replace(notfinite_count=_checked(limit, count))
+
+    return optax.GradientTransformationExtraArgs(skipping.init, update)
+
+
+def _checked(limit: int, count: Array) -> Array:
+    """The count of skipped steps in a row, if it is within the limit.
+
+    Raises:
+        RuntimeError: it is beyond.
+    """
+
+    def check(count):
+        if np.max(count) > limit:
+            raise RuntimeError(_stuck(int(np.max(count))))
+        return np.asarray(count)
+
+    if is_concrete(count):
+        check(count)
+        return count
+    shape = jax.ShapeDtypeStruct(count.shape, count.dtype)
+    return jax.pure_callback(check, shape, count, vmap_method="expand_dims")
+
+
+def _stuck(count: int) -> str:
+    return (
+        f"the last {count} steps had no finite gradient and were skipped, so the weights no longer "
+        "change. A gradient is NaN where there is no bound: sets are empty, unbounded or overflow, "
+        "because the weights went astray. Go on from earlier weights with a smaller learning rate, "
+        "clip gradients (optax.clip_by_global_norm), give the loop an input_box, or look at "
+        "reach(...) of these weights outside jax.jit, whose error says what is wrong. "
+        "skip_failures(optimizer, limit=...) allows more steps in a row"
+    )
 
 
 def failures(state: Any) -> int:
     """How many steps an optimiser wrapped by `skip_failures` has skipped.
+
+    A step whose gradient is that of a bound is not skipped, however its programs ended: `unsolved`
+    counts these.
 
     Args:
         state: the optimiser's state, alone or inside another one's; where several are wrapped, or
@@ -79,3 +133,20 @@ def failures(state: Any) -> int:
     if not is_concrete(counts):
         raise ValueError("state must hold numbers: call failures(state) outside jax.jit")
     return int(sum(np.sum(count) for count in counts))
+
+
+def unsolved(tube: ReachTube) -> Int[Array, ""]:
+    """How many of a tube's programs were not solved, also inside `jax.jit`.
+
+    Their bounds hold and have gradients, but they are looser than they might be. A loss that
+    returns this beside its value (`jax.value_and_grad(loss, has_aux=True)`) says how often solvers
+    failed in a training run.
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach
+        >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+        >>> int(unsolved(reach(loop, Box([1.0], [2.0]), 2, Template.box(1))))
+        0
+    """
+    codes = [tube.proof(t).codes for t in range(1, len(tube.sets))]
+    return sum((jnp.sum(code != SolverStatus.SOLVED) for code in codes), start=jnp.zeros((), int))

@@ -92,11 +92,12 @@ def _ellipsoid(
             program, step.window.layout, setting.solver, setting.relaxation, form
         )
     if form is None:
-        region, enclosure = proved_ellipsoid(program, setting.solver)
+        form, level, enclosure = proved_ellipsoid(program, setting.solver)
     else:
-        region, enclosure = proved_size(program, form, setting.solver)
+        form, level, enclosure = proved_size(program, form, setting.solver)
+    region = Ellipsoid.enclosing(form, level)
     _require_finite(step, region.shape)
-    return region, EllipsoidCertificate.from_enclosure(program, region, enclosure)
+    return region, EllipsoidCertificate.from_enclosure(program, form, level, enclosure)
 
 
 def _intersection(

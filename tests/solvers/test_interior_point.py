@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reachjax.solvers.arrangement import arranged, bucket, cut
 from scipy.linalg import eigvalsh
 
 import reachjax as rj
@@ -17,7 +18,6 @@ from reachjax.proofs.proposal import ANSWERS
 from reachjax.proofs.recheck import interval_offsets
 from reachjax.sets import NormalForm
 from reachjax.solvers import barrier, centring, interior_point
-from reachjax.solvers.arrangement import arranged, bucket, cut
 from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 from reachjax.solvers.factorisations import inverse_factor
 from tests.loops import closed_loop, one_step, random_loop, recursion

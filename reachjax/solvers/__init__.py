@@ -1,5 +1,15 @@
-"""Solvers of semidefinite programs: they propose, and nothing more."""
+"""The seam to semidefinite-programming codes: arrays in, arrays out."""
 
+from reachjax.proofs.accepted import accepted_enclosure, accepted_offsets
+from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
+from reachjax.sets.geometry import (
+    bounding_box,
+    facets_in_units,
+    polytope_volume,
+    row_ranges,
+    separation,
+    support,
+)
 from reachjax.solvers.auto import Auto
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.cutting_planes import proved_with_cuts, with_cuts_around
@@ -16,10 +26,21 @@ __all__ = [
     "CentralPath",
     "Clarabel",
     "CvxpySolver",
+    "Enclosure",
     "InteriorPoint",
+    "Solution",
+    "SolverStatus",
+    "accepted_enclosure",
+    "accepted_offsets",
+    "bounding_box",
+    "facets_in_units",
+    "polytope_volume",
     "proved_ellipsoid",
     "proved_offsets",
     "proved_size",
     "proved_with_cuts",
+    "row_ranges",
+    "separation",
+    "support",
     "with_cuts_around",
 ]

@@ -11,18 +11,61 @@ from __future__ import annotations
 
 from typing import Any, Self
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from reachjax.numerics.pytrees import pytree
 
 UNIT = 2.0**-53
 """The unit roundoff of float64."""
 
+TINY = float(np.finfo(float).tiny)
+"""The smallest positive number that XLA tells from zero: what underflow takes from a product."""
+
 
 def gamma(operations: int) -> float:
     """Relative error bound of `operations` rounded operations, with some to spare."""
     count = (operations + 8) * UNIT
     return count / (1.0 - count)
+
+
+def exponents(rows) -> Any:
+    """Whole numbers `e`, one a row, with the row's largest entry in `[2^e, 2^(e+1))`; 0 for zeros.
+
+    Derivatives take them for constants.
+    """
+    return jnp.frexp(jax.lax.stop_gradient(jnp.max(abs(rows), axis=-1)))[1] - 1
+
+
+def shifted(numbers, by) -> Any:
+    """`numbers * 2^by`, exact unless it overflows or underflows.
+
+    In two factors, neither of which leaves the range of floats before the product does.
+    """
+    half = by // 2
+    return numbers * _power(half) * _power(by - half)
+
+
+def raised(numbers, by) -> Any:
+    """`numbers * 2^by`, rounded up where it underflows."""
+    values = shifted(numbers, by)
+    return jnp.where((numbers > 0) & (values < TINY), TINY, values)
+
+
+def _power(exponent) -> Any:
+    """`2^exponent` from -1022 to 1023: the bits, since a compiled power may be rounded."""
+    kind = jnp.finfo(
+        jnp.result_type(float)
+    )  # float32 where 64-bit floats are off, and a smaller range
+    bits = (jnp.asarray(exponent, dtype=f"int{kind.bits}") + kind.maxexp - 1) << kind.nmant
+    return jax.lax.bitcast_convert_type(bits, kind.dtype)
+
+
+def lengths(rows) -> Any:
+    """The norm of each row, whose squares may overflow or vanish."""
+    by = exponents(rows)
+    return shifted(jnp.linalg.norm(shifted(rows, -by[..., None]), axis=-1), by)
 
 
 @pytree

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from reachjax.numerics.checks import Numbers, same_size
 from reachjax.numerics.pytrees import Replaceable
-from reachjax.numerics.rounding import gamma
+from reachjax.numerics.rounding import TINY, gamma
+from reachjax.sets.balance import balanced
 
 if TYPE_CHECKING:
     from reachjax.sets.box import Box
@@ -102,9 +104,11 @@ class PolyhedralSet(AbstractSet):
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
-        A, b = self.facets
-        x = self._points(point)
-        return bool(jnp.all(A @ x + gamma(self.dimension) * (abs(A) @ abs(x)) <= b))
+        x = np.asarray(self._points(point))  # numpy knows subnormal numbers, XLA does not
+        A, b = balanced(*(np.asarray(part) for part in self.facets), inner=True)
+        with np.errstate(over="ignore", invalid="ignore"):
+            rounding = gamma(self.dimension) * (abs(A) @ abs(x)) + TINY * ((A != 0) @ (x != 0))
+            return bool(np.all(A @ x + rounding <= b))
 
     def bounded_values(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch m"]:
         """`A x` of each facet."""

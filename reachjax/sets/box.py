@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from reachjax.numerics.checks import Numbers, is_concrete, within_time_axis
 from reachjax.numerics.pytrees import converted, pytree
-from reachjax.numerics.rounding import gamma
+from reachjax.numerics.rounding import TINY, exponents, gamma, raised, shifted
 from reachjax.sets.base import PolyhedralSet
 
 MOST_CORNERS = 2**16
@@ -103,17 +103,12 @@ class Box(PolyhedralSet):
     def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
         """`max a . x` over the box, attained at a corner; rounded up."""
         self._single()
-        directions = self._directions(directions)
-        terms = directions * jnp.where(directions > 0, self.upper, self.lower)
-        # along an axis nothing is rounded, and nothing is added
-        inexact = jnp.sum(directions != 0, axis=-1) > jnp.max(abs(directions) == 1, axis=-1)
-        rounding = gamma(self.dimension) * jnp.sum(abs(terms), axis=-1)
-        return jnp.sum(terms, axis=-1) + jnp.where(inexact, rounding, 0.0)
+        return _support(self.lower, self.upper, self._directions(directions))
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the box: comparisons are exact."""
-        x = self._points(point)
-        return bool(jnp.all((self.lower <= x) & (x <= self.upper)))
+        x = np.asarray(self._points(point))  # numpy knows subnormal numbers, XLA does not
+        return bool(np.all((np.asarray(self.lower) <= x) & (x <= np.asarray(self.upper))))
 
     def vertices(self) -> Float[Array, "2**n n"]:
         """All corners, flat coordinates included.
@@ -146,3 +141,17 @@ class Box(PolyhedralSet):
         """The box itself."""
         self._single()
         return self
+
+
+@jax.jit
+def _support(
+    lower: Float[Array, " n"], upper: Float[Array, " n"], directions: Float[Array, "m n"]
+) -> Float[Array, " m"]:
+    by = exponents(directions)
+    D = shifted(directions, -by[:, None])
+    terms = D * jnp.where(D > 0, upper, lower)
+    # along an axis nothing is rounded, and nothing is added
+    inexact = jnp.sum(directions != 0, axis=1) > jnp.max(abs(D) == 1, axis=1)
+    lost = TINY * (len(lower) + jnp.sum(jnp.maximum(abs(lower), abs(upper))))  # by underflow
+    rounding = gamma(len(lower)) * jnp.sum(abs(terms), axis=1) + lost
+    return raised(jnp.sum(terms, axis=1) + jnp.where(inexact, rounding, 0.0), by)

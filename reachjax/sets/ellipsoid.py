@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from reachjax.numerics.checks import Numbers, is_concrete, same_size, whole_number
 from reachjax.numerics.pytrees import converted, pytree
-from reachjax.numerics.rounding import gamma
+from reachjax.numerics.rounding import TINY, exponents, gamma, raised, shifted
 from reachjax.sets import outward
 from reachjax.sets.base import AbstractSet
 from reachjax.sets.box import Box
@@ -150,15 +150,7 @@ class Ellipsoid(AbstractSet):
 
     def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
         """`a . q + sqrt(a' Q a)`, rounded up."""
-        D, n = self._directions(directions), self.dimension
-        Q, q = self.shape, self.center
-        squares = jnp.einsum("mi,ij,mj->m", D, Q, D)
-        sizes = jnp.einsum("mi,ij,mj->m", abs(D), abs(Q), abs(D))
-        above = squares + gamma(2 * n) * sizes
-        some = above > 0  # the root has no derivative at zero
-        reach = jnp.where(some, jnp.sqrt(jnp.where(some, above, 1.0)), 0.0)
-        rounding = gamma(n + 4) * (abs(D) @ abs(q) + reach)
-        return D @ q + reach + rounding
+        return _support(self.center, self.shape, self._directions(directions))
 
     def bounded_values(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch 1"]:
         """`|A x + b|`, at most 1 on the set."""
@@ -224,6 +216,23 @@ class Ellipsoid(AbstractSet):
             )
         index = np.array(coordinates)
         return Ellipsoid(self.center[index], self.shape[np.ix_(index, index)])
+
+
+@jax.jit
+def _support(
+    q: Float[Array, " n"], Q: Float[Array, "n n"], directions: Float[Array, "m n"]
+) -> Float[Array, " m"]:
+    n, by = len(q), exponents(directions)
+    D, unit = shifted(directions, -by[:, None]), jnp.max(exponents(Q)) // 2
+    S = shifted(Q, -2 * unit)
+    squares = jnp.einsum("mi,ij,mj->m", D, S, D)
+    sizes = jnp.einsum("mi,ij,mj->m", abs(D), abs(S), abs(D))
+    some = sizes > 0  # the root has no derivative at zero
+    above = squares + gamma(2 * n) * sizes + 16 * n**2 * TINY  # the last by underflow
+    reach = shifted(jnp.where(some, jnp.sqrt(jnp.where(some, above, 1.0)), 0.0), unit)
+    lost = n * TINY * (1 + jnp.max(abs(q)) + 4 * shifted(1.0, unit))
+    rounding = gamma(n + 4) * (abs(D) @ abs(q) + reach) + jnp.where(some, lost, 0.0)
+    return raised(D @ q + reach + rounding, by)
 
 
 def _require_positive_definite(matrix: np.ndarray) -> None:

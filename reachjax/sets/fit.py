@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
+from reachjax.sets.balance import exponents, lengths
+
 FLAT = 1e-6
 """Points are taken to spread by at least this part of their widest spread in every direction."""
 
@@ -40,7 +42,7 @@ def axes(points: Float[np.ndarray, "c n"], facets: int) -> Float[np.ndarray, "f 
     Raises:
         ValueError: that many directions do not come in pairs, or are not to be had.
     """
-    n = points.shape[1]
+    n, points = points.shape[1], _about_one(points)
     rows = octagonal(n)
     if facets % 2 or facets > len(rows):
         raise ValueError(
@@ -55,6 +57,7 @@ def edges(points: Float[np.ndarray, "c 2"], facets: int) -> Float[np.ndarray, "f
     Edges are left out one by one, the one first without which the polygon grows least. Ratios of
     areas do not depend on the coordinates, so points are whitened.
     """
+    points = _about_one(points)
     W = _whitening(points)
     try:
         hull = ConvexHull(points @ W.T)
@@ -103,5 +106,10 @@ def _whitening(points: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "n n"]:
     return rows / np.maximum(spreads, FLAT * spreads[0])[:, None]
 
 
+def _about_one(points: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n"]:
+    """The same points in another unit: directions do not depend on it."""
+    return np.ldexp(points, -exponents(points.ravel()))
+
+
 def _unit(rows: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / lengths(rows)[:, None]

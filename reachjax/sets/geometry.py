@@ -23,6 +23,8 @@ from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import is_concrete, require_double_precision
 from reachjax.numerics.host import all_finite, on_host
+from reachjax.numerics.rounding import exponents, shifted
+from reachjax.numerics.rounding import lengths as row_lengths
 from reachjax.sets import (
     AbstractSet,
     Box,
@@ -32,6 +34,7 @@ from reachjax.sets import (
     hulls,
     polyhedra,
 )
+from reachjax.sets.balance import balanced, lengths
 
 Slopes = tuple[np.ndarray, ...]
 Values = Callable[..., tuple[np.ndarray, Slopes]]
@@ -75,10 +78,27 @@ def separation(X: AbstractSet, Y: PolyhedralSet) -> Float[Array, ""]:
     if isinstance(X, Intersection):
         return jnp.maximum(*(separation(part, Y) for part in X.parts))
     if not isinstance(X, PolyhedralSet):
-        C, d = Y.facets
-        facet = jnp.max((-X.support(-C) - d) / jnp.linalg.norm(C, axis=1))
+        C, d, norms = facets_in_units(Y)
+        facet = jnp.max((-X.support(-C) - d) / norms)
         return jnp.maximum(facet, separation(X.bounding_box(), Y))
     return _values(_separation, 1, *X.facets, *Y.facets)[0]
+
+
+def facets_in_units(
+    Y: PolyhedralSet, inner: bool = False
+) -> tuple[Float[Array, "m n"], Float[Array, " m"], Float[Array, " m"]]:
+    """Facets `C x <= d` whose largest coefficients are in `[1, 2)`, and their norms.
+
+    Of numbers, the set is exactly the same, or where offsets cannot be, larger; or smaller, if
+    `inner`. Signs of what is computed from them then are right whatever underflows.
+    """
+    C, d = Y.facets
+    if is_concrete(C, d):
+        C, d = (jnp.asarray(part) for part in balanced(np.asarray(C), np.asarray(d), inner))
+    else:
+        by = exponents(C)
+        C, d = shifted(C, -by[:, None]), shifted(d, -by)
+    return C, d, row_lengths(C)
 
 
 def polytope_volume(X: Polytope) -> Float[Array, ""]:
@@ -140,13 +160,13 @@ def _separation(
     A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray
 ) -> tuple[np.ndarray, Slopes]:
     """From the Lagrangian `s + y . (A x - b) + w . (C x - s |c| - d)`."""
-    value, y, w, x = polyhedra.separation_and_multipliers(A, b, C, d)
-    units = C / np.linalg.norm(C, axis=1)[:, None]
-    slopes = (y[:, None] * x, -y, w[:, None] * (x - value * units), -w)
+    value, swept, y, w, x = polyhedra.separation_and_multipliers(A, b, C, d)
+    units = C / lengths(C)[:, None]
+    slopes = (swept, -y, w[:, None] * (x - value * units), -w)
     return np.array([value]), tuple(slope[None] for slope in slopes)
 
 
 def _volume(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, Slopes]:
     volume, areas, centroids = hulls.facet_areas(A, b)
-    swept = areas / np.linalg.norm(A, axis=1)
+    swept = areas / lengths(A)
     return np.array([volume]), ((-swept[:, None] * centroids)[None], swept[None])

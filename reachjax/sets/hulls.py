@@ -7,7 +7,8 @@ import math
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, HalfspaceIntersection, QhullError
 
-from reachjax.sets.polyhedra import balanced, bounding_box, chebyshev, maximiser
+from reachjax.sets.balance import Balanced, balanced, lengths
+from reachjax.sets.polyhedra import boxed, chebyshev, maximiser
 
 TOO_THIN = "the polytope is too thin for its corners to be told apart"
 
@@ -24,14 +25,23 @@ def vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     Raises:
         RuntimeError: the polytope is too thin for its corners to be told apart.
     """
-    if A.shape[1] == 1:
+    region, corners = _corners(A, b)
+    return np.ldexp(corners, region.columns)
+
+
+def _corners(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, np.ndarray]:
+    """A polytope in coordinates of a size about 1, and its corners in these."""
+    region, box = boxed(A, b)
+    (A, b), n = (region.A[region.near], region.b[region.near]), A.shape[1]
+    if n == 1:
         ends = b / A[:, 0]
-        return np.unique([[ends[A[:, 0] < 0].max()], [ends[A[:, 0] > 0].min()]], axis=0)
-    lower, upper = bounding_box(A, b)
+        ends = ends[A[:, 0] < 0].max(), ends[A[:, 0] > 0].min()
+        return region, np.unique([[min(ends)], [max(ends)]], axis=0)  # they may cross by rounding
+    lower, upper = -box.values[:n], box.values[n:]
     middle, radii = (lower + upper) / 2, (upper - lower) / 2
     radii = np.where(radii > FLAT * radii.max(), radii, radii.max() or 1.0)
     try:
-        return middle + radii * _unit_vertices(*balanced(A * radii, b - A @ middle))
+        return region, middle + radii * _unit_vertices(*balanced(A * radii, b - A @ middle))
     except QhullError as error:
         raise RuntimeError(f"{TOO_THIN}: {str(error).splitlines()[0]}") from None
 
@@ -51,20 +61,21 @@ def _unit_vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     return center + vertices(reduced[kept], slack[kept]) @ basis.T
 
 
-def extreme_points(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The corners, or where they cannot be told apart, points that linear programs find."""
+def _extreme_points(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, np.ndarray]:
+    """As `_corners`, but points that linear programs find where corners cannot be told apart."""
     try:
-        return vertices(A, b)
+        return _corners(A, b)
     except RuntimeError:
-        A, b = balanced(A, b)
-        n = A.shape[1]
+        region, _ = boxed(A, b)
+        A, b, n = region.A, region.b, len(region.columns)
         draws = np.random.default_rng(0).normal(size=(8 * n, n))
-        return np.stack([maximiser(A, b, d)[1] for d in np.vstack([np.eye(n), -np.eye(n), draws])])
+        directions = np.vstack([np.eye(n), -np.eye(n), draws])
+        return region, np.stack([maximiser(A, b, direction)[1] for direction in directions])
 
 
 def _affine_hull(A: np.ndarray, b: np.ndarray, point: np.ndarray, tolerance: float) -> np.ndarray:
     """An orthonormal basis `(n, k)` of the directions in which a flat polytope extends."""
-    norms = np.linalg.norm(A, axis=1)
+    norms = lengths(A)
     extent = [-a @ maximiser(A, b, -a)[1] for a in A / norms[:, None]]
     tight = np.array(extent) + b / norms <= 4 * tolerance
     if not tight.any():
@@ -81,11 +92,10 @@ def volume(A: np.ndarray, b: np.ndarray) -> float:
         ValueError: the polytope is empty or unbounded.
         RuntimeError: it is too thin for its corners to be found.
     """
-    corners = vertices(A, b)
-    if A.shape[1] == 1:
-        return float(np.ptp(corners))
-    hull = _hull(corners)
-    return 0.0 if hull is None else float(hull.volume)
+    region, corners = _corners(A, b)
+    hull = None if A.shape[1] == 1 else _hull(corners)
+    inside = np.ptp(corners) if A.shape[1] == 1 else 0.0 if hull is None else hull.volume
+    return float(np.ldexp(inside, region.columns.sum()))
 
 
 def _hull(corners: np.ndarray) -> ConvexHull | None:
@@ -108,14 +118,26 @@ def facet_areas(A: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.nda
         ValueError: the polytope is empty or unbounded.
         RuntimeError: it is too thin for its corners to be found.
     """
-    n, norms = A.shape[1], np.linalg.norm(A, axis=1)
-    corners, reach = vertices(A, b), b / norms
+    region, corners = _corners(A, b)
+    volume, swept, centroids = _swept(region, corners)
+    # in balanced coordinates, `swept` is the derivative of the volume in the offset
+    unit = region.columns.sum()
+    with np.errstate(over="ignore"):
+        areas = np.ldexp(swept, unit + region.rows) * lengths(A)
+        return float(np.ldexp(volume, unit)), areas, np.ldexp(centroids, region.columns)
+
+
+def _swept(region: Balanced, corners: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """The volume, its derivative in each offset and each facet's centroid."""
+    A, b, n = region.A, region.b, len(region.columns)
+    norms = np.where(region.near, lengths(A), 1.0)
+    reach = np.where(region.near, b / norms, np.inf)
     areas, centroids = np.zeros(len(b)), np.zeros((len(b), n))
     if n == 1:
         for side in (A[:, 0] < 0, A[:, 0] > 0):
             facet = np.flatnonzero(side)[np.argmin(reach[side])]
             areas[facet], centroids[facet] = 1.0, b[facet] / A[facet, 0]
-        return float(np.ptp(corners)), areas, centroids
+        return float(np.ptp(corners)), areas / norms, centroids
     hull = _hull(corners)
     if hull is None:
         return 0.0, areas, centroids
@@ -127,12 +149,18 @@ def facet_areas(A: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.nda
         area = np.sqrt(max(np.linalg.det(edges @ edges.T), 0.0)) / math.factorial(n - 1)
         areas[facet] += area
         centroids[facet] += area * simplex.mean(axis=0)
-    return float(hull.volume), areas, centroids / np.where(areas > 0, areas, 1)[:, None]
+    centroids /= np.where(areas > 0, areas, 1)[:, None]
+    return float(hull.volume), areas / norms, centroids
 
 
 def uniform(A: np.ndarray, b: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
     """`count` points drawn uniformly, by a triangulation of the corners `(count, n)`."""
-    corners = extreme_points(A, b)
+    region, corners = _extreme_points(A, b)
+    return np.ldexp(_drawn(corners, rng, count), region.columns)
+
+
+def _drawn(corners: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
+    """Points drawn uniformly from the convex hull of some."""
     center = corners.mean(axis=0)
     _, values, rows = np.linalg.svd(corners - center, full_matrices=False)
     spanned = rows[values > FLAT * max(values.max(initial=0.0), np.finfo(float).tiny)]

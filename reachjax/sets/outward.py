@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from reachjax.numerics.rounding import gamma
+from reachjax.numerics.rounding import gamma, lengths
 
 Matrix = Float[Array | np.ndarray, "n n"]
 Vector = Float[Array | np.ndarray, " n"]
@@ -34,7 +34,7 @@ def level(A: Matrix, q: Vector, Q: Matrix) -> Float[Array, ""]:
     """A bound of `|A x + b|` on the set, `b` being `-A q` as it is rounded."""
     n = len(q)
     largest = jnp.max(jnp.sum(abs(A @ Q @ A.T) + _rounding(A, Q), axis=1)) * (1 + gamma(n))
-    offset = jnp.linalg.norm(gamma(n) * (abs(A) @ abs(q))) * (1 + gamma(n))
+    offset = lengths(gamma(n) * (abs(A) @ abs(q))) * (1 + gamma(n))
     return jax.lax.stop_gradient((jnp.sqrt(largest) + offset) * (1 + gamma(4)))
 
 
@@ -64,7 +64,7 @@ def inflation(
     """
     n = len(b)
     residual = abs(A @ q + b) + gamma(n + 2) * (abs(A) @ abs(q) + abs(b))
-    needed = ((level + jnp.linalg.norm(residual)) * (1 + gamma(n + 8))) ** 2
+    needed = ((level + lengths(residual)) * (1 + gamma(n + 8))) ** 2
     return jax.lax.stop_gradient(needed / (1 - _off_identity(A, Q)) * (1 + gamma(8)))
 
 

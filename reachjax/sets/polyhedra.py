@@ -7,20 +7,17 @@ what is used in a certificate is rebuilt from the dual solution: for any `y >= 0
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse as sp
 from scipy.optimize import linprog
 
-from reachjax.numerics.rounding import gamma
+from reachjax.numerics.rounding import TINY, gamma
+from reachjax.sets.balance import Balanced, balanced, lengths, upwards
 
-
-def balanced(A: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Rows brought to a length between 1/2 and 1 by powers of two, which is exact.
-
-    The linear-programming code drops small coefficients and stops on large ones.
-    """
-    exponents = -np.frexp(np.linalg.norm(A, axis=1))[1]
-    return (np.ldexp(A, exponents[:, None]), *(np.ldexp(other, exponents) for other in others))
+UNEVEN = 10
+"""Coordinates whose sizes are further from 1, as powers of two, are scaled anew."""
 
 
 def maximiser(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -74,29 +71,93 @@ def bounding_box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def bounding_box_and_multipliers(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, ...]:
     """Lower and upper bounds of each coordinate, true for the exact polytope.
 
-    With `D = [-I; I]`, multipliers `Y` and residual `E = D - Y A`, every point has
-    `D x <= Y b + |E| rho` where `rho = max|x_i| <= max(Y b) / (1 - max row sum of |E|)`.
-
     Returns:
         Lower and upper bounds `(n,)`, the multipliers `Y` `(2 n, m)` and where the maxima are
         attained `(2 n, n)`, both for `-x_i` and then for `x_i`.
+
+    Raises:
+        ValueError: the polytope is empty or unbounded.
+        RuntimeError: the linear programs were not solved.
     """
-    lengths = np.frexp(np.linalg.norm(A, axis=1))[1]
-    A, b = balanced(A, b)
-    n = A.shape[1]
+    region, box = boxed(A, b)
+    n, columns = A.shape[1], region.columns
+    lower, upper = -upwards(box.values[:n], columns), upwards(box.values[n:], columns)
+    ends = np.minimum(lower, upper), np.maximum(lower, upper)
+    with np.errstate(over="ignore"):
+        Y = np.ldexp(box.Y, region.rows + np.tile(columns, 2)[:, None])
+        return *ends, Y, np.ldexp(box.points, columns)
+
+
+class Maxima(NamedTuple):
+    """Bounds of directions over a polytope in balanced coordinates.
+
+    Attributes:
+        values: `(k,)`, upper bounds, rounding included.
+        Y: `(k, m)`, the multipliers that prove them.
+        points: `(k, n)`, where the maxima are attained.
+    """
+
+    values: np.ndarray
+    Y: np.ndarray
+    points: np.ndarray
+
+    @property
+    def size(self) -> np.ndarray:
+        """The largest absolute value of each coordinate, of bounds of `-x_i` and then of `x_i`."""
+        n = self.points.shape[1]
+        return np.maximum(abs(self.values[:n]), abs(self.values[n:]))
+
+
+def boxed(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, Maxima]:
+    """A polytope in coordinates of a size about 1, and its box in these.
+
+    The first guess of the sizes is mended by the box that it leads to. If it leads to none, all
+    coordinates are taken to be of one size.
+    """
+    region = Balanced.of(A, b)
+    try:
+        box = _box(region)
+    except (ValueError, RuntimeError) as error:
+        region = Balanced.of(A, b, region.of_one_size)
+        try:
+            box = _box(region)
+        except (ValueError, RuntimeError):
+            raise error from None
+    size = box.size
+    by = np.where(size > 0, np.frexp(size)[1], 0)
+    if abs(by).max() > UNEVEN:
+        mended = Balanced.of(A, b, region.columns + by)
+        try:
+            return mended, _box(mended)
+        except (ValueError, RuntimeError):
+            pass  # the first one holds as well
+    return region, box
+
+
+def _box(region: Balanced) -> Maxima:
+    """Bounds of `-x_i` and of `x_i` in balanced coordinates.
+
+    With `D = [-I; I]`, multipliers `Y` and residual `E = D - Y A`, every point has
+    `D x <= Y b + |E| rho` where `rho = max|x_i| <= max(Y b) / (1 - max row sum of |E|)`.
+    """
+    n = region.A.shape[1]
     D = np.vstack([-np.eye(n), np.eye(n)])
-    Y, points = maximisers(A, b, D)
-    error = gamma(len(b) + 2)
-    residual = np.abs(D - Y @ A) + error * (np.abs(D) + Y @ np.abs(A))
-    values = Y @ b + error * (Y @ np.abs(b))
+    Y, points = maximisers(region.A, region.b, D)
+    values, residual = _proved(region, Y, D)
     leak = residual.sum(axis=1)
-    if leak.max() > 0.5:
+    if not leak.max() <= 0.5:
         raise RuntimeError("the linear programs that bound the polytope are too inaccurate")
     radius = max(values.max(), 0.0) / (1 - leak.max())
-    values = values + leak * radius * (1 + error)
-    lower = -values[:n]
-    ends = np.minimum(lower, values[n:]), np.maximum(lower, values[n:])
-    return *ends, np.ldexp(Y, -lengths), points
+    return Maxima(values + leak * radius * (1 + gamma(len(region.b) + 2)), Y, points)
+
+
+def _proved(region: Balanced, Y: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What multipliers prove: `Y b`, rounded up, and bounds of `|D - Y A|`, `(k,)` and `(k, n)`."""
+    m, n = region.A.shape
+    error = gamma(m + n + 4)
+    lost = TINY * (m + 2 + Y.sum(axis=1))  # by underflow, here and where `region` was scaled
+    residual = abs(D - Y @ region.A) + error * (abs(D) + Y @ abs(region.A)) + lost[:, None]
+    return Y @ region.b + error * (Y @ abs(region.b)) + lost, residual
 
 
 def support(A: np.ndarray, b: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -111,18 +172,19 @@ def support_and_multipliers(
 
     Returns:
         The bounds `(k,)`, the multipliers `(k, m)` and where the maxima are attained `(k, n)`.
+
+    Raises:
+        ValueError: the polytope is empty or unbounded.
+        RuntimeError: the linear programs were not solved.
     """
-    lengths = np.frexp(np.linalg.norm(A, axis=1))[1]
-    A, b = balanced(A, b)
-    lower, upper = bounding_box(A, b)
-    size = np.maximum(np.abs(lower), np.abs(upper))
-    error = gamma(len(b) + len(size) + 4)
-    exponents = np.frexp(abs(directions).max(axis=1))[1]  # squares of entries may overflow
-    D = np.ldexp(directions, -exponents[:, None])
-    Y, points = maximisers(A, b, D)
-    residual = np.abs(D - Y @ A) + error * (np.abs(D) + Y @ np.abs(A))
-    values = Y @ b + error * (Y @ np.abs(b)) + residual @ size * (1 + error)
-    return np.ldexp(values, exponents), np.ldexp(Y, exponents[:, None] - lengths), points
+    region, box = boxed(A, b)
+    D, by = region.facing(directions)
+    Y, points = maximisers(region.A, region.b, D)
+    values, residual = _proved(region, Y, D)
+    values = values + residual @ box.size * (1 + gamma(A.shape[1] + 4))
+    with np.errstate(over="ignore"):
+        Y = np.ldexp(Y, region.rows + by[:, None])
+        return upwards(values, by), Y, np.ldexp(points, region.columns)
 
 
 def separation_and_multipliers(
@@ -132,42 +194,98 @@ def separation_and_multipliers(
 
     A lower bound whatever the linear program's accuracy; positive means disjoint. Minimises `s`
     over `A x <= b`, `C x - s |c_i| <= d`. The value returned is the dual one, `-(y'b + w'd)` with
-    `y, w >= 0` and `w . |c_i| = 1`, less what its residual can cost.
+    `y, w >= 0` and `w . |c_i| = 1`, less what its residual can cost; or what the box around
+    `A x <= b` proves by a single facet, if that is more.
 
     Returns:
-        The separation, the multipliers of both sets and the nearest point.
+        The separation, its derivatives in `A`, up to their sign, the multipliers of both sets, and
+        the nearest point.
 
     Raises:
-        RuntimeError: the linear program was not solved.
+        ValueError: the polytope `A x <= b` is empty or unbounded.
+        RuntimeError: the linear programs that bound it were not solved.
     """
-    lengths = [np.frexp(np.linalg.norm(rows, axis=1))[1] for rows in (A, C)]
-    (A, b), (C, d) = balanced(A, b), balanced(C, d)
-    norms = np.linalg.norm(C, axis=1)
-    m, n = A.shape
+    region, box = boxed(A, b)
+    other = Balanced.of(C, d, region.columns)
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        norms = np.ldexp(lengths(C), other.rows)
+        one = _by_one_facet(region, box, other, norms)
+        telling = other.near & ((abs(other.A) @ box.size - other.b) / norms >= one.value)
+        all_of_them = _by_program(region, box, other, norms, telling)
+        value, swept, y, w, x = _better(one, all_of_them)
+        swept = np.ldexp(swept, region.rows[:, None] + region.columns)
+        y, w = np.ldexp(y, region.rows), np.ldexp(w, other.rows)
+        return value, swept, y, w, np.ldexp(x, region.columns)
+
+
+class _Apart(NamedTuple):
+    """A separation, and in balanced coordinates its derivatives and the nearest point."""
+
+    value: float
+    swept: np.ndarray
+    y: np.ndarray
+    w: np.ndarray
+    x: np.ndarray
+
+
+def _by_one_facet(region: Balanced, box: Maxima, other: Balanced, norms: np.ndarray) -> _Apart:
+    """The best separation that one facet has from a box around the polytope."""
+    n = len(region.columns)
+    weights = np.hstack([np.maximum(other.A, 0.0), np.maximum(-other.A, 0.0)])
+    error = gamma(2 * n + 4) * (abs(other.A) @ box.size + abs(other.b)) + TINY * (2 * n + 4)
+    room = -(weights @ box.values) - other.b - error  # `C x` is at least the first of these
+    values = np.where(other.near & (norms > 0), np.nan_to_num(room / norms, nan=-np.inf), -np.inf)
+    best = int(np.argmax(values))
+    with_box = weights[best] / norms[best]
+    corner = np.where(other.A[best] > 0, -box.values[:n], box.values[n:])
+    swept = np.einsum("k,km,kn->mn", with_box, box.Y, box.points)
+    single = np.zeros(len(norms))
+    single[best] = 1 / norms[best]
+    return _Apart(float(values[best]), swept, with_box @ box.Y, single, corner)
+
+
+def _by_program(
+    region: Balanced, box: Maxima, other: Balanced, norms: np.ndarray, telling: np.ndarray
+) -> _Apart | None:
+    """The separation by a linear program over the facets that tell; None if it is not solved."""
+    (m, n), C, d = region.A.shape, other.A[telling], other.b[telling]
+    if len(d) == 0 or not np.isfinite(norms[telling]).all():
+        return None
+    unit = 2.0 ** float(np.frexp(max(abs(d).max(), 1.0))[1])
     result = linprog(
         np.r_[np.zeros(n), 1.0],
-        A_ub=np.block([[A, np.zeros((m, 1))], [C, -norms[:, None]]]),
-        b_ub=np.r_[b, d],
+        A_ub=np.block([[region.A, np.zeros((m, 1))], [C, -norms[telling, None]]]),
+        b_ub=np.r_[region.b, d] / unit,
         bounds=(None, None),
         method="highs",
     )
     if result.status != 0:
-        raise RuntimeError(f"the linear program that separates two sets failed: {result.message}")
+        return None
     duals = np.maximum(-result.ineqlin.marginals, 0.0)
-    duals = duals / (duals[m:] @ norms)
-    y, w = duals[:m], duals[m:]
-    lower, upper = bounding_box(A, b)
-    size = np.maximum(np.abs(lower), np.abs(upper))
+    total = duals[m:] @ norms[telling]
+    if not total > 0:
+        return None
+    y, w = duals[:m] / total, duals[m:] / total
     error = gamma(m + len(d) + n + 8)
-    residual = np.abs(y @ A + w @ C) + error * (y @ np.abs(A) + w @ np.abs(C))
-    cost = error * (y @ np.abs(b) + w @ np.abs(d)) + residual @ size * (1 + error)
-    value = float(-(y @ b + w @ d) - cost)
-    return value, np.ldexp(y, -lengths[0]), np.ldexp(w, -lengths[1]), result.x[:n]
+    lost = TINY * (m + len(d) + 2 + y.sum() + w.sum())  # by underflow
+    residual = abs(y @ region.A + w @ C) + error * (y @ abs(region.A) + w @ abs(C)) + lost
+    cost = error * (y @ abs(region.b) + w @ abs(d)) + residual @ box.size * (1 + error) + lost
+    x, weights = result.x[:n] * unit, np.zeros(len(norms))
+    weights[telling] = w
+    return _Apart(float(-(y @ region.b + w @ d) - cost), y[:, None] * x, y, weights, x)
+
+
+def _better(one: _Apart, every: _Apart | None) -> _Apart:
+    """What the program proves, which has the better derivatives, unless that is clearly less."""
+    if every is None or not np.isfinite(every.value) or one.value > 0 >= every.value:
+        return one
+    return one if one.value - every.value > 1e-6 * (1 + abs(one.value)) else every
 
 
 def chebyshev(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
     """Centre and radius of the largest ball inside (radius 0 for a flat polytope)."""
-    norms = np.linalg.norm(A, axis=1)
+    A, b = balanced(A, b)
+    norms = lengths(A)
     result = linprog(
         np.r_[np.zeros(A.shape[1]), -1.0],
         A_ub=np.hstack([A, norms[:, None]]),

@@ -1,7 +1,5 @@
-"""The seam to semidefinite-programming codes: arrays in, arrays out."""
+"""Solvers of semidefinite programs: they propose, and nothing more."""
 
-from reachjax.proofs.accepted import accepted_enclosure, accepted_offsets
-from reachjax.sets.geometry import bounding_box, polytope_volume, row_ranges, separation, support
 from reachjax.solvers.auto import Auto
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.cutting_planes import proved_with_cuts, with_cuts_around
@@ -16,20 +14,10 @@ __all__ = [
     "Auto",
     "Clarabel",
     "CvxpySolver",
-    "Enclosure",
     "InteriorPoint",
-    "Solution",
-    "SolverStatus",
-    "accepted_enclosure",
-    "accepted_offsets",
-    "bounding_box",
-    "polytope_volume",
     "proved_ellipsoid",
     "proved_offsets",
     "proved_size",
     "proved_with_cuts",
-    "row_ranges",
-    "separation",
-    "support",
     "with_cuts_around",
 ]

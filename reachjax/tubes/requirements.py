@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,9 +18,32 @@ from jaxtyping import Array, Float
 from reachjax.numerics.checks import described, is_concrete, real_number, require_kind
 from reachjax.sets import Box, PolyhedralSet
 from reachjax.sets.geometry import separation, support
+from reachjax.solvers import facets_in_units
 from reachjax.tubes.reach import ReachTube
 
 AvoidSets = Sequence[PolyhedralSet] | Mapping[int, Sequence[PolyhedralSet]]
+
+
+class Compared(NamedTuple):
+    """What every state surely does not exceed, and what it should not.
+
+    Attributes:
+        attained: `(k,)`, upper bounds of the states' values.
+        limits: `(k,)`, what they are compared with.
+        units: `(k,)`, what a distance of 1 in the units of the state changes the values by.
+    """
+
+    attained: Float[Array, " k"]
+    limits: Float[Array, " k"]
+    units: Float[Array, " k"]
+
+    @property
+    def margins(self) -> Float[Array, " k"]:
+        """How far every state surely is on the right side, in the units of the state.
+
+        To be shown and differentiated: of a margin at rounding level, the sign proves nothing.
+        """
+        return (self.limits - self.attained) / self.units
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,24 +62,30 @@ class Requirement:
     region: PolyhedralSet
     inside: bool
 
-    def margins(self, tube: ReachTube) -> Float[Array, " k"]:
-        """How far every state surely is on the right side: of each facet, or of the whole set."""
+    def compared(self, tube: ReachTube) -> Compared:
+        """What every state surely does not exceed, and should not: of each facet, or of the set."""
         reached = tube.sets[self.time]
         if self.inside:
-            C, d = self.region.facets
-            return (d - support(reached, C)) / jnp.linalg.norm(C, axis=1)
-        return separation(reached, self.region)[None]
+            C, d, norms = facets_in_units(self.region, inner=True)
+            return Compared(support(reached, C), d, norms)
+        return Compared(-separation(reached, self.region)[None], jnp.zeros(1), jnp.ones(1))
 
     def simulated(self, trajectories: np.ndarray) -> np.ndarray:
         """How far each trajectory `(c,)` is on the right side; negative on the wrong one."""
-        C, d = (np.asarray(part) for part in self.region.facets)
-        room = (d - trajectories[:, self.time] @ C.T) / np.linalg.norm(C, axis=1)
+        C, d, norms = (np.asarray(part) for part in facets_in_units(self.region))
+        with np.errstate(over="ignore", invalid="ignore"):
+            room = (d - trajectories[:, self.time] @ C.T) / norms
         depth = room.min(axis=1)
         return depth if self.inside else -depth
 
-    def proved(self, margin: float) -> bool:
-        """Sets are closed: touching is inside."""
-        return margin >= 0 if self.inside else margin > 0
+    def proved(self, compared: Compared) -> bool:
+        """Whether every state surely is on the right side. Sets are closed: touching is inside.
+
+        Only comparisons are made, which no rounding can turn; with what is no number they fail.
+        """
+        attained, limits = np.asarray(compared.attained), np.asarray(compared.limits)
+        right = attained <= limits if self.inside else attained < limits
+        return bool(np.all(right))
 
 
 def of_tube(
@@ -151,7 +180,7 @@ def shortfall(
     check_margin(margin)
     missing = jnp.zeros(())
     for item in of_tube(tube, goal, avoid, safe):
-        missing += jnp.sum(jnp.maximum(0.0, margin - item.margins(tube)))
+        missing += jnp.sum(jnp.maximum(0.0, margin - item.compared(tube).margins))
     return missing
 
 

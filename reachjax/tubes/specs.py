@@ -6,14 +6,18 @@ of them refutes it only if it surely begins in the initial set and breaks it wha
 
 from __future__ import annotations
 
+import contextlib
+
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from reachjax.numerics.checks import whole_number
-from reachjax.numerics.rounding import gamma
+from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet, Box, PolyhedralSet
+from reachjax.sets.balance import balanced
 from reachjax.tubes.partitions import BESIDE, PartitionedTube
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.requirements import AvoidSets, Requirement, of_tube
@@ -74,9 +78,7 @@ def _decided(
     """What a tube proves, or a trajectory from `X0` refutes."""
     proofs = [tube.proof(t) for t in range(1, tube.horizon + 1)]
     unsolved = sum(s is not SolverStatus.SOLVED for proof in proofs for s in proof.statuses)
-    states = jnp.concatenate([proof.witness_states for proof in proofs])
-    witnessed = tube.loop.simulate(states, tube.horizon, tube.start)
-    trajectories = np.concatenate([witnessed, tube.simulate(samples, seed)])
+    trajectories = _trajectories(tube, samples, seed)
     if X0 is not tube.sets[0]:  # a cell may hold points beside the initial set
         trajectories = trajectories[np.asarray(X0.contains(trajectories[:, 0], BESIDE))]
     margins: dict[str, np.ndarray] = {}
@@ -84,10 +86,13 @@ def _decided(
     proved, suspects = True, []
     for item in required:
         blank = np.full(tube.horizon + 1, np.nan)
-        margin, rooms = float(item.margins(tube).min()), item.simulated(trajectories)
+        compared, rooms = item.compared(tube), item.simulated(trajectories)
+        holds, margin = item.proved(compared), float(compared.margins.min())
+        if not holds:  # what underflows or is no number proves nothing
+            margin = min(margin, -TINY) if np.isfinite(margin) else -np.inf
         margins.setdefault(item.name, blank.copy())[item.time] = margin
         simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min(initial=np.inf)
-        proved = proved and item.proved(margin)
+        proved = proved and holds
         worst = np.argsort(rooms)[:SUSPECTS]
         suspects += [(rooms[k], item, trajectories[k]) for k in worst if rooms[k] <= 0]
     for room, item, states in sorted(suspects, key=lambda suspect: suspect[0]):
@@ -100,17 +105,32 @@ def _decided(
     return Verdict(status, margins, simulated, None, unsolved)
 
 
+def _trajectories(tube: ReachTube, samples: int, seed: int) -> Float[np.ndarray, "c h+1 n_x"]:
+    """Trajectories from witnesses, corners and samples, as far as there are any."""
+    states = jnp.concatenate([tube.proof(t).witness_states for t in range(1, tube.horizon + 1)])
+    found = [tube.loop.simulate(states, tube.horizon, tube.start)]
+    with contextlib.suppress(RuntimeError):  # a set that is too thin to be sampled
+        found.append(tube.simulate(samples, seed))
+    trajectories = np.concatenate(found)
+    return trajectories[np.isfinite(trajectories).all(axis=(1, 2))]
+
+
 def _surely_broken(tube: ReachTube, item: Requirement, x0: np.ndarray) -> bool:
     """Whether the exact trajectory from `x0` breaks a requirement, rounding accounted for."""
     reached = Box(x0, x0)
     for t in range(item.time):
         reached = successor_box(tube.loop, reached, tube.start + t)
-    x, spread = np.asarray(reached.center), np.asarray(reached.widths)
-    C, d = (np.asarray(part) for part in item.region.facets)
-    error = abs(C) @ spread + gamma(len(x)) * (abs(C) @ abs(x) + abs(d))
-    if item.inside:
-        return bool(np.any(d - C @ x + error < 0))
-    return bool(np.all(d - C @ x - error >= 0))
+    lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
+    C, d = balanced(*(np.asarray(part) for part in item.region.facets), inner=not item.inside)
+    ends = np.where(C > 0, lower, upper), np.where(C > 0, upper, lower)
+    with np.errstate(over="ignore", invalid="ignore"):
+        least, most = (np.sum(C * end, axis=1) for end in ends)
+        size = np.sum(abs(C) * np.maximum(abs(lower), abs(upper)), axis=1)
+        underflow = TINY * ((C != 0) @ ((lower != 0) | (upper != 0)))
+        error = gamma(len(lower)) * size + underflow
+        if item.inside:
+            return bool(np.any(least - error > d))
+        return bool(np.all(most + error <= d))
 
 
 def _counterexample(

@@ -77,7 +77,7 @@ def test_edges_of_a_polygon_are_found():
     corners = rj.Polytope(normals, np.ones(7)).vertices()
     weights = np.random.default_rng(0).dirichlet(np.ones(7), size=500)
     found = fit.edges(np.vstack([corners, weights @ np.asarray(corners)]), 7)
-    order = np.argsort(np.arctan2(found[:, 1], found[:, 0]) % (2 * np.pi - 1e-9))
+    order = np.argsort((np.arctan2(found[:, 1], found[:, 0]) + 1e-9) % (2 * np.pi))
     np.testing.assert_allclose(found[order], normals, atol=1e-9)
 
 

@@ -7,7 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from reachjax.numerics.checks import Numbers, is_concrete, within_time_axis
+from reachjax.numerics.checks import (
+    Numbers,
+    is_concrete,
+    require_double_precision,
+    within_time_axis,
+)
 from reachjax.numerics.pytrees import converted, pytree
 from reachjax.numerics.rounding import gamma
 from reachjax.sets.base import PolyhedralSet
@@ -112,6 +117,7 @@ class Box(PolyhedralSet):
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the box: comparisons are exact."""
+        require_double_precision(set=self)
         x = self._points(point)
         return bool(jnp.all((self.lower <= x) & (x <= self.upper)))
 

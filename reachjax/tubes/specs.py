@@ -46,7 +46,8 @@ def verify(
 
     Raises:
         TypeError: a set is of a kind without facets.
-        ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
+        ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or a
+            part of the tube was exchanged for another one.
 
     Source: equations (reach_avoid) and (reach_avoid_approx) of the paper.
 
@@ -63,6 +64,7 @@ def verify(
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     if isinstance(tube, PartitionedTube):
+        tube.require_sealed()
         cells = [(each, of_tube(each, goal, avoid, safe)) for each in tube.tubes]
         return of_cells([_decided(*cell, samples, seed, tube.X0) for cell in cells])
     return _decided(tube, of_tube(tube, goal, avoid, safe), samples, seed, tube.sets[0])
@@ -74,9 +76,11 @@ def _decided(
     """What a tube proves, or a trajectory from `X0` refutes."""
     proofs = [tube.proof(t) for t in range(1, tube.horizon + 1)]
     unsolved = sum(s is not SolverStatus.SOLVED for proof in proofs for s in proof.statuses)
-    states = jnp.concatenate([proof.witness_states for proof in proofs])
-    witnessed = tube.loop.simulate(states, tube.horizon, tube.start)
-    trajectories = np.concatenate([witnessed, tube.simulate(samples, seed)])
+    trajectories = np.asarray(tube.simulate(samples, seed))
+    found = [proof.witness_states for proof in proofs if proof.witness_states.size]
+    if found:  # a tube from inside jax.jit has no witnesses
+        witnessed = tube.loop.simulate(jnp.concatenate(found), tube.horizon, tube.start)
+        trajectories = np.concatenate([witnessed, trajectories])
     if X0 is not tube.sets[0]:  # a cell may hold points beside the initial set
         trajectories = trajectories[np.asarray(X0.contains(trajectories[:, 0], BESIDE))]
     margins: dict[str, np.ndarray] = {}

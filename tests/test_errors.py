@@ -129,6 +129,13 @@ BAD_TYPES = {
     r"MLP\.layers must be pairs .*NoneType": lambda: rj.MLP.from_layers(None),
     r"Clarabel\.tolerance must be a number": lambda: rj.Clarabel(tolerance="a"),
     "progress must wrap an iterable": lambda: reach(progress=True),
+    "progress must return an iterable .* None arrived": lambda: reach(progress=lambda steps: None),
+    "progress must return .* wraps, .* None": lambda: rj.reach_partitioned(
+        LOOP, X0, 1, TEMPLATE, window=1, cells=(1, 1), samples=10, progress=lambda tubes: None
+    ),
+    r"controller must be of type reachjax\.MLP, .*from_layers of .* an MLP of tests\.test_errors": (
+        lambda: LOOP.replace(controller=type("MLP", (), {"__module__": __name__})())
+    ),
     "loop must be a ClosedLoop, but an AffinePlant": lambda: reach(loop=PLANT),
     "tube must be a ReachTube": lambda: rj.verify(LOOP, goal=X0),
     # misspelt options
@@ -165,6 +172,28 @@ def test_what_was_built_from_32_bit_floats_is_named(name):
     leftover = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), built)
     with pytest.raises(RuntimeError, match=f"{name} holds float32, but float64 is needed"):
         reach(**{name: leftover})
+
+
+FLAT = {
+    "box": X0,
+    "polytope": rj.Polytope(*X0.facets),
+    "ellipsoid": rj.Ellipsoid(np.zeros(2), np.eye(2)),
+    "intersection": rj.Intersection(X0, rj.Ellipsoid(np.zeros(2), np.eye(2))),
+}
+CERTIFIED = {
+    "support": lambda X: X.support([[0.1, 0.2]]),
+    "surely_contains": lambda X: X.surely_contains([0.1, 0.1]),
+}
+
+
+@pytest.mark.parametrize("question", CERTIFIED.values(), ids=CERTIFIED)
+@pytest.mark.parametrize("X", FLAT.values(), ids=FLAT)
+def test_sets_certify_nothing_in_32_bits(X, question):
+    with jax.enable_x64(False), pytest.raises(RuntimeError, match="needs 64-bit floats"):
+        question(X)
+    rounded = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), X)
+    with pytest.raises(RuntimeError, match="set holds float32, but float64 is needed"):
+        question(rounded)
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,11 @@ from reachjax.sets import Box
 
 PROJECTION = ReLU()
 
+NETWORK = (
+    "of type reachjax.MLP, which MLP.from_flax makes of a flax network, and MLP.from_layers of the "
+    "pairs (W, b) of any other"
+)
+
 
 @pytree
 class ClosedLoop(Replaceable):
@@ -49,10 +54,10 @@ class ClosedLoop(Replaceable):
     input_box: Box | None = None
 
     def __post_init__(self):
-        for name, kind in (("plant", AffinePlant), ("controller", MLP), ("input_box", Box)):
-            value = getattr(self, name)
-            if name != "input_box" or value is not None:
-                require_kind(f"ClosedLoop.{name}", value, kind, f"of type {kind.__name__}")
+        require_kind("ClosedLoop.plant", self.plant, AffinePlant, "of type AffinePlant")
+        require_kind("ClosedLoop.controller", self.controller, MLP, NETWORK)
+        if self.input_box is not None:
+            require_kind("ClosedLoop.input_box", self.input_box, Box, "of type Box")
         plant, net = self.plant, self.controller
         same_size(
             "the plant's number of states is",

@@ -19,19 +19,25 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from reachjax.loops.activations import ReLU
 from reachjax.numerics.checks import is_concrete
 
 ADVICE = "give its layers by MLP.from_layers"
 
 
-def flax_layers(source: Any, activation: Callable, module: Any = None) -> list[tuple[Any, Any]]:
+def flax_layers(
+    source: Any, activation: Callable | None, module: Any = None
+) -> list[tuple[Any, Any]]:
     """The pairs `(W, b)` of a flax network in the order of the forward pass.
+
+    Without an activation it is ReLU, where that is compared with what the network does.
 
     Raises:
         TypeError: `source` is neither an nnx module nor a mapping of linen parameters.
         ValueError: it holds other parameters than those of linear layers, or their order or what
             is between them cannot be told.
     """
+    given, activation = activation is not None, ReLU() if activation is None else activation
     if isinstance(source, nnx.State) or not isinstance(source, nnx.Module | Mapping):
         raise TypeError(
             "source must be a flax nnx module or the parameters of a linen module, "
@@ -41,6 +47,11 @@ def flax_layers(source: Any, activation: Callable, module: Any = None) -> list[t
         pairs = _linen_layers(source.get("params", source))
         if module is not None:
             _require_same_module(module, pairs, activation)
+        elif not given and len(pairs) > 1:
+            raise ValueError(
+                "linen's parameters do not tell what is between the layers: give activation=, such "
+                "as reachjax.ReLU(), or module=, the linen module, to have it compared"
+            )
         elif _orders(pairs) > 1:
             raise ValueError(
                 "the layers chain in more than one order, and linen numbers them as they are "
@@ -56,6 +67,11 @@ def flax_layers(source: Any, activation: Callable, module: Any = None) -> list[t
         raise ValueError(
             "source keeps its layers as attributes, whose order is lost inside jit: "
             f"keep them in nnx.List or nnx.Sequential, or {ADVICE}"
+        )
+    elif not given and len(pairs) > 1 and type(source) is not nnx.Sequential:
+        raise ValueError(
+            "what source does between its layers cannot be seen where it is traced, or cannot be "
+            "called: give activation=, such as reachjax.ReLU(), or keep all of it in nnx.Sequential"
         )
     return pairs
 

@@ -96,7 +96,7 @@ class MLP(Replaceable):
     def from_flax(
         cls,
         source: Any,
-        activation: AbstractActivation = ReLU(),  # noqa: B008
+        activation: AbstractActivation | None = None,
         module: Any = None,
     ) -> MLP:
         """A network from a flax nnx module, or from the parameters of a linen module.
@@ -106,18 +106,20 @@ class MLP(Replaceable):
         Args:
             source: an `nnx.Module` whose linear layers are applied in the order in which they
                 were assigned, or linen's `{"params": {"Dense_0": {"kernel", "bias"}, ...}}`.
-            activation: applied between the layers; linen's parameters do not tell which one it is,
-                and their names do not always tell the order of the layers.
-            module: the linen module itself: what is read is then compared with its output.
+            activation: applied between the layers. None for ReLU, where what is read can be
+                compared with the network's output or the layers stand in an `nnx.Sequential`.
+            module: the linen module itself, whose parameters do not tell what is between the
+                layers, nor always their order: what is read is then compared with its output.
 
         Raises:
             TypeError: `source` is neither.
             ValueError: it holds something else than a chain of linear layers, or computes something
-                else, or the order of its layers cannot be told.
+                else, or the order of its layers or the activation cannot be told.
         """
         from reachjax.loops.flax_layers import flax_layers
 
-        return cls(flax_layers(source, activation, module), activation)
+        read = flax_layers(source, activation, module)
+        return cls(read, ReLU() if activation is None else activation)
 
     @property
     def inputs(self) -> int:

@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import Numbers, within_time_axis
 from reachjax.numerics.pytrees import Replaceable, converted, pytree
+
+
+def _one_array(constant: str, varying: str) -> Callable[..., Array]:
+    """A converter that refuses a tuple of matrices: it may be meant as an interval."""
+    numbers, ndim = Numbers(constant, varying), constant.count(",") + (not constant.endswith(",)"))
+
+    def convert(value: Any, name: str = "value") -> Array:
+        if isinstance(value, tuple | list) and any(np.ndim(e) >= ndim for e in _arrays(value)):
+            kind = type(value).__name__
+            raise TypeError(
+                f"{name} must be one array of shape {constant} or {varying}, but a {kind} of "
+                f"{len(value)} arrays arrived: for a plant that varies in time give one array with "
+                "a leading time axis, such as jnp.stack of them; what is only known to lie between "
+                "two values needs a disturbance"
+            )
+        return numbers(value, name)
+
+    return convert
+
+
+def _arrays(values: Iterable[Any]) -> list[Any]:
+    return [value for value in values if hasattr(value, "dtype")]
 
 
 @pytree
@@ -22,6 +46,8 @@ class AffinePlant(Replaceable):
         c: `(n_x,)` or `(time, n_x)`, in the units of the state; zero when left out.
 
     Raises:
+        TypeError: a tuple or a list of arrays arrived, of which nobody knows what they are: the
+            matrices of several times, or the ends of an interval.
         ValueError: shapes disagree, time axes differ in length, or an entry is not finite.
 
     Example:
@@ -30,9 +56,11 @@ class AffinePlant(Replaceable):
         [1.5, 0.0]
     """
 
-    A: Float[Array, "*time n n"] = converted(converter=Numbers("(n_x, n_x)", "(time, n_x, n_x)"))
-    B: Float[Array, "*time n m"] = converted(converter=Numbers("(n_x, n_u)", "(time, n_x, n_u)"))
-    c: Float[Array, "*time n"] = converted(converter=Numbers("(n_x,)", "(time, n_x)"), default=None)
+    A: Float[Array, "*time n n"] = converted(converter=_one_array("(n_x, n_x)", "(time, n_x, n_x)"))
+    B: Float[Array, "*time n m"] = converted(converter=_one_array("(n_x, n_u)", "(time, n_x, n_u)"))
+    c: Float[Array, "*time n"] = converted(
+        converter=_one_array("(n_x,)", "(time, n_x)"), default=None
+    )
 
     def __post_init__(self):
         n = self.A.shape[-1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -16,8 +17,38 @@ def is_concrete(*trees: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def owned(tree: Any) -> Any:
+    """The tree with every concrete leaf as an array that shares memory with none that exists.
+
+    `jnp.asarray` and `jax.device_put` keep aligned numpy arrays as they are, so what is written
+    into these later would change objects that were built from them. Leaves that are sharded over
+    devices come to one of them; traced ones are left alone.
+    """
+    return jax.tree.map(_own, tree)
+
+
+def _own(leaf: Any) -> Any:
+    if isinstance(leaf, Tracer):
+        return leaf
+    with jax.ensure_compile_time_eval():  # a constant stays one inside jax.jit
+        return jnp.array(_gathered(leaf))
+
+
+def _gathered(value: Any) -> Any:
+    """A concrete array of several devices on the host; anything else as it is."""
+    if isinstance(value, jax.Array) and len(value.sharding.device_set) > 1:
+        return np.asarray(value)
+    return value
+
+
+EXACT = 2**53
+"""Whole numbers up to this one are numbers of float64."""
+
+
 class Numbers:
     """Converts what a user passes to a finite floating-point array of an expected shape.
+
+    The array is a copy, on one device, and no number is rounded to become one of float64.
 
     Args:
         shapes: the shapes that are allowed, in words: each is one axis name for each axis, such as
@@ -33,14 +64,13 @@ class Numbers:
 
         Raises:
             TypeError: `value` is not numeric.
-            ValueError: `value` has another number of axes, or holds NaN or infinity.
+            ValueError: `value` has another number of axes, holds NaN or infinity or a number that
+                is none of float64, or is traced and sharded over devices.
         """
         expected = f"{name} must be an array of shape {self.expected}"
         try:
-            if any(_is_complex(leaf) for leaf in jax.tree.leaves(value)):
-                raise TypeError("its entries are complex")
-            array = jnp.asarray(value, dtype=float)
-        except (TypeError, ValueError, RuntimeError) as error:
+            array = as_floats(value, name)
+        except (TypeError, RuntimeError) as error:
             kind = type(value).__name__
             raise TypeError(f"{expected}, but a {kind} arrived: {error}") from None
         if array.ndim not in self.ndims or array.size == 0:
@@ -51,9 +81,102 @@ class Numbers:
         return array
 
 
-def _is_complex(leaf: Any) -> bool:
-    """A number or an array of complex numbers, which a conversion would cut to their real parts."""
-    return isinstance(leaf, complex) or getattr(getattr(leaf, "dtype", None), "kind", "") == "c"
+def as_floats(value: Any, name: str) -> jax.Array:
+    """`value` as an array of floats that has its own memory, all numbers as they are.
+
+    Raises:
+        TypeError: `value` is not numeric, or it is ragged.
+        ValueError: float64 does not hold one of its numbers, or it is traced and sharded.
+    """
+    require_exact(value, name)
+    if isinstance(value, Tracer):
+        _require_one_device(value, name)
+        return jnp.asarray(value, dtype=float)
+    try:
+        if isinstance(value, jax.Array):
+            with jax.ensure_compile_time_eval():  # a constant stays one inside jax.jit
+                return jnp.array(_gathered(value), dtype=float)
+        return jnp.array(value, dtype=float)
+    except ValueError as error:
+        raise TypeError(str(error)) from None
+
+
+def require_exact(value: Any, name: str) -> None:
+    """Raise an error where a conversion to float64 would change a number.
+
+    Raises:
+        TypeError: there is text, a date, or a complex number (it would be cut to its real part).
+        ValueError: float64 does not hold a number.
+    """
+    for leaf in jax.tree.leaves(value):
+        changed = _first_changed(leaf)
+        if changed is not None:
+            number = repr(changed) if len(repr(changed)) < 80 else f"{repr(changed)[:60]}..."
+            raise ValueError(
+                f"{name} must hold numbers of float64, but {number} is none: the nearest one is "
+                f"{_nearest(changed)!r}; give that one if it will do"
+            )
+
+
+def _first_changed(leaf: Any) -> Any:
+    """The first number that a conversion to float64 would change; None if it changes none."""
+    if isinstance(leaf, float | Tracer):
+        return None
+    if isinstance(leaf, str | bytes):
+        raise TypeError("it is text")
+    if isinstance(leaf, complex):
+        raise TypeError("its entries are complex")
+    kind = getattr(leaf, "dtype", None)
+    if kind is None and not isinstance(leaf, int) and hasattr(leaf, "__array__"):
+        leaf = np.asarray(leaf)
+        kind = leaf.dtype
+    if kind is None:
+        return None if _held(leaf) else leaf
+    if jnp.issubdtype(kind, jnp.complexfloating):
+        raise TypeError("its entries are complex")
+    code, size = getattr(kind, "kind", ""), kind.itemsize
+    if code in "USMm":
+        raise TypeError(f"its entries are of type {kind}, which are no numbers")
+    if code == "O":
+        found = (_first_changed(entry) for entry in np.asarray(leaf).ravel())
+        return next((entry for entry in found if entry is not None), None)
+    if code in "iu" and size == 8:
+        array = np.asarray(leaf)
+        large = array[(array > EXACT) | (array < -EXACT)].tolist()
+        return next((entry for entry in large if not _held(entry)), None)
+    if code == "f" and size > 8:
+        array = np.asarray(leaf)
+        with np.errstate(over="ignore"):
+            changed = array[(array.astype(float) != array) & (array == array)]
+        return changed.flat[0] if changed.size else None
+    return None
+
+
+def _held(number: Any) -> bool:
+    """Whether float64 holds a number such as an `int` or a `Fraction`; True of what is none."""
+    try:
+        return bool(float(number) == number)
+    except OverflowError:
+        return False
+    except (TypeError, ValueError):
+        return True  # the conversion will say what it is
+
+
+def _nearest(number: Any) -> float:
+    try:
+        return float(number)
+    except OverflowError:
+        return float("inf" if number > 0 else "-inf")
+
+
+def _require_one_device(value: Tracer, name: str) -> None:
+    """Inside `jax.jit` an array that is sharded explicitly cannot be brought to one device."""
+    over = [axis for axis in jax.typeof(value).sharding.spec if axis is not None]
+    if over:
+        raise ValueError(
+            f"{name} must not be sharded, but it is over the mesh axes {over}: gather it before, "
+            "by jax.device_get, or inside jax.jit by jax.sharding.reshard"
+        )
 
 
 def whole_number(name: str, value: Any, least: int) -> int:
@@ -86,13 +209,35 @@ def real_number(name: str, value: Any, least: float) -> float:
         raise TypeError(f"{name} must be a number, but {described(value)} arrived")
     if not (np.isfinite(array) and array >= least):
         raise ValueError(f"{name} must be finite and at least {least:g}, but {array} arrived")
+    require_exact(value, name)
     return float(array)
 
 
 def require_kind(name: str, value: Any, kind: type, expected: str) -> None:
     """Raise a `TypeError` that says what was expected if `value` is of another kind."""
     if not isinstance(value, kind):
-        raise TypeError(f"{name} must be {expected}, but {described(value)} arrived")
+        arrived = described(value)
+        if type(value).__name__ == kind.__name__:  # a class of the same name, of another library
+            arrived += f" of {type(value).__module__}"
+        raise TypeError(f"{name} must be {expected}, but {arrived} arrived")
+
+
+def wrapped(progress: Any, items: Iterable[Any]) -> Iterable[Any]:
+    """The items as a progress bar passes them on; as they are where there is none.
+
+    Raises:
+        TypeError: the bar returns nothing that can be iterated over.
+    """
+    if progress is None:
+        return items
+    shown = progress(items)
+    try:
+        return iter(shown)
+    except TypeError:
+        raise TypeError(
+            "progress must return an iterable over what it wraps, as tqdm.tqdm does, but "
+            f"{described(shown)} arrived"
+        ) from None
 
 
 def require_bar(progress: Any) -> None:
@@ -138,6 +283,11 @@ def require_double_precision(**arguments: Any) -> None:
         raise RuntimeError(f"reachability needs 64-bit floats, but JAX's are off: {remedy}")
     for name, tree in arguments.items():
         for leaf in jax.tree.leaves(tree):
-            if jnp.result_type(leaf) != jnp.float64:
-                kind = jnp.result_type(leaf)
+            kind = getattr(leaf, "dtype", None) or jnp.result_type(leaf)
+            if kind != jnp.float64:
                 raise RuntimeError(f"{name} holds {kind}, but float64 is needed: {remedy}")
+
+
+def floats_of(tree: Any) -> list[Any]:
+    """The leaves that hold no whole numbers."""
+    return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]

@@ -2,6 +2,9 @@
 
 Inside `jax.jit` and `jax.vmap` they are reached through `jax.pure_callback`; on plain arrays they
 are called as they are. No JAX call is made inside a callback, and only arrays cross.
+
+A callback runs on a thread of its own, where JAX rounds all numbers to 32 bits if 64-bit floats are
+on only in a scope, `with jax.enable_x64(True)`. So numbers of 64 bits cross as pairs of 32.
 """
 
 from __future__ import annotations
@@ -9,7 +12,9 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from reachjax.numerics.checks import is_concrete
 
@@ -33,12 +38,15 @@ def on_host(function: Any, shapes: Any, argument: Any) -> Any:
         argument: a tree of JAX arrays.
     """
     if is_concrete(argument):
-        return jax.device_put(function(jax.device_get(argument)))
+        # copied: a solver may use its arrays again
+        return jax.device_put(jax.tree.map(np.array, function(jax.device_get(argument))))
     core = [leaf.ndim for leaf in jax.tree.leaves(argument)]
+    kinds = [leaf.dtype for leaf in jax.tree.leaves(argument)]
     structure = jax.tree.structure(argument)
 
     def batched(*leaves):
-        leaves = [np.asarray(leaf) for leaf in leaves]
+        given = map(np.asarray, leaves)
+        leaves = [_joined(leaf, kind) for leaf, kind in zip(given, kinds, strict=True)]
         leads = [leaf.shape[: leaf.ndim - k] for leaf, k in zip(leaves, core, strict=True)]
         batch = np.broadcast_shapes(*leads)
         whole = [
@@ -49,15 +57,43 @@ def on_host(function: Any, shapes: Any, argument: Any) -> Any:
             jax.tree.leaves(function(jax.tree.unflatten(structure, [leaf[i] for leaf in whole])))
             for i in np.ndindex(batch)
         ]
-        return [
+        stacked = [
             np.stack(parts).reshape(batch + np.shape(parts[0]))
             for parts in zip(*results, strict=True)
         ]
+        return [_halved(part.astype(kind)) for part, kind in zip(stacked, returned, strict=True)]
 
-    flat = jax.pure_callback(
+    expected, described = jax.tree.flatten(shapes)
+    returned = [leaf.dtype for leaf in expected]
+    halves = jax.pure_callback(
         batched,
-        jax.tree.leaves(shapes),
-        *jax.tree.leaves(argument),
+        [_halved_shape(leaf) for leaf in expected],
+        *(_halved(leaf) for leaf in jax.tree.leaves(argument)),
         vmap_method="expand_dims",
     )
-    return jax.tree.unflatten(jax.tree.structure(shapes), flat)
+    flat = [_joined(half, kind) for half, kind in zip(halves, returned, strict=True)]
+    return jax.tree.unflatten(described, flat)
+
+
+def _halved(leaf: Array | np.ndarray) -> Array | np.ndarray:
+    """Numbers of 64 bits as pairs of 32, `(..., 2)`; others as they are."""
+    if leaf.dtype.itemsize != 8:
+        return leaf
+    if isinstance(leaf, np.ndarray):
+        return np.ascontiguousarray(leaf).reshape(*leaf.shape, 1).view(np.uint32)
+    return jax.lax.bitcast_convert_type(leaf, jnp.uint32)
+
+
+def _halved_shape(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+    if leaf.dtype.itemsize != 8:
+        return leaf
+    return jax.ShapeDtypeStruct((*leaf.shape, 2), jnp.uint32)
+
+
+def _joined(half: Array | np.ndarray, kind: np.dtype) -> Any:
+    """What `_halved` took apart."""
+    if kind.itemsize != 8:
+        return half
+    if isinstance(half, np.ndarray):
+        return np.ascontiguousarray(half).view(kind)[..., 0]
+    return jax.lax.bitcast_convert_type(half, kind)

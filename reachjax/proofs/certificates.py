@@ -12,6 +12,7 @@ import abc
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from reachjax.numerics.checks import floats_of, require_double_precision
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.lmi import Program
 from reachjax.proofs.proposal import SolverStatus
@@ -58,6 +59,7 @@ class AbstractCertificate(Replaceable, abc.ABC):
 
     def _proposed(self, multipliers: Float[np.ndarray, "f K"] | None) -> Float[np.ndarray, "f K"]:
         """These multipliers, or the certificate's own."""
+        require_double_precision(certificate=floats_of(self))
         proposed = np.asarray(self.multipliers if multipliers is None else multipliers)
         if proposed.shape != self.multipliers.shape:
             raise ValueError(

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from reachjax.numerics.checks import Numbers, same_size
+from reachjax.numerics.checks import Numbers, as_floats, require_double_precision, same_size
 from reachjax.numerics.pytrees import Replaceable
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.sets.balance import balanced
@@ -57,6 +57,7 @@ class AbstractSet(Replaceable, abc.ABC):
         """The largest value of each direction on the set (rounded up where it is computed)."""
 
     def _directions(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, "m n"]:
+        require_double_precision(set=self)
         rows = Numbers("(m, n)")(directions, "directions")
         same_size(
             "the set's dimension is",
@@ -66,7 +67,7 @@ class AbstractSet(Replaceable, abc.ABC):
         return rows
 
     def _points(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch n"]:
-        rows = jnp.asarray(points)
+        rows = as_floats(points, "points")
         arrived = rows.shape[-1] if rows.ndim else None
         same_size("the set's dimension is", "the dimension of points is", (self.dimension, arrived))
         return rows
@@ -104,6 +105,7 @@ class PolyhedralSet(AbstractSet):
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
+        require_double_precision(set=self)
         x = np.asarray(self._points(point))  # numpy knows subnormal numbers, XLA does not
         A, b = balanced(*(np.asarray(part) for part in self.facets), inner=True)
         with np.errstate(over="ignore", invalid="ignore"):

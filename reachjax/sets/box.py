@@ -7,7 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from reachjax.numerics.checks import Numbers, is_concrete, within_time_axis
+from reachjax.numerics.checks import (
+    Numbers,
+    is_concrete,
+    require_double_precision,
+    within_time_axis,
+)
 from reachjax.numerics.pytrees import converted, pytree
 from reachjax.numerics.rounding import TINY, exponents, gamma, raised, shifted
 from reachjax.sets.base import PolyhedralSet
@@ -107,6 +112,7 @@ class Box(PolyhedralSet):
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the box: comparisons are exact."""
+        require_double_precision(set=self)
         x = np.asarray(self._points(point))  # numpy knows subnormal numbers, XLA does not
         return bool(np.all((np.asarray(self.lower) <= x) & (x <= np.asarray(self.upper))))
 

@@ -16,7 +16,13 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from reachjax.numerics.checks import Numbers, is_concrete, same_size, whole_number
+from reachjax.numerics.checks import (
+    Numbers,
+    is_concrete,
+    require_double_precision,
+    same_size,
+    whole_number,
+)
 from reachjax.numerics.pytrees import converted, pytree
 from reachjax.numerics.rounding import TINY, exponents, gamma, raised, shifted
 from reachjax.sets import outward
@@ -119,6 +125,7 @@ class Ellipsoid(AbstractSet):
             >>> Ellipsoid.enclosing(form, 2.0).shape.round(6).tolist()
             [[16.0, 0.0], [0.0, 4.0]]
         """
+        require_double_precision(form=form)
         A, b = form
         if is_concrete(level) and level <= 0:
             raise ValueError(f"level must be above 0, but {level} arrived")
@@ -165,6 +172,7 @@ class Ellipsoid(AbstractSet):
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
+        require_double_precision(set=self)
         x = self._points(point)
         if x.ndim != 1:
             raise ValueError(f"point must be one of shape (n,), but {x.shape} arrived")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from reachjax.numerics.checks import Numbers, is_concrete, same_size
+from reachjax.numerics.checks import Numbers, is_concrete, require_double_precision, same_size
 from reachjax.numerics.pytrees import converted, pytree
 from reachjax.sets import hulls, polyhedra
 from reachjax.sets.base import PolyhedralSet
@@ -73,6 +73,7 @@ class Polytope(PolyhedralSet):
         Raises:
             ValueError: the polytope is empty or unbounded.
         """
+        require_double_precision(set=self)
         lower, upper = polyhedra.bounding_box(*self._host())
         return Box(lower, upper)
 

@@ -19,10 +19,12 @@ from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import (
     described,
     is_concrete,
+    owned,
     require_bar,
     require_double_precision,
     require_kind,
     whole_number,
+    wrapped,
 )
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
@@ -31,6 +33,7 @@ from reachjax.sets.geometry import bounding_box, support
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.cells import grid, halves
 from reachjax.tubes.reach import SAMPLES, ReachTube, reach
+from reachjax.tubes.seals import Seal, require_sealed, seal_of
 
 Bar = Callable[[Iterable[Any]], Iterable[Any]]
 """Wraps an iteration over cells, such as `tqdm.tqdm`."""
@@ -49,10 +52,26 @@ class PartitionedTube(Replaceable):
     Attributes:
         X0: the initial set.
         tubes: one for each cell.
+        seal: a hash of both, as `reach_partitioned` returned them.
+
+    Raises:
+        ValueError: a part was exchanged for another one. These tubes come from `reach_partitioned`.
     """
 
     X0: AbstractSet
     tubes: tuple[ReachTube, ...]
+    seal: Seal | None = None
+
+    def __post_init__(self):
+        self.require_sealed()
+
+    def require_sealed(self) -> None:
+        """Raise an error unless both parts are those that `reach_partitioned` returned together.
+
+        Raises:
+            ValueError: a part was changed, or exchanged for another one.
+        """
+        require_sealed("the tube", self.seal, self.X0, [tube.seal for tube in self.tubes])
 
     def __repr__(self) -> str:
         return f"PartitionedTube(cells={len(self.tubes)}, horizon={self.horizon})"
@@ -154,6 +173,7 @@ def reach_partitioned(
             f"but {described(executor)} arrived"
         )
     require_bar(progress)
+    X0 = owned(X0)
     options = {
         "horizon": horizon,
         "relaxation": relaxation,
@@ -181,7 +201,7 @@ def reach_partitioned(
     finally:
         if own is not None:
             own.shutdown(cancel_futures=True)
-    return PartitionedTube(X0, tuple(tubes))
+    return PartitionedTube(X0, tuple(tubes), seal_of(X0, [tube.seal for tube in tubes]))
 
 
 class _Run:
@@ -206,7 +226,7 @@ class _Run:
         futures = [self._executor.submit(_tube, self._loop, cell, *given) for cell in arrays]
         try:
             done = _results(futures)
-            for _ in done if self._progress is None else self._progress(done):
+            for _ in wrapped(self._progress, done):
                 pass
         except BaseException:
             for future in futures:

@@ -14,12 +14,15 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import (
+    floats_of,
     is_concrete,
+    owned,
     require_bar,
     require_double_precision,
     require_kind,
     same_size,
     whole_number,
+    wrapped,
 )
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
@@ -27,6 +30,7 @@ from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.witnesses import Simulations, initial_states
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.seals import Seal, require_sealed, seal_of
 from reachjax.tubes.steps import Setting, Step, boxed
 from reachjax.tubes.successors import successors
 
@@ -57,6 +61,10 @@ class ReachTube(Replaceable):
         sets: `sets[t]` for `t = 0 .. horizon`; `sets[0]` is the initial set.
         certificates: `certificates[t]` for `t = 1 .. horizon`; the first entry is `None`.
         start: the time of the initial set, for time-varying loops.
+        seal: a hash of all of these, as `reach` returned them: it is what makes the tube a proof.
+
+    Raises:
+        ValueError: a part was exchanged for another one. Tubes come from `reach`.
     """
 
     loop: ClosedLoop
@@ -64,6 +72,21 @@ class ReachTube(Replaceable):
     sets: tuple[AbstractSet, ...]
     certificates: tuple[AbstractCertificate | None, ...]
     start: int = static(default=0)
+    seal: Seal | None = None
+
+    def __post_init__(self):
+        self.require_sealed()
+
+    def require_sealed(self) -> None:
+        """Raise an error unless all parts are those that `reach` computed together.
+
+        Raises:
+            RuntimeError: numbers were cast to lower precision, or JAX's 64-bit floats are off.
+            ValueError: a part was changed, or exchanged for another one.
+        """
+        parts = self.loop, self.template, self.sets, self.certificates
+        require_double_precision(tube=floats_of(parts))
+        require_sealed("the tube", self.seal, *parts, start=self.start)
 
     def __repr__(self) -> str:
         sets = self.template.summary
@@ -170,7 +193,7 @@ def reach(
 
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
-        TypeError: an argument is of another kind.
+        TypeError: an argument is of another kind, or `progress` returns no iterable.
         ValueError: dimensions disagree, `X0` is empty or unbounded, the window is no positive
             number, or None inside `jax.jit`, a time-varying loop ends before the horizon, states
             overflow, or `progress` leaves out steps. What depends on traced values is NaN instead,
@@ -196,6 +219,7 @@ def reach(
         True
     """
     _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
+    loop, X0, template = owned((loop, X0, template))
     boxed(X0, "X0")
     fixed = jax.lax.stop_gradient((loop, X0))
     simulations = None
@@ -212,7 +236,7 @@ def reach(
     )
     sets, certificates, steps = [X0], [], []
     numbers = range(horizon)
-    for _, k in zip(numbers if progress is None else progress(numbers), numbers, strict=False):
+    for _, k in zip(wrapped(progress, numbers), numbers, strict=False):
         before = steps if window is None else steps[max(0, k + 1 - window) :]
         proof = certificates[-1] if certificates else None
         steps.append(Step(setting, sets[-1], k, tuple(before), proof))
@@ -225,7 +249,8 @@ def reach(
         )
     if simulations is not None and is_concrete(certificates):
         certificates = _with_witnesses(certificates, sets, simulations, steps)
-    return ReachTube(loop, template, tuple(sets), (None, *certificates), start)
+    proved = loop, template, tuple(sets), (None, *owned(certificates))
+    return ReachTube(*proved, start, seal_of(*proved, start=start))
 
 
 def _with_witnesses(

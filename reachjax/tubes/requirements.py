@@ -95,9 +95,11 @@ def of_tube(
 
     Raises:
         TypeError: there is no tube, or a set is of a kind without facets.
-        ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
+        ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or a
+            part of the tube was exchanged for another one.
     """
     require_kind("tube", tube, ReachTube, "a ReachTube, as reach(...) returns it")
+    tube.require_sealed()
     return requirements(tube.loop.states, tube.horizon, goal, avoid, safe)
 
 

@@ -50,7 +50,8 @@ def verify(
 
     Raises:
         TypeError: a set is of a kind without facets.
-        ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
+        ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or a
+            part of the tube was exchanged for another one.
 
     Source: equations (reach_avoid) and (reach_avoid_approx) of the paper.
 
@@ -67,6 +68,7 @@ def verify(
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     if isinstance(tube, PartitionedTube):
+        tube.require_sealed()
         cells = [(each, of_tube(each, goal, avoid, safe)) for each in tube.tubes]
         return of_cells([_decided(*cell, samples, seed, tube.X0) for cell in cells])
     return _decided(tube, of_tube(tube, goal, avoid, safe), samples, seed, tube.sets[0])
@@ -107,8 +109,11 @@ def _decided(
 
 def _trajectories(tube: ReachTube, samples: int, seed: int) -> Float[np.ndarray, "c h+1 n_x"]:
     """Trajectories from witnesses, corners and samples, as far as there are any."""
-    states = jnp.concatenate([tube.proof(t).witness_states for t in range(1, tube.horizon + 1)])
-    found = [tube.loop.simulate(states, tube.horizon, tube.start)]
+    found = [np.zeros((0, tube.horizon + 1, tube.loop.states))]
+    proofs = (tube.proof(t) for t in range(1, tube.horizon + 1))
+    states = [proof.witness_states for proof in proofs if proof.witness_states.size]
+    if states:  # a tube from inside jax.jit has none
+        found.append(tube.loop.simulate(jnp.concatenate(states), tube.horizon, tube.start))
     with contextlib.suppress(RuntimeError):  # a set that is too thin to be sampled
         found.append(tube.simulate(samples, seed))
     trajectories = np.concatenate(found)

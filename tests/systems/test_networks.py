@@ -1,5 +1,7 @@
 """Claims about networks: the forward pass, and what is read from flax."""
 
+import functools
+
 import flax
 import jax
 import jax.numpy as jnp
@@ -155,7 +157,8 @@ def test_linen_parameters_may_be_traced():
     def through(apply):
         return jax.jit(jax.grad(lambda v: jnp.sum(apply(v, jnp.ones(3)))))(variables)
 
-    ours, theirs = through(lambda v, x: rj.MLP.from_flax(v)(x)), through(module.apply)
+    read = functools.partial(rj.MLP.from_flax, activation=rj.ReLU())
+    ours, theirs = through(lambda v, x: read(v)(x)), through(module.apply)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), ours, theirs)
 
 
@@ -230,7 +233,7 @@ class Nested(linen.Module):
 def test_linen_layers_that_chain_in_several_orders_are_refused_without_their_module():
     variables = Nested().init(jax.random.key(0), jnp.ones(2))
     with pytest.raises(ValueError, match=r"chain in more than one order.*pass module="):
-        rj.MLP.from_flax(variables)
+        rj.MLP.from_flax(variables, rj.ReLU())
     with pytest.raises(ValueError, match="computes something else than its linear layers"):
         rj.MLP.from_flax(variables, module=Nested())
     assert (
@@ -241,6 +244,34 @@ def test_linen_layers_that_chain_in_several_orders_are_refused_without_their_mod
         )
         == 2
     )
+
+
+def test_linen_parameters_need_an_activation_or_their_module():
+    class Tanh(linen.Module):
+        @linen.compact
+        def __call__(self, x):
+            return linen.Dense(1)(linen.tanh(linen.Dense(3)(x)))
+
+    variables = Tanh().init(jax.random.key(0), jnp.ones(2))
+    with pytest.raises(ValueError, match="do not tell what is between the layers: give"):
+        rj.MLP.from_flax(variables)
+    with pytest.raises(ValueError, match="computes something else than its linear layers"):
+        rj.MLP.from_flax(variables, module=Tanh())
+    alone = linen.Dense(1).init(jax.random.key(0), jnp.ones(2))
+    assert len(rj.MLP.from_flax({"Dense_0": alone["params"]}).layers) == 1
+
+
+def test_a_traced_module_is_not_taken_for_a_relu_network():
+    class Tanh(nnx.Module):
+        def __init__(self):
+            self.layers = nnx.List([linear(2, 3), linear(3, 1)])
+
+        def __call__(self, x):
+            return self.layers[1](nnx.tanh(self.layers[0](x)))
+
+    graph, weights = nnx.split(Tanh())
+    with pytest.raises(ValueError, match=r"cannot be seen where it is traced.*give activation="):
+        jax.jit(lambda w: rj.MLP.from_flax(nnx.merge(graph, w))(jnp.ones(2)))(weights)
 
 
 def test_linen_layers_whose_names_do_not_tell_their_order_are_refused():

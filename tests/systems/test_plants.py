@@ -41,6 +41,28 @@ def test_the_offset_is_zero_when_left_out(lead):
     np.testing.assert_allclose(system.propagate(jnp.ones(3), jnp.ones(1), 1), 4.0)
 
 
+PAIR = (0.9 * np.eye(2), 1.1 * np.eye(2))
+TUPLES = {
+    "A": lambda: rj.AffinePlant(PAIR, np.ones((2, 1))),
+    "B": lambda: rj.AffinePlant(np.eye(2), [jnp.ones((2, 1)), jnp.zeros((2, 1))]),
+    "c": lambda: rj.AffinePlant(np.eye(2), np.ones((2, 1)), (np.zeros(2), np.ones(2))),
+}
+
+
+@pytest.mark.parametrize("name", TUPLES)
+def test_a_tuple_of_matrices_is_neither_read_as_times_nor_as_an_interval(name):
+    both_ways = "for a plant that varies in time give one array .* needs a disturbance"
+    with pytest.raises(TypeError, match=rf"AffinePlant\.{name} must be one array .* {both_ways}"):
+        TUPLES[name]()
+
+
+def test_lists_of_numbers_and_of_rows_are_matrices():
+    rows = rj.AffinePlant([np.ones(2), jnp.zeros(2)], [[1.0], [2.0]], [np.float64(1.0), 2])
+    np.testing.assert_array_equal(rows.A, [[1.0, 1.0], [0.0, 0.0]])
+    assert rows.steps is None
+    assert rj.AffinePlant([[[1.0, 0.0], [0.0, 1.0]]] * 3, np.ones((2, 1))).steps == 3
+
+
 def test_integers_become_floats():
     system = rj.AffinePlant([[1, 1], [0, 1]], [[0], [1]], [2, 0])
     assert {a.dtype for a in jax.tree.leaves(system)} == {jnp.dtype("float64")}

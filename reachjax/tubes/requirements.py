@@ -17,8 +17,7 @@ from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import described, is_concrete, real_number, require_kind
 from reachjax.sets import Box, PolyhedralSet
-from reachjax.sets.geometry import separation, support
-from reachjax.solvers import facets_in_units
+from reachjax.sets.geometry import facets_in_units, separation, support
 from reachjax.tubes.reach import ReachTube
 
 AvoidSets = Sequence[PolyhedralSet] | Mapping[int, Sequence[PolyhedralSet]]

@@ -1,20 +1,14 @@
 """Every notebook runs from top to bottom."""
 
-from pathlib import Path
-
-import nbformat
 import pytest
-from nbclient import NotebookClient
 
-NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
+from docs.tools.tutorials import NOTEBOOKS, executed
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(path):
-    notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": path.parent}}).execute()
-    printed = [out for cell in notebook.cells for out in cell.get("outputs", [])]
+    printed = [out for cell in executed(path).cells for out in cell.get("outputs", [])]
     assert any(out.output_type == "display_data" for out in printed)  # it shows a figure
 
 

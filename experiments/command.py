@@ -1,14 +1,14 @@
-"""What experiments share at the command line: how they run, their bars, tables and checks."""
+"""What experiments share at the command line: how they run, their options and their bars."""
 
+import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import tyro
-from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 CONTINUES = "run again to continue with what is stored"
 
@@ -17,8 +17,10 @@ def run_experiment(
     main: Callable[[Any], None], settings: type, interrupted: str = CONTINUES
 ) -> None:
     """`main(settings)` as the command line has them; mistakes end it with one line."""
+    spec = sys.modules["__main__"].__spec__
+    command = spec and f"python -m {spec.name.removesuffix('.__main__')}"
     try:
-        main(tyro.cli(settings))
+        main(tyro.cli(settings, prog=command))
     except (ValueError, OSError, ImportError) as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
@@ -47,14 +49,37 @@ def bar(progress=True):
     return Progress(*columns, TimeElapsedColumn(), disable=not progress)
 
 
-def blank_table(title: str, *headings: str) -> Table:
-    """An empty table in the style of all experiments."""
-    style = {"box": SIMPLE_HEAD, "padding": (0, 1, 0, 0), "title_style": "bold"}
-    return Table(*headings, title=title, **style)
-
-
 def at_least_one(**counts):
     """Raise a `ValueError` that names the first count below one."""
     for name, value in counts.items():
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+
+
+def require_options(settings: Any, *positive: str, **least: float) -> None:
+    """Check options, each a number, or numbers of which each counts; None is none to check.
+
+    Args:
+        settings: the options.
+        positive: names of those that must be above 0.
+        least: the least values of others.
+
+    Raises:
+        ValueError: one is not that large, not finite, or there is none of several.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> require_options(SimpleNamespace(hidden=(10, 0)), hidden=1)
+        Traceback (most recent call last):
+            ...
+        ValueError: --hidden must be finite and at least 1, but (10, 0) arrived
+    """
+    for name in (*positive, *least):
+        value = getattr(settings, name)
+        values = value if isinstance(value, tuple) else () if value is None else (value,)
+        smallest = least.get(name, 0)
+        enough = all(smallest <= each < math.inf for each in values)
+        if value == () or not enough or (name in positive and 0 in values):
+            wanted = "above 0" if name in positive else f"at least {smallest:g}"
+            option = f"--{name.replace('_', '-')}"
+            raise ValueError(f"{option} must be finite and {wanted}, but {value} arrived")

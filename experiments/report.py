@@ -1,175 +1,120 @@
-"""What an experiment with planar tubes reports: tables, a figure, and results as JSON."""
+"""Tables and figures of all experiments, and their results as JSON."""
 
 import dataclasses
 import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from scipy.spatial import ConvexHull, QhullError
 
 import reachjax as rj
-from experiments.command import blank_table
-from experiments.imitation import Fit
 
-NOTE = """\
-area, hull: of the certified set, and of the convex hull of simulated states
-gap: the worst facet's bound less its witness;  solver: all facets of the step
-goal, constraint: smallest certified margin, in the units of the state"""
 COLOURS = {"PROVED": "green", "REFUTED": "red", "UNKNOWN": "yellow"}
+"""Of verdicts."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Analysis:
-    """A certified tube of one controller under one relaxation."""
+def table(title: str, left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence]) -> Table:
+    """A table in the style of all experiments.
 
-    controller: str
-    relaxation: str
-    tube: rj.ReachTube
-    verdict: rj.Verdict
-    states: np.ndarray
-    seconds: float
-
-    def steps(self) -> list[dict]:
-        """Figures of each step: areas, the worst gap, solver time and statuses."""
-        rows = []
-        for t in range(1, self.tube.horizon + 1):
-            certificate = self.tube.proof(t)
-            rows.append(
-                {
-                    "step": t,
-                    "area": float(self.tube.sets[t].volume()),
-                    "hull": _hull_area(self.states[:, t]),
-                    "gap": float(certificate.gaps.max()),
-                    "seconds": float(certificate.seconds.sum()),
-                    "offsets": certificate.bounds.tolist(),
-                    "statuses": [status.name for status in certificate.statuses],
-                }
-            )
-        return rows
+    Args:
+        title: above it.
+        left: headings of the first columns, which hold words, in several lines if need be.
+        right: headings of the others, which hold numbers, in one.
+        rows: cells, one for each heading.
+    """
+    style: Any = {"box": SIMPLE_HEAD, "padding": (0, 1, 0, 0), "title_style": "bold"}
+    shown = Table(title=title, **style)
+    for heading in left:
+        shown.add_column(heading)
+    for heading in right:
+        shown.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        shown.add_row(*map(str, row))
+    return shown
 
 
-def _hull_area(points: np.ndarray) -> float:
-    try:
-        return float(ConvexHull(points).volume)
-    except QhullError:  # points on a line
-        return 0.0
+def grouped(groups: Iterable[str], columns: Sequence[str]) -> list[str]:
+    """Headings of two lines: the same columns for each group, whose name is above the first."""
+    return [f"{group if k == 0 else ''}\n{c}" for group in groups for k, c in enumerate(columns)]
 
 
-def step_table(analyses: list[Analysis]) -> Table:
-    """Controllers side by side, a row a step."""
-    table = blank_table(analyses[0].relaxation)
-    table.add_column("\nt", justify="right")
-    for analysis in analyses:
-        for k, column in enumerate(("area", "hull", "gap", "solver")):
-            heading = analysis.controller if k == 0 else ""
-            table.add_column(f"{heading}\n{column}", justify="right", no_wrap=True)
-    for rows in zip(*(analysis.steps() for analysis in analyses), strict=True):
-        cells = [str(rows[0]["step"])]
-        for row in rows:
-            cells += [f"{row[key]:.4f}" for key in ("area", "hull", "gap")]
-            cells += [f"{row['seconds']:.2f} s"]
-        table.add_row(*cells)
-    return table
+def coloured(verdict: str, words: str | None = None) -> str:
+    """Words in the colour of a verdict; without any, its own name."""
+    return f"[{COLOURS[verdict]}]{words or verdict}[/]"
 
 
-def verdict_table(analyses: list[Analysis]) -> Table:
-    """What each relaxation decides of each controller, with the smallest margins."""
-    table = blank_table("verdicts")
-    for heading in ("controller", "relaxation", "verdict"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("goal", "constraint", "reach"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for analysis in sorted(analyses, key=lambda a: a.controller):
-        verdict = analysis.verdict
-        name = verdict.status.name
-        margins = [f"{np.nanmin(verdict.margins[part]):+.4f}" for part in ("goal", "safe")]
-        table.add_row(
-            analysis.controller,
-            analysis.relaxation,
-            f"[{COLOURS[name]}]{name}[/]",
-            *margins,
-            f"{analysis.seconds:.1f} s",
-        )
-    return table
-
-
-def draw(analyses: list[Analysis], goal: np.ndarray, safe: np.ndarray, path: Path) -> None:
-    """One panel a controller: samples, certified sets, goal, constraint and counterexample."""
+def panels(rows: int, columns: int, size: tuple[float, float], **options: Any):
+    """A figure and its axes `(rows, columns)`."""
     import matplotlib.pyplot as plt
 
-    from reachjax.tubes.plotting import plot_set, plot_tube
+    return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **options)
 
-    figure, axes = plt.subplots(
-        1, len(analyses), figsize=(11, 4.8), sharey=True, squeeze=False, layout="constrained"
-    )
-    for ax, analysis in zip(axes[0], analyses, strict=True):
-        plot_set(
-            rj.Box(*goal), ax, edgecolor="none", facecolor="tab:green", alpha=0.3, label="goal"
-        )
-        plot_tube(analysis.tube, ax)
-        ax.axhline(safe[0, 1], color="black", linewidth=1, label="$x_2 \\geq -1$")
-        example = analysis.verdict.counterexample
-        if example is not None:
-            ax.plot(
-                *example.states.T, ".-", color="tab:orange", linewidth=1, label="counterexample"
-            )
-        ax.set_title(f"{analysis.controller}: {analysis.verdict.status.name}")
-        ax.margins(0.05)
-        ax.autoscale_view()
-    axes[0, 1 if len(analyses) > 1 else 0].set_ylabel("")
-    found = {
-        label: handle
-        for ax in axes[0]
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(
-        found.values(),
-        found.keys(),
-        loc="outside lower center",
-        ncols=len(found),
-        markerscale=3,
-        frameon=False,
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+
+def legend_below(figure, order: Sequence[str] = (), **options: Any) -> None:
+    """One legend for all panels, each name once; in the given order if there is one."""
+    found = {}
+    for ax in figure.axes:
+        for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):
+            found.setdefault(name, handle)
+    names = [name for name in order or found if name in found]
+    options = {"loc": "outside lower center", "ncols": len(names), "frameon": False} | options
+    figure.legend([found[name] for name in names], names, **options)
+
+
+def draw_tube(
+    ax,
+    tube: rj.ReachTube,
+    goal: Float[np.ndarray, "2 2"] | None,
+    example: rj.Counterexample | None = None,
+    coordinates: tuple[int, int] = (0, 1),
+    samples: int = 2000,
+) -> None:
+    """A tube over its simulated states, the goal in the plane and the trajectory that refutes."""
+    if goal is not None:
+        style = {"edgecolor": "none", "facecolor": "tab:green", "alpha": 0.3}
+        rj.plot_set(rj.Box(*goal), ax, label="goal", **style)
+    rj.plot_tube(tube, ax, samples, coordinates)
+    if example is not None:
+        path = example.states[:, list(coordinates)].T
+        ax.plot(*path, ".-", color="tab:orange", linewidth=1, label="counterexample")
+    ax.margins(0.05)
+    ax.autoscale_view()
+
+
+def save(figure, *paths: Path) -> None:
+    """Write a figure to each of the paths, and forget it."""
+    import matplotlib.pyplot as plt
+
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=150)
     plt.close(figure)
 
 
-def write(settings, fits: dict[str, Fit], analyses: list[list[Analysis]], path: Path) -> None:
-    """Settings, imitation errors, figures of each step and verdicts."""
-    content = {
-        "settings": {
-            k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(settings).items()
-        },
-        "imitation": {
-            name: {"training": fit.training_error, "validation": fit.validation_error}
-            for name, fit in fits.items()
-        },
-        "analyses": [_plain(analysis) for pair in analyses for analysis in pair],
-    }
+def write(path: Path, settings: Any, **results: Any) -> None:
+    """Settings and results as strict JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1))
+    content = {"settings": dataclasses.asdict(settings)} | results
+    path.write_text(json.dumps(plain(content), indent=1, allow_nan=False))
 
 
-def _plain(analysis: Analysis) -> dict:
-    verdict, example = analysis.verdict, analysis.verdict.counterexample
-    smallest = {name: float(np.nanmin(margin)) for name, margin in verdict.margins.items()}
-    return {
-        "controller": analysis.controller,
-        "relaxation": analysis.relaxation,
-        "verdict": verdict.status.name,
-        "margins": smallest,
-        "simulated": {name: float(np.nanmin(m)) for name, m in verdict.simulated.items()},
-        "counterexample": None
-        if example is None
-        else {
-            "requirement": example.requirement,
-            "time": example.time,
-            "violation": example.violation,
-            "states": example.states.tolist(),
-            "inputs": example.inputs.tolist(),
-        },
-        "seconds": analysis.seconds,
-        "steps": analysis.steps(),
-    }
+def plain(value: Any) -> Any:
+    """What JSON can hold: arrays as lists, paths as words, and no number (NaN) as null.
+
+    Example:
+        >>> plain({"bounds": np.array([1.0, np.nan]), "output": Path("results")})
+        {'bounds': [1.0, None], 'output': 'results'}
+    """
+    if isinstance(value, dict):
+        return {key: plain(each) for key, each in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from experiments import stored
 from experiments.command import at_least_one, bar
-from experiments.mpc import LinearMPC
+from experiments.double_integrator.mpc import LinearMPC
 
 # Candidate states are drawn in blocks of this size. The file is written after each block, so an
 # interruption loses one block: a fraction of a second, or some ten for a nonlinear MPC.

@@ -59,6 +59,7 @@ from reachjax.training import (
     volume_penalty,
 )
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
+from reachjax.tubes.plotting import plot_set, plot_tube
 from reachjax.tubes.reach import ReachTube, reach, reach_step
 from reachjax.tubes.requirements import shortfall
 from reachjax.tubes.sizes import log_volume, log_widths, volume
@@ -110,6 +111,8 @@ __all__ = [
     "failures",
     "log_volume",
     "log_widths",
+    "plot_set",
+    "plot_tube",
     "reach",
     "reach_partitioned",
     "reach_step",

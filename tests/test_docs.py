@@ -43,9 +43,7 @@ def test_a_how_to_runs(path, begun, monkeypatch):
 
 def test_a_public_name_stands_on_one_page_of_the_reference():
     pages = "".join(page.read_text() for page in sorted((DOCS / "reference").glob("*.md")))
-    assert sorted(re.findall(r"^::: reachjax\.(\w+)$", pages, re.MULTILINE)) == sorted(
-        [*rj.__all__, "plotting"]
-    )
+    assert sorted(re.findall(r"^::: reachjax\.(\w+)$", pages, re.MULTILINE)) == sorted(rj.__all__)
 
 
 def test_the_picture_of_the_rooms_is_the_one_that_is_drawn():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from experiments.reference import (
+from experiments.benchmark.reference import (
     facet_matrix,
     paper_E_in,
     paper_E_mid,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from experiments.reference import paper_E_in, paper_E_mid, paper_E_out, paper_step
+from experiments.benchmark.reference import paper_E_in, paper_E_mid, paper_E_out, paper_step
 from tests.loops import recursion
 from tests.networks import (
     LoopData,

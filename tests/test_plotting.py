@@ -14,9 +14,8 @@ mpl.use("Agg")
 
 
 def test_the_outline_of_a_polytope_is_its_corners_in_order():
-    from reachjax.tubes.plotting import plot_set
 
-    ax = plot_set(rj.Polytope([[1, 1], [1, -1], [-1, 1], [-1, -1]], [1, 1, 1, 1]))
+    ax = rj.plot_set(rj.Polytope([[1, 1], [1, -1], [-1, 1], [-1, -1]], [1, 1, 1, 1]))
     outline = ax.patches[0].get_xy()[:-1]
     assert {tuple(np.round(corner, 9) + 0.0) for corner in outline} == {
         (1, 0),
@@ -31,13 +30,11 @@ def test_the_outline_of_a_polytope_is_its_corners_in_order():
 def test_a_tube_is_drawn_on_the_axes_given():
     import matplotlib.pyplot as plt
 
-    from reachjax.tubes.plotting import plot_tube
-
     net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2) / 2, np.zeros((2, 1))), net)
     tube = recursion(loop, rj.Box([0.5, 0.5], [1, 1]), 2, rj.Template.box(2))
     _, ax = plt.subplots()
-    assert plot_tube(tube, ax, samples=50) is ax
+    assert rj.plot_tube(tube, ax, samples=50) is ax
     assert len(ax.patches) == 3
     assert len(ax.collections) == 3
     plt.close("all")
@@ -47,9 +44,7 @@ def outline(region, *coordinates):
     """The points drawn, and the Axes closed."""
     import matplotlib.pyplot as plt
 
-    from reachjax.tubes.plotting import plot_set
-
-    ax = plot_set(region, coordinates=coordinates or None)
+    ax = rj.plot_set(region, coordinates=coordinates or None)
     plt.close("all")
     return np.asarray(ax.patches[0].get_xy()[:-1])
 
@@ -120,10 +115,8 @@ def loop_of(states):
 def test_a_tube_of_three_states_is_drawn_on_the_coordinates_given(template):
     import matplotlib.pyplot as plt
 
-    from reachjax.tubes.plotting import plot_tube
-
     X0 = rj.Ellipsoid([1.0, 2.0, 3.0], np.diag([0.25, 1.0, 4.0]))
-    ax = plot_tube(recursion(loop_of(3), X0, 1, template), samples=50, coordinates=(2, 0))
+    ax = rj.plot_tube(recursion(loop_of(3), X0, 1, template), samples=50, coordinates=(2, 0))
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("$x_{3}$", "$x_{1}$")
     lower, upper = ax.patches[1].get_xy().min(axis=0), ax.patches[1].get_xy().max(axis=0)
     np.testing.assert_allclose([lower, upper], [[0.5, 0.25], [2.5, 0.75]], atol=1e-3)
@@ -132,21 +125,20 @@ def test_a_tube_of_three_states_is_drawn_on_the_coordinates_given(template):
 
 
 def test_what_cannot_be_drawn_is_refused():
-    from reachjax.tubes.plotting import plot_set, plot_tube
 
     cube = rj.Box([0, 0, 0], [1, 1, 1])
     with pytest.raises(ValueError, match="dimension 3 arrived: choose the two coordinates"):
-        plot_set(cube)
+        rj.plot_set(cube)
     for wrong in [(0, 3), (1, 1), (0,), (0, 1, 2), (-1, 0), (0.5, 1), 1, "01"]:
         with pytest.raises(ValueError, match=r"two different ones of 0 \.\. 2, but .* arrived"):
-            plot_set(cube, coordinates=wrong)  # pyright: ignore[reportArgumentType]
+            rj.plot_set(cube, coordinates=wrong)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="two or more dimensions can be drawn, but 1 arrived"):
-        plot_set(rj.Box([0], [1]))
+        rj.plot_set(rj.Box([0], [1]))
     tube = recursion(loop_of(1), rj.Box([0], [1]), 1, rj.Template.box(1))
     with pytest.raises(ValueError, match="two or more dimensions can be drawn, but 1 arrived"):
-        plot_tube(tube)
+        rj.plot_tube(tube)
     with pytest.raises(ValueError, match="unbounded"):
-        plot_set(rj.Polytope([[1, 0]], [1]))
+        rj.plot_set(rj.Polytope([[1, 0]], [1]))
 
 
 def test_importing_the_package_changes_no_flag_and_loads_neither_cvxpy_nor_matplotlib():

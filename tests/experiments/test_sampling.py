@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.command import require_folder
-from experiments.mpc import LinearMPC
+from experiments.double_integrator.mpc import LinearMPC
 from experiments.sampling import sample_draws, sample_policy
 
 MPC = LinearMPC(

@@ -1,8 +1,9 @@
 """The gradient agrees with an independent one: the paper's program, differentiated by diffcp.
 
-The program is written by `experiments.reference` from the paper's matrices alone, solved by SCS and
-differentiated by diffcp through the optimality conditions of the cone program; how its data move
-with weights, plant, sets and limits is a central difference, exact because they are quadratic.
+The program is written by `experiments.benchmark.reference` from the paper's matrices alone, solved
+by SCS and differentiated by diffcp through the optimality conditions of the cone program; how its
+data move with weights, plant, sets and limits is a central difference, exact because they are
+quadratic.
 """
 
 import cvxpy as cp
@@ -14,7 +15,7 @@ import pytest
 import scipy.sparse as sp
 
 import reachjax as rj
-from experiments.reference import paper_lmi
+from experiments.benchmark.reference import paper_lmi
 from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import box_region
 

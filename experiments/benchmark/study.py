@@ -1,0 +1,109 @@
+"""What the command `python -m experiments.benchmark` does.
+
+`steps`: one step of the double integrator with its input box and the paper's eight facets, for
+networks with two hidden layers: some trained on the MPC and started from the paper's small initial
+set, some with random weights and a set of the same size where most of their neurons switch.
+`growth`: one facet of the paper's program as random networks grow. `loops`: six-step tubes of the
+trained 2-10-5-1 network, and training steps. All methods run one after the other, with one BLAS
+thread and one thread for Clarabel (XLA takes what cores there are), so their ratios mean more than
+their seconds.
+"""
+
+import dataclasses
+import os
+
+import jax
+import numpy as np
+import rich
+
+from experiments import report
+from experiments.benchmark.cases import Settings, cases
+from experiments.benchmark.growth import (
+    GROWTH_NOTE,
+    LEAST,
+    exponent,
+    grown,
+    growth_table,
+    in_new_process,
+    jobs,
+    related,
+)
+from experiments.benchmark.loops import (
+    LOOPS_NOTE,
+    controller,
+    step_rows,
+    step_table,
+    tube_rows,
+    tube_table,
+)
+from experiments.benchmark.steps import STEPS_NOTE, measured, methods, steps_table
+from experiments.command import bar, require_folder
+
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS")
+
+
+def steps(settings: Settings) -> None:
+    """Every method on every network; each table is printed as soon as it is complete."""
+    results, networks, named = [], cases(settings), methods(settings)
+    with bar() as shown:
+        task = shown.add_task("", total=len(networks) * len(named))
+        for case in networks:
+            shown.update(task, description=case.name)
+            rows = []
+            for row in measured(case, named, settings):
+                rows.append(row)
+                shown.advance(task)
+            results += rows
+            shown.console.print(steps_table(rows))
+            write(settings, rows=results)
+    rich.print(STEPS_NOTE)
+
+
+def growth(settings: Settings) -> None:
+    """Every solver on ever larger networks, each in a process of its own."""
+    rows, todo = [], jobs(settings)
+    with bar() as shown:
+        task = shown.add_task("", total=len(todo))
+        for width, name in todo:
+            shown.update(task, description=f"2x{width}: {name}")
+            rows = related([*rows, in_new_process(grown, width, name, settings)])
+            shown.advance(task)
+            write(settings, rows=rows)
+    rich.print(growth_table(rows))
+    rich.print(GROWTH_NOTE)
+    if np.isfinite(slope := exponent(rows)):
+        rich.print(f"InteriorPoint's seconds grow like n^{slope:.2f} from n = {LEAST} on")
+
+
+def loops(settings: Settings) -> None:
+    """Tubes and training steps of one trained network."""
+    layers, tubes, trained = controller(settings), [], []
+    with bar() as shown:
+        task = shown.add_task("tubes", total=None)
+        for row in tube_rows(layers, settings):
+            tubes.append(row)
+            shown.advance(task)
+        shown.update(task, description="training steps")
+        for row in step_rows(layers):
+            trained.append(row)
+            shown.advance(task)
+    rich.print(tube_table(tubes))
+    rich.print(LOOPS_NOTE)
+    rich.print(step_table(trained))
+    named = [{"solver": name} | dataclasses.asdict(cost) for name, cost in trained]
+    write(settings, tubes=tubes, training=named)
+
+
+def write(settings: Settings, **results: list[dict]) -> None:
+    """Settings, threads and every row of each table."""
+    threads = {name: os.environ.get(name) for name in THREADS} | {"cores": os.cpu_count()}
+    path = settings.output / f"{settings.study}.json"
+    report.write(path, settings, threads=threads, **results)
+
+
+def main(settings: Settings) -> None:
+    """One study: its tables are printed, and its rows written."""
+    require_folder(settings.output)
+    jax.config.update("jax_enable_x64", True)
+    {"steps": steps, "growth": growth, "loops": loops}[settings.study](settings)
+    rich.print(f"written: {settings.output / settings.study}.json")

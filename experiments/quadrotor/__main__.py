@@ -1,0 +1,7 @@
+"""The command."""
+
+from experiments.command import run_experiment
+from experiments.quadrotor.study import Settings, main
+
+if __name__ == "__main__":
+    run_experiment(main, Settings)

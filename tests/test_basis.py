@@ -106,7 +106,11 @@ def test_every_row_gives_the_simulated_number(case):
 
 def test_facts_are_nonnegative_and_outputs_complement_slacks(case):
     rows, _, _, x, y, z, _ = case
-    facts = [values(part, basis_points(x, z)) for part in rows.facts]
+    if not rows.facts:
+        assert not y.shape[1]
+        return
+    (stated,) = rows.facts  # of one kind of unit
+    facts = [values(block.rows, basis_points(x, z)) for block in stated.blocks]
     assert all((part >= -1e-9).all() for part in facts)
     output, slack, output_cap, slack_cap = facts
     np.testing.assert_allclose(output, np.maximum(y, 0), rtol=0, atol=1e-12)
@@ -120,7 +124,7 @@ def test_facts_are_nonnegative_and_outputs_complement_slacks(case):
 
 def test_pruning_empties_the_columns_of_stable_units_in_all_rows(case):
     rows, bounds, prune, x, _, z, _ = case
-    stable = np.asarray(bounds.passing | bounds.blocking)
+    stable = np.asarray(bounds.affine)
     gone = x.shape[1] + np.flatnonzero(stable) if prune else []
     for part in jax.tree.leaves(rows):
         np.testing.assert_array_equal(part[:, gone], 0.0)
@@ -132,16 +136,16 @@ def test_pruning_empties_the_columns_of_stable_units_in_all_rows(case):
 def test_pruning_meets_units_that_pass_that_block_and_that_do_neither():
     loop = closed_loop(loop_data(3, True))
     bounds, _ = bounds_and_rows(loop, rj.Box(*state_box(3)), TIME)
-    passing, blocking = np.asarray(bounds.passing), np.asarray(bounds.blocking)
-    assert passing.any()
-    assert blocking.any()
-    assert (~passing & ~blocking).any()
+    affine, slope = np.asarray(bounds.affine), np.asarray(bounds.lines.above.slope)
+    assert (affine & (slope == 1)).any()
+    assert (affine & (slope == 0)).any()
+    assert (~affine).any()
 
 
 def exact_rows(data, bounds, prune):
     """The rows in exact arithmetic: preactivation, output, successor."""
     A, B, c, lower, upper = (fractions(part) for part in data.at(TIME))
-    n, size = A.shape[0], A.shape[0] + len(bounds.passing) + 1
+    n, size = A.shape[0], A.shape[0] + len(bounds.affine) + 1
     unit_vectors, one = fractions(np.eye(size)), fractions(np.eye(size))[-1:]
     ys, zs, done = [], [], 0
 
@@ -149,10 +153,8 @@ def exact_rows(data, bounds, prune):
         nonlocal done
         z = unit_vectors[n + done : n + done + len(y)].copy()
         for i in range(len(y)):
-            if prune and bounds.passing[done + i]:
-                z[i] = y[i]
-            elif prune and bounds.blocking[done + i]:
-                z[i] *= 0
+            if prune and bounds.affine[done + i]:
+                z[i] = y[i] * int(bounds.lines.above.slope[done + i])
         done += len(y)
         ys.append(y)
         zs.append(z)
@@ -182,9 +184,9 @@ def test_coefficients_are_within_their_radii_of_the_exact_ones(n_x, prune):
         "preactivation": (rows.preactivation, y),
         "output": (rows.output, z),
         "successor": (rows.successor, successor),
-        "slack": (rows.facts.slack, z - y),
-        "output cap": (rows.facts.output_cap, high * one - z),
-        "slack cap": (rows.facts.slack_cap, low * one - (z - y)),
+        "slack": (rows.facts[0]["slack"], z - y),
+        "output cap": (rows.facts[0]["output cap"], high * one - z),
+        "slack cap": (rows.facts[0]["slack cap"], low * one - (z - y)),
     }
     for name, (ball, expected) in exact.items():
         assert (abs(fractions(ball.mid) - expected) <= fractions(ball.rad)).all(), name

@@ -98,6 +98,14 @@ def case(request):
     return data, lower, upper, bounds
 
 
+def affine_units(bounds):
+    """Masks of the units that are the identity, and of those that are zero."""
+    affine, (slope, offset) = np.asarray(bounds.affine), bounds.lines.above
+    assert np.all(offset[affine] == 0)
+    assert np.all((slope[affine] == 0) | (slope[affine] == 1))
+    return affine & np.asarray(slope == 1), affine & np.asarray(slope == 0)
+
+
 def samples(lower, upper):
     rng = np.random.default_rng(0)
     inside = rng.uniform(lower, upper, (2000, len(lower)))
@@ -131,11 +139,12 @@ def test_preactivation_bounds_are_those_of_interval_arithmetic(case):
 def test_masks_name_the_units_that_are_surely_affine(case):
     data, lower, upper, bounds = case
     low, high = intervals(data, lower, upper)
-    np.testing.assert_array_equal(bounds.passing, low > 0)
-    np.testing.assert_array_equal(bounds.blocking, high < 0)
+    passing, blocking = affine_units(bounds)
+    np.testing.assert_array_equal(passing, low > 0)
+    np.testing.assert_array_equal(blocking, high < 0)
     y, _, _ = simulated(data, samples(lower, upper))
-    assert (y[:, np.asarray(bounds.passing)] >= 0).all()
-    assert (y[:, np.asarray(bounds.blocking)] <= 0).all()
+    assert (y[:, passing] >= 0).all()
+    assert (y[:, blocking] <= 0).all()
 
 
 def test_the_networks_have_units_of_all_three_kinds():
@@ -143,8 +152,7 @@ def test_the_networks_have_units_of_all_three_kinds():
     for network in NETWORKS:
         data = loop_data(3, True, network)
         bounds = loop_bounds(closed_loop(data), rj.Box(*state_box(3)), TIME)
-        passing, blocking = np.asarray(bounds.passing), np.asarray(bounds.blocking)
-        assert not (passing & blocking).any()
+        passing, blocking = affine_units(bounds)
         kinds.append([passing.any(), blocking.any(), (~passing & ~blocking).any()])
     assert np.array(kinds).any(axis=0).all()
 
@@ -164,17 +172,18 @@ def test_a_linear_controller_without_input_box_has_no_units(n_x):
     lower, upper = state_box(n_x)
     bounds = loop_bounds(closed_loop(data), rj.Box(lower, upper), TIME)
     assert bounds.preactivation.mid.shape == bounds.output.mid.shape == (0,)
-    assert bounds.passing.shape == bounds.blocking.shape == (0,)
+    assert bounds.affine.shape == bounds.excess.shape == (0,)
     successor = simulated(data, samples(lower, upper))[2]
     assert (np.asarray(bounds.successor.lower) <= successor.min(axis=0)).all()
     assert (np.asarray(bounds.successor.upper) >= successor.max(axis=0)).all()
 
 
-def test_a_neuron_that_is_constantly_zero_is_not_both_passing_and_blocking():
+def test_a_neuron_that_is_constantly_zero_is_affine():
     net = rj.MLP.from_layers([([[0.0]], [0.0]), ([[1.0]], [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net)
     bounds = loop_bounds(loop, rj.Box([0.0], [1.0]), 0)
-    assert bool(bounds.passing[0]) != bool(bounds.blocking[0])
+    assert bool(bounds.affine[0])
+    assert float(bounds.output.upper[0]) <= 1e-300
 
 
 @pytest.mark.parametrize("size", [1e10, 1e14])
@@ -182,5 +191,7 @@ def test_what_counts_as_zero_is_off_by_no_more_than_the_input_box(size):
     net = rj.MLP.from_layers([([[size, size]], [0.0]), ([[1.0]], [0.0])])  # inputs of 0 to `size`
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.ones((2, 1))), net, rj.Box([-1.0], [1.0]))
     bounds = loop_bounds(loop, rj.Box([-1.0, -1.0], [1.0, 1.0]), 0)
-    assert bool(bounds.blocking[-1])  # 1 - u, whose part above zero is next to nothing of `size`
+    assert bool(
+        affine_units(bounds)[1][-1]
+    )  # 1 - u, whose part above zero is next to nothing of `size`
     assert 1.0 <= float(bounds.excess[-1]) <= 1.0 + 1e-13 * size

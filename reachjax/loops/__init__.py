@@ -1,17 +1,23 @@
-"""What is verified: activations, networks, plants and the loop they close."""
+"""What is verified: units, networks, plants and the loop they close."""
 
-from reachjax.loops.activations import AbstractActivation, ReLU
 from reachjax.loops.closed_loop import ClosedLoop
 from reachjax.loops.discretisation import runge_kutta, zero_order_hold
-from reachjax.loops.networks import MLP
+from reachjax.loops.networks import MLP, AbstractNetwork
 from reachjax.loops.plants import AffinePlant
+from reachjax.loops.residual import Residual
+from reachjax.loops.units import AbstractActivation, AbstractUnit, HardTanh, LeakyReLU, ReLU
 
 __all__ = [
     "MLP",
     "AbstractActivation",
+    "AbstractNetwork",
+    "AbstractUnit",
     "AffinePlant",
     "ClosedLoop",
+    "HardTanh",
+    "LeakyReLU",
     "ReLU",
+    "Residual",
     "runge_kutta",
     "zero_order_hold",
 ]

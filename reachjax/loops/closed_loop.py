@@ -1,30 +1,36 @@
 """The loop: a plant under a network whose output is projected onto an input box.
 
-The projection is two more ReLU layers (the paper's equation (proj_NN)):
-`v = max(pi(x) - u_low, 0) + u_low`, then `u = u_high - max(u_high - v, 0)`.
+The projection is two more layers of units (the paper's equation (proj_NN)), the last ones of a
+step. Which units there are, and in which order, the loop's own forward pass tells.
 """
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from reachjax.loops.activations import ReLU, evaluate
-from reachjax.loops.networks import MLP, Unit
+from reachjax.loops.networks import AbstractNetwork
 from reachjax.loops.plants import AffinePlant
+from reachjax.loops.units import AbstractUnit, AtUnit, clipped, evaluate
 from reachjax.numerics.checks import Numbers, require_kind, same_size, whole_number
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.sets import Box
 
-PROJECTION = ReLU()
+
+class UnitLayer(NamedTuple):
+    """A layer of units of one kind, and how many they are."""
+
+    unit: AbstractUnit
+    size: int
+
 
 NETWORK = (
-    "of type reachjax.MLP, which MLP.from_flax makes of a flax network, and MLP.from_layers of the "
-    "pairs (W, b) of any other"
+    "a network such as reachjax.MLP, which MLP.from_flax makes of a flax network, and "
+    "MLP.from_layers of the pairs (W, b) of any other"
 )
 
 
@@ -42,6 +48,7 @@ class ClosedLoop(Replaceable):
         ValueError: numbers of states, inputs or time steps disagree.
 
     Example:
+        >>> from reachjax import MLP
         >>> plant = AffinePlant([[1.0]], [[1.0]])
         >>> net = MLP.from_layers([([[-2.0]], [0.0])])
         >>> loop = ClosedLoop(plant, net, input_box=Box([-1.0], [1.0]))
@@ -50,12 +57,12 @@ class ClosedLoop(Replaceable):
     """
 
     plant: AffinePlant
-    controller: MLP
+    controller: AbstractNetwork
     input_box: Box | None = None
 
     def __post_init__(self):
         require_kind("ClosedLoop.plant", self.plant, AffinePlant, "of type AffinePlant")
-        require_kind("ClosedLoop.controller", self.controller, MLP, NETWORK)
+        require_kind("ClosedLoop.controller", self.controller, AbstractNetwork, NETWORK)
         if self.input_box is not None:
             require_kind("ClosedLoop.input_box", self.input_box, Box, "of type Box")
         plant, net = self.plant, self.controller
@@ -88,27 +95,31 @@ class ClosedLoop(Replaceable):
         return self.plant.states
 
     @property
+    def layers(self) -> tuple[UnitLayer, ...]:
+        """The layers of units in the order of the forward pass, the projection's last."""
+        leaves, structure = jax.tree.flatten(self)
+        return _recorded(structure, tuple(jnp.shape(leaf) for leaf in leaves))
+
+    @property
     def units(self) -> int:
-        """The number of nonlinear units: hidden neurons, and two for each projected input."""
-        hidden = sum(b.shape[0] for _, b in self.controller.layers[:-1])
-        return hidden + (0 if self.input_box is None else 2 * self.plant.inputs)
+        """The number of units of one step."""
+        return sum(layer.size for layer in self.layers)
 
     @property
     def steps(self) -> int | None:
         """How many steps a time-varying loop is given for; `None` when it is time-invariant."""
         return self.plant.steps or (self.input_box.steps if self.input_box else None)
 
-    def input(self, x: Any, t: int | jax.Array = 0, unit: Unit = evaluate) -> Any:
-        """The projected input, for any kind of number and with `unit` at each nonlinear layer."""
+    def input(self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
+        """The projected input, for any kind of number and with `unit` at each layer of units."""
         u = self.controller.propagate(x, unit)
-        if self.input_box is not None:
-            box = self.input_box.at(t)
-            u = unit(PROJECTION, u - box.lower) + box.lower
-            u = box.upper - unit(PROJECTION, box.upper - u)
-        return u
+        if self.input_box is None:
+            return u
+        box = self.input_box.at(t)
+        return clipped(u, box.lower, box.upper, unit)
 
-    def step(self, x: Any, t: int | jax.Array = 0, unit: Unit = evaluate) -> Any:
-        """The state at `t + 1`, for any kind of number and with `unit` at each nonlinear layer."""
+    def step(self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
+        """The state at `t + 1`, for any kind of number and with `unit` at each layer of units."""
         return self.plant.propagate(x, self.input(x, t, unit), t)
 
     def simulate(
@@ -135,6 +146,27 @@ class ClosedLoop(Replaceable):
                 f"but start {start} and horizon {horizon} ask for t = {start} .. "
                 f"{start + horizon - 1}"
             )
+
+
+@lru_cache(maxsize=256)
+def _recorded(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[UnitLayer, ...]:
+    """The layers of units that the forward pass of a loop of this structure meets.
+
+    Args:
+        structure: of the loop as a tree.
+        shapes: of its leaves.
+    """
+    layers = []
+
+    def record(unit: AbstractUnit, y: Array) -> Array:
+        layers.append(UnitLayer(unit, len(y)))
+        return unit(y)
+
+    leaves = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
+    loop = jax.tree.unflatten(structure, leaves)
+    state = jax.ShapeDtypeStruct((loop.states,), float)
+    jax.eval_shape(lambda loop, x: loop.step(x, 0, record), loop, state)
+    return tuple(layers)
 
 
 @partial(jax.jit, static_argnames="horizon")

@@ -19,10 +19,32 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from reachjax.loops.activations import ReLU
+from reachjax.loops.units import AbstractActivation, HardTanh, LeakyReLU, ReLU
 from reachjax.numerics.checks import is_concrete
 
 ADVICE = "give its layers by MLP.from_layers"
+
+
+def read_activation(activation: Any) -> Any:
+    """The activation object that computes what a flax function does; objects are left as they are.
+
+    Raises:
+        ValueError: none of them does.
+    """
+    if isinstance(activation, AbstractActivation | type) or not callable(activation):
+        return activation
+    points = np.linspace(-3.0, 3.0, 25)
+    with jax.ensure_compile_time_eval():
+        values = np.asarray(activation(jnp.asarray(points)))
+        leak = float(values[points == -1.0][0] / -1.0)
+        known = [ReLU(), HardTanh(), *([LeakyReLU(leak)] if 0 <= leak < 1 else [])]
+        for each in known:
+            if values.shape == points.shape and np.allclose(each(points), values, atol=1e-6):
+                return each
+    raise ValueError(
+        f"activation must compute what one of {', '.join(type(each).__name__ for each in known)} "
+        f"does, but {activation!r} arrived"
+    )
 
 
 def flax_layers(

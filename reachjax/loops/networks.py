@@ -7,18 +7,42 @@ yields bounds and the program that certifies the loop.
 
 from __future__ import annotations
 
+import abc
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from jaxtyping import Array, ArrayLike, Float
 
-from reachjax.loops.activations import AbstractActivation, ReLU, evaluate
+from reachjax.loops.units import AbstractActivation, AtUnit, ReLU, evaluate
 from reachjax.numerics.checks import Numbers, same_size
 from reachjax.numerics.pytrees import Replaceable, converted, pytree, static
 
-Unit = Callable[[AbstractActivation, Any], Any]
-"""What is done at a nonlinear layer: `(activation, inputs) -> outputs`."""
+
+class AbstractNetwork(Replaceable, abc.ABC):
+    """What a loop needs of its controller: sizes, and a forward pass over any kind of number."""
+
+    @property
+    @abc.abstractmethod
+    def inputs(self) -> int:
+        """The number of inputs."""
+
+    @property
+    @abc.abstractmethod
+    def outputs(self) -> int:
+        """The number of outputs."""
+
+    @abc.abstractmethod
+    def propagate(self, x: Any, unit: AtUnit) -> Any:
+        """The forward pass over any kind of number, with `unit` at each layer of units."""
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """The output for one input vector; `jax.vmap(net)` takes a batch."""
+        x = Numbers("(n,)")(x, "x")
+        same_size(
+            "the network's number of inputs is", "the dimension of x is", (self.inputs, len(x))
+        )
+        return self.propagate(x, evaluate)
 
 
 def _layers(value: Any, name: str = "layers") -> tuple[tuple[Array, Array], ...]:
@@ -53,7 +77,7 @@ def _layer(pair: Any, name: str) -> tuple[Array, Array]:
 
 
 @pytree
-class MLP(Replaceable):
+class MLP(AbstractNetwork):
     """A fully connected network with a linear last layer. Build it with `from_layers`.
 
     Attributes:
@@ -96,7 +120,7 @@ class MLP(Replaceable):
     def from_flax(
         cls,
         source: Any,
-        activation: AbstractActivation | None = None,
+        activation: AbstractActivation | Callable | None = None,
         module: Any = None,
     ) -> MLP:
         """A network from a flax nnx module, or from the parameters of a linen module.
@@ -106,7 +130,8 @@ class MLP(Replaceable):
         Args:
             source: an `nnx.Module` whose linear layers are applied in the order in which they
                 were assigned, or linen's `{"params": {"Dense_0": {"kernel", "bias"}, ...}}`.
-            activation: applied between the layers. None for ReLU, where what is read can be
+            activation: applied between the layers, as an object or as the flax function that one
+                of them computes (`nnx.leaky_relu`). None for ReLU, where what is read can be
                 compared with the network's output or the layers stand in an `nnx.Sequential`.
             module: the linen module itself, whose parameters do not tell what is between the
                 layers, nor always their order: what is read is then compared with its output.
@@ -116,10 +141,11 @@ class MLP(Replaceable):
             ValueError: it holds something else than a chain of linear layers, or computes something
                 else, or the order of its layers or the activation cannot be told.
         """
-        from reachjax.loops.flax_layers import flax_layers
+        from reachjax.loops.flax_layers import flax_layers, read_activation
 
-        read = flax_layers(source, activation, module)
-        return cls(read, ReLU() if activation is None else activation)
+        known = read_activation(activation)
+        read = flax_layers(source, known, module)
+        return cls(read, ReLU() if known is None else known)
 
     @property
     def inputs(self) -> int:
@@ -131,17 +157,9 @@ class MLP(Replaceable):
         """The number of outputs."""
         return self.layers[-1][0].shape[0]
 
-    def propagate(self, x: Any, unit: Unit) -> Any:
-        """The forward pass over any kind of number, with `unit` at each nonlinear layer."""
+    def propagate(self, x: Any, unit: AtUnit) -> Any:
+        """The forward pass over any kind of number, with `unit` at each layer of units."""
         for W, b in self.layers[:-1]:
-            x = unit(self.activation, W @ x + b)
+            x = self.activation.propagate(W @ x + b, unit)
         W, b = self.layers[-1]
         return W @ x + b
-
-    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """The output for one input vector; `jax.vmap(net)` takes a batch."""
-        x = Numbers("(n,)")(x, "x")
-        same_size(
-            "the network's number of inputs is", "the dimension of x is", (self.inputs, len(x))
-        )
-        return self.propagate(x, evaluate)

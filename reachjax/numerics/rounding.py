@@ -127,6 +127,13 @@ class Ball:
             self.mid @ matrix, (self.rad * (1 + error)) @ weights, error * (size @ weights)
         )
 
+    def __rmul__(self, factors) -> Self:
+        """Every entry, or every row, times an exact factor; those of 0, 1 and -1 round nothing."""
+        factors = jnp.asarray(factors)
+        factors = factors.reshape(factors.shape + (1,) * (self.mid.ndim - factors.ndim))
+        mid, inexact = factors * self.mid, (factors != 0) & (abs(factors) != 1)
+        return self._rebuilt(mid, abs(factors) * self.rad, gamma(1) * inexact * abs(mid))
+
     def __add__(self, other) -> Self:
         other = self.lift(other)
         mid = self.mid + other.mid

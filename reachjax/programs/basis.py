@@ -4,21 +4,22 @@ The basis is `xi = [x, z, 1]`: the state, the outputs of the units (hidden neuro
 projection layers) and a last 1. A row `r` means the number `r . xi`. The loop's own forward pass
 is run over rows, so what is certified is what is simulated.
 
-A unit whose bounds prove it to be affine may leave the basis: its output is then the row of its
-input, or zero, and its column stays empty (so that array shapes never change).
+A unit whose bounds prove it to be affine may leave the basis: its output is then an affine function
+of the row of its input, and its column stays empty (so that array shapes never change).
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from reachjax.loops import AbstractActivation, ClosedLoop
-from reachjax.loops.activations import UnitFacts
+from reachjax.loops import ClosedLoop
+from reachjax.loops.units import AbstractUnit, Block, Facts, Line, Lines, Mark
 from reachjax.numerics.checks import require_double_precision
 from reachjax.numerics.pytrees import pytree
 from reachjax.numerics.rounding import Ball
@@ -34,11 +35,10 @@ class Rows(Ball):
     """`k` rows over the basis, `(k, n)`, with a bound of the rounding error of each coefficient."""
 
     def lift(self, other: Any) -> Ball:
-        """A plain vector `(k,)` is a constant: rows with entries in the last column only."""
+        """A plain vector `(k,)`, or a number, is a constant: entries in the last column only."""
         if isinstance(other, Ball):
             return other
-        last = jnp.zeros((other.shape[0], self.mid.shape[1])).at[:, -1].set(other)
-        return Rows.exact(last)
+        return Rows.exact(jnp.zeros_like(self.mid).at[:, -1].set(other))
 
     def widened(self, by: Array) -> Rows:
         """Rows whose values may be off by so much."""
@@ -58,14 +58,15 @@ class LoopRows:
         state: `(n_x, n)`.
         preactivation: `(k, n)`, inputs `y` of the units.
         output: `(k, n)`, outputs `z` of the units.
-        facts: what holds of the units, each `(k, n)`.
+        facts: what holds of the units, those of one kind together, in the order in which the loop
+            meets the kinds.
         successor: `(n_x, n)`, the state one step later.
     """
 
     state: Rows
     preactivation: Rows
     output: Rows
-    facts: UnitFacts
+    facts: tuple[Facts, ...]
     successor: Rows
 
 
@@ -97,27 +98,47 @@ def loop_rows(
         bounds: of this step's units.
         prune: whether units that the bounds prove to be affine leave their columns empty.
     """
-    size = state.mid.shape[1]
-    units: list[tuple[Rows, Rows, UnitFacts]] = []
+    size, done = state.mid.shape[1], 0
+    none = columns(0, 0, size)
+    inputs, outputs = [none], [none]
+    facts: dict[AbstractUnit, list[Facts]] = {}
 
-    def unit(activation: AbstractActivation, y: Rows) -> Rows:
-        done = sum(z.mid.shape[0] for _, z, _ in units)
-        here = slice(done, done + y.mid.shape[0])
+    def unit(unit: AbstractUnit, y: Rows) -> Rows:
+        nonlocal done
+        here, done = slice(done, done + y.mid.shape[0]), done + y.mid.shape[0]
         z = picking(places[here], size)
+        gone = bounds.affine[here] & prune
         if prune:
-            passing, blocking = bounds.passing[here], bounds.blocking[here]
-            z = (z.where(~passing & ~blocking) + y.where(passing)).widened(bounds.excess[here])
+            slope, offset = (jnp.where(gone, part[here], 0.0) for part in bounds.lines.above)
+            kept = z.where(~gone)  # zero where offsets are not, so that they are added exactly
+            line = Rows.exact(kept.mid.at[:, -1].add(offset)) + slope * y
+            z = line.widened(bounds.excess[here])
         interval = bounds.preactivation[here]
-        facts = activation.facts(y, z, interval.lower, interval.upper)
+        stated = unit.facts(y, z, interval.lower, interval.upper)
         telling = interval.rad > STEADY * abs(interval.mid)
-        units.append((y, z, facts.capped_where(telling)))
+        facts.setdefault(unit, []).append(stated.map(partial(_said, gone=gone, telling=telling)))
+        inputs.append(y)
+        outputs.append(z)
         return z
 
     successor = loop.step(state, t, unit)
-    none = columns(0, 0, size)
-    units.insert(0, (none, none, UnitFacts(none, none, none, none)))
-    y, z, facts = jax.tree.map(lambda *rows: jnp.concatenate(rows), *units)
-    return LoopRows(state, y, z, facts, successor)
+    together = tuple(_joined(*parts) for parts in facts.values())
+    return LoopRows(state, _joined(*inputs), _joined(*outputs), together, successor)
+
+
+def _said(block: Block, gone: Bool[Array, " k"], telling: Bool[Array, " k"]) -> Rows:
+    """A block's rows, zero where they say nothing.
+
+    That is where the input varies by next to nothing, of facts that rest on its bounds, and where
+    rounding alone may have left something of a fact of a unit that has left the basis.
+    """
+    rows = block.rows
+    empty = gone & jnp.all(abs(rows.mid) <= rows.rad, axis=1)
+    return rows.where(~empty & telling if block.mark is Mark.BOUND else ~empty)
+
+
+def _joined(*parts: Any) -> Any:
+    return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
 
 
 @pytree
@@ -126,7 +147,7 @@ class ChangeOfBasis:
 
     Attributes:
         E_in: `(n_x + 1, n)`, proposition 3.
-        E_mid: `(2 k + 1, n)`, proposition 5: inputs `y`, outputs `z` of the ReLUs, and 1.
+        E_mid: `(2 k + 1, n)`, proposition 5: inputs `y`, outputs `z` of the units, and 1.
         E_out: `(n_x + 1, n)`, proposition 4.
     """
 
@@ -162,9 +183,9 @@ def change_of_basis(loop: ClosedLoop, t: int = 0) -> ChangeOfBasis:
 def _change_of_basis(loop: ClosedLoop, t: int) -> ChangeOfBasis:
     n, k = loop.states, loop.units
     size = n + k + 1
-    anything = Ball(jnp.zeros(k), jnp.zeros(k))
     none = jnp.zeros(k)
-    bounds = LoopBounds(anything, anything, anything, none, none, none, anything)
+    any_ball, line = Ball(none, none), Line(none, none)
+    bounds = LoopBounds(any_ball, any_ball, any_ball, Lines(line, line), none > 0, none, any_ball)
     rows = loop_rows(loop, columns(0, n, size), n + jnp.arange(k), t, bounds, prune=False)
     one = columns(size - 1, 1, size).mid
     # the paper keeps x^{l+1} = z + u_low and x^{l+2} = u_high - z in place of the last outputs

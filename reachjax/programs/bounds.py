@@ -1,7 +1,7 @@
 """Bounds of everything nonlinear in one step of the loop, from a box of states.
 
 The loop's own forward pass is run over midpoint-radius intervals, so rounding is included: a
-neuron that these bounds call stable is stable.
+unit that these bounds call affine is affine.
 """
 
 from __future__ import annotations
@@ -12,34 +12,36 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from reachjax.loops import AbstractActivation, ClosedLoop
+from reachjax.loops import ClosedLoop
+from reachjax.loops.units import AbstractUnit, Line, Lines
 from reachjax.numerics.pytrees import pytree
 from reachjax.numerics.rounding import Ball, gamma
 from reachjax.sets import Box
 
 MARGINAL = 1e-9
-"""Inputs that cross zero by no more than this part of their size leave a unit affine."""
+"""Inputs that leave a range on which a unit is affine by no more than this part of their size
+leave it affine."""
 
 
 @pytree
 class LoopBounds:
-    """Intervals over one step, units in the order of the loop (hidden layers, then projection).
+    """Intervals over one step, units in the order in which the loop meets them.
 
     Attributes:
         state: `(n_x,)`, the box of states it started from.
         preactivation: `(k,)`, inputs `y` of the units.
         output: `(k,)`, outputs `z` of the units.
-        passing: `(k,)`, units that are the identity, up to `excess`.
-        blocking: `(k,)`, units that are zero, up to `excess`.
-        excess: `(k,)`, by how much at most; zero where `y` surely does not change its sign.
+        lines: `(k,)`, below and above outputs, up to `excess`.
+        affine: `(k,)`, units of which both lines are the same.
+        excess: `(k,)`, by how much those may be off at most; zero where they surely are affine.
         successor: `(n_x,)`, states one step later.
     """
 
     state: Ball
     preactivation: Ball
     output: Ball
-    passing: Array
-    blocking: Array
+    lines: Lines
+    affine: Array
     excess: Array
     successor: Ball
 
@@ -55,45 +57,57 @@ def loop_bounds(
         t: the time.
         known: `(k,)`, other bounds of the units' inputs, if there are any.
     """
-    units: list[tuple[Ball, Ball, Array, Array, Array]] = []
+    units: list[tuple[Ball, Ball, Lines, Array, Array]] = []
 
-    def unit(activation: AbstractActivation, y: Ball) -> Ball:
+    def unit(unit: AbstractUnit, y: Ball) -> Ball:
         if known is not None:
             done = sum(len(each[0].mid) for each in units)
             also = known[done : done + len(y.mid)]
             lower = jnp.maximum(y.lower, also.lower)
             y = Ball.between(lower, jnp.maximum(lower, jnp.minimum(y.upper, also.upper)))
-        z = Ball.between(*activation.interval(y.lower, y.upper))
+        z = Ball.between(*unit.interval(y.lower, y.upper))
         # the ends of `y` may be rounded differently where the midpoint and the radius are formed
         rounding = gamma(8) * (abs(y.mid) + y.rad)
-        zero = activation.phases(y.lower, y.upper)[1]
-        z = Ball(jnp.where(zero, 0.0, z.mid), jnp.where(zero, 0.0, z.rad + rounding))
-        units.append((y, z, *_phases(activation, y, z)))
+        lines = unit.lines(y.lower, y.upper)
+        constant = lines.affine & (lines.above.slope == 0)
+        mid = jnp.where(constant, lines.above.offset, z.mid)
+        z = Ball(mid, jnp.where(constant, 0.0, z.rad + rounding))
+        units.append((y, z, *_settled(unit, y, z, lines)))
         return z
 
     state = Ball.between(box.lower, box.upper)
     successor = loop.step(state, t, unit)
     empty = jnp.zeros(0)
-    units.insert(0, (Ball.exact(empty), Ball.exact(empty), empty > 0, empty > 0, empty))
-    y, z, passing, blocking, excess = jax.tree.map(_concatenate, *units)
-    return LoopBounds(state, y, z, passing, blocking, excess, successor)
+    none, line = Ball.exact(empty), Line(empty, empty)
+    units.insert(0, (none, none, Lines(line, line), empty > 0, empty))
+    y, z, lines, affine, excess = jax.tree.map(_concatenate, *units)
+    return LoopBounds(state, y, z, lines, affine, excess, successor)
 
 
-def _phases(activation: AbstractActivation, y: Ball, z: Ball) -> tuple[Array, Array, Array]:
-    """Units that are affine but for inputs that change their sign by next to nothing.
+def _settled(unit: AbstractUnit, y: Ball, z: Ball, lines: Lines) -> tuple[Lines, Array, Array]:
+    """Lines, which units are affine, and by how much the lines of these may be off.
 
-    Kept, such a unit would need multipliers of the size of `1 / MARGINAL`, and derivatives lose as
-    many digits. An activation is nonexpansive, so its output is off by twice the distance of an
-    input from where it is the identity; and what is taken for zero by no more than its size.
+    Affine is also a unit that would be if its inputs ended next to nothing sooner, below or above.
+    Kept, it would need multipliers of the size of `1 / MARGINAL`, and derivatives lose as many
+    digits. A unit is nonexpansive, and so is such a line, so its output is off by twice the
+    distance of an input from where it is affine, and by no more than its distance from the line.
     """
-    spare = MARGINAL * (abs(y.mid) + y.rad)
-    surely = activation.phases(y.lower, y.upper)
-    passing = activation.phases(y.lower + spare, jnp.maximum(y.upper, y.lower + spare))[0]
-    blocking = activation.phases(jnp.minimum(y.lower, y.upper - spare), y.upper - spare)[1]
-    blocking &= ~passing
-    excess = jnp.where(blocking, jnp.minimum(2 * spare, abs(z.mid) + z.rad), 2 * spare)
-    excess = jnp.where(surely[0] | surely[1] | ~(passing | blocking), 0.0, excess)
-    return passing, blocking, excess
+    spare, surely = MARGINAL * (abs(y.mid) + y.rad), lines.affine
+    from_above = unit.lines(y.lower + spare, jnp.maximum(y.upper, y.lower + spare))
+    from_below = unit.lines(jnp.minimum(y.lower, y.upper - spare), y.upper - spare)
+    affine, line = surely, lines.above
+    for near in (from_above, from_below):
+        line = _chosen(affine, line, near.above)
+        affine = affine | near.affine
+    off = z - (line.slope * y + line.offset)
+    excess = jnp.minimum(2 * spare, abs(off.mid) + off.rad)
+    lines = Lines(_chosen(affine, line, lines.below), _chosen(affine, line, lines.above))
+    return lines, affine, jnp.where(affine & ~surely, excess, 0.0)
+
+
+def _chosen(mask: Array, one: Line, other: Line) -> Line:
+    """The first line where the mask is true, and the second elsewhere."""
+    return Line(*(jnp.where(mask, *pair) for pair in zip(one, other, strict=True)))
 
 
 @jax.jit

@@ -2,11 +2,11 @@
 
 Interval arithmetic forgets that the neurons of a layer come from one state, and a box around an
 ellipsoid of six dimensions has corners at 2.4 times its radius: neurons would count as switching
-that do not. Here each input is written as a row over the state and the neurons before it that do
-switch. These are replaced by linear bounds of theirs, the last first (CROWN: Zhang, Weng, Chen,
-Hsieh, Daniel, Efficient Neural Network Robustness Certification, NeurIPS 2018), and what is left
-over the state is the support function of the set. Layers are settled one after the other, and no
-bound is looser than that by intervals.
+that do not. Here each input is written as a row over the state and the units before it that are not
+affine. These are replaced by their lines, the last first (CROWN: Zhang, Weng, Chen, Hsieh, Daniel,
+Efficient Neural Network Robustness Certification, NeurIPS 2018), and what is left over the state is
+the support function of the set. Layers are settled one after the other, and no bound is looser than
+that by intervals.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.rounding import Ball, gamma
 from reachjax.programs.basis import Rows, columns, loop_rows, picking
 from reachjax.programs.bounds import LoopBounds, loop_bounds
@@ -78,10 +79,9 @@ def bounds_over(
 
     # a layer is settled when those before it are: one pass each, of which the last one's ranges go
     # unused, so that one pass is all that is compiled
-    layers = len(loop.controller.layers) - 1 + 2 * (loop.input_box is not None)
     shapes = jax.eval_shape(loop_bounds, loop, box, t, known)
     blank = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)
-    return jax.lax.fori_loop(0, layers + 1, once, (known, blank))[1]
+    return jax.lax.fori_loop(0, len(loop.layers) + 1, once, (known, blank))[1]
 
 
 def _meet(one: Ball, other: Ball) -> Ball:
@@ -91,7 +91,7 @@ def _meet(one: Ball, other: Ball) -> Ball:
 
 
 def _ranges(rows: Rows, X: AbstractSet, bounds: LoopBounds) -> Ball:
-    """Intervals of rows over the basis `[x, z, 1]`, by intervals and by linear bounds of `z`."""
+    """Intervals of rows over the basis `[x, z, 1]`, by intervals and by the lines of `z`."""
     both = jax.tree.map(lambda *part: jnp.concatenate(part), rows, -rows)
     relaxed = _relaxed(both, rows, bounds)
     upper, below = jnp.minimum(_upper(both, X, bounds), _upper(relaxed, X, bounds)).reshape(2, -1)
@@ -101,30 +101,23 @@ def _ranges(rows: Rows, X: AbstractSet, bounds: LoopBounds) -> Ball:
 def _relaxed(rows: Rows, inputs: Rows, bounds: LoopBounds) -> Rows:
     """Rows that are nowhere smaller, over the state alone but for rounding.
 
-    With `l <= y <= u`, `l < 0 < u`: `z <= u / (u - l) (y - l)`, and `z >= y` or `z >= 0`, whichever
-    leaves less out. Where a coefficient is positive the first takes the place of `z`, else the
-    second; any slopes are sound that the interval allows.
+    Where a coefficient is positive the line above takes the place of `z`, else the line below.
 
     Args:
         rows: over the basis `[x, z, 1]`.
         inputs: those of the units `z`.
         bounds: of the units.
     """
-    y, k = bounds.preactivation, len(inputs.mid)
+    k = len(inputs.mid)
     n = inputs.mid.shape[1] - 1 - k
-    lower, upper = y.lower, y.upper
-    switching = ~(bounds.passing | bounds.blocking)
-    width = jnp.where(switching, upper - lower, 1.0)
-    slope = jnp.where(switching, upper / width, 0.0) * (1 + gamma(4))
-    below = 1.0 * (switching & (upper > -lower))
 
     def replaced(i, rows: Rows) -> Rows:
         unit = k - 1 - i
-        weight = jnp.where(switching[unit], rows.mid[:, n + unit], 0.0)
-        above, under = jnp.maximum(weight, 0.0)[:, None], jnp.minimum(weight, 0.0)[:, None]
+        weight = jnp.where(bounds.affine[unit], 0.0, rows.mid[:, n + unit])
         y, z = _row(inputs, unit), picking((n + unit)[None], inputs.mid.shape[1])
-        chord = slope[unit][None, None] @ (y - lower[unit][None])
-        return rows + above @ (chord - z) + under @ (below[unit][None, None] @ y - z)
+        below, above = (line.slope[unit] * y + line.offset[unit] for line in bounds.lines)
+        over, under = jnp.maximum(weight, 0.0)[:, None], jnp.minimum(weight, 0.0)[:, None]
+        return rows + over @ (above - z) + under @ (below - z)
 
     return jax.lax.fori_loop(0, k, replaced, rows)
 
@@ -143,3 +136,34 @@ def _upper(rows: Rows, X: AbstractSet, bounds: LoopBounds) -> Float[Array, " k"]
     error = rows.rad @ values + gamma(len(values)) * (abs(rows.mid) @ values)
     spread = (abs(B) @ z.rad + error) * (1 + gamma(len(values)))
     return B @ z.mid + c + X.support(A) + spread
+
+
+@jax.jit
+def first_rows(loop: ClosedLoop) -> Rows | None:
+    """Rows over `[x, 1]` of the inputs of the controller's first layer; None if it has no units."""
+    n, found = loop.states, []
+
+    def stop(_: AbstractUnit, y: Rows) -> Rows:
+        found.append(y)
+        return y
+
+    loop.controller.propagate(columns(0, n, n + 1), stop)
+    return found[0] if found else None
+
+
+@jax.jit  # so that the interval arithmetic is compiled as one
+def first_inputs(
+    rows: Rows, lower: Float[Array, " k"], upper: Float[Array, " k"], box: Box
+) -> Ball:
+    """Bounds of the inputs of the controller's first layer.
+
+    Args:
+        rows: of these inputs over `[x, 1]`.
+        lower: `(k,)`, of the rows without their constants over the set of states.
+        upper: `(k,)`, the same.
+        box: around these states.
+    """
+    around = Ball.between(box.lower, box.upper)
+    size = jnp.append(abs(around.mid) + around.rad, 1.0)
+    error = (rows.rad @ size) * (1 + gamma(len(size)))
+    return Ball.between(lower, upper) + Ball(rows.mid[:, -1], error)

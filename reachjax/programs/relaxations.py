@@ -1,11 +1,11 @@
 """Which products of facts enter the semidefinite program: that choice is the relaxation.
 
-Facts are stacked as `[1; facets of the set; z; z - y; caps of z; caps of z - y]`, all but the first
-once for each step of a window. The product of two of them is never negative on a trajectory, the
-product `z (z - y)` is zero there. Weighted by multipliers they form `F' Gamma F` (propositions 1-2
-and lemma 1 of the paper, and what others add to them). A diagonal entry of `Gamma` would only add a
-positive semidefinite term, which never helps, so there is none; but an ellipsoid's rows come
-squared, `s^2 - |R x|^2 >= 0`, in every relaxation (proposition 2).
+Facts are stacked as `facts` says. The product of two of them is never negative on a trajectory, and
+some are zero there, such as `z (z - y)` of a ReLU. Weighted by multipliers they form `F' Gamma F`
+(propositions 1-2 and lemma 1 of the paper, and what others add to them). Facts of units and their
+products are chosen by what they rest on. A diagonal entry of `Gamma` would only add a positive
+semidefinite term, which never helps, so there is none; but an ellipsoid's rows come squared,
+`s^2 - |R x|^2 >= 0`, in every relaxation (proposition 2).
 """
 
 from __future__ import annotations
@@ -19,82 +19,13 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from reachjax.loops.units import Mark
 from reachjax.numerics.checks import real_number, whole_number
 from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.programs.facts import FactLayout, Pair
 
-
-@dataclasses.dataclass(frozen=True)
-class FactLayout:
-    """Where each kind of fact stands among the rows.
-
-    First the constant 1, then for each step of the window the facets of its set and the facts of
-    its units, last the cone.
-
-    Attributes:
-        facets: of the set of states at each step of the window.
-        units: of the loop.
-        cone: rows of the first set's cone fact, the level first; 0 when it has none.
-    """
-
-    facets: tuple[int, ...]
-    units: int
-    cone: int = 0
-
-    @property
-    def steps(self) -> int:
-        """How many steps the window has."""
-        return len(self.facets)
-
-    def _first(self, step: int) -> int:
-        """The first row of a step."""
-        return 1 + sum(self.facets[:step]) + 4 * self.units * step
-
-    def _kind(self, number: int) -> tuple[int, ...]:
-        """One kind of fact of every unit, step after step."""
-        firsts = [
-            self._first(step) + self.facets[step] + number * self.units
-            for step in range(self.steps)
-        ]
-        return tuple(itertools.chain(*(range(first, first + self.units) for first in firsts)))
-
-    @property
-    def set_facets(self) -> tuple[range, ...]:
-        """Facets of each set of states."""
-        firsts = [self._first(step) for step in range(self.steps)]
-        return tuple(
-            range(first, first + count) for first, count in zip(firsts, self.facets, strict=True)
-        )
-
-    @property
-    def output(self) -> tuple[int, ...]:
-        """`z >= 0`."""
-        return self._kind(0)
-
-    @property
-    def slack(self) -> tuple[int, ...]:
-        """`z - y >= 0`."""
-        return self._kind(1)
-
-    @property
-    def output_cap(self) -> tuple[int, ...]:
-        """`max(u, 0) - z >= 0`."""
-        return self._kind(2)
-
-    @property
-    def slack_cap(self) -> tuple[int, ...]:
-        """`max(-l, 0) - (z - y) >= 0`."""
-        return self._kind(3)
-
-    @property
-    def linear(self) -> range:
-        """Every fact but the cone."""
-        return range(self._first(self.steps))
-
-    @property
-    def cone_rows(self) -> range:
-        """The level `s`, then the rows `R` with `|R x| <= s`."""
-        first = self._first(self.steps)
-        return range(first, first + self.cone)
+Groups = tuple[list[list[Pair]], int]
+"""Products that share a multiplier, the free groups first, and how many are free."""
 
 
 @pytree
@@ -131,7 +62,7 @@ class AbstractRelaxation(abc.ABC):
     linear_bounds: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
+    def groups(self, facts: FactLayout) -> Groups:
         """Pairs of facts that share a multiplier, the free groups first, and how many are free."""
 
     def products(self, facts: FactLayout) -> Products:
@@ -151,10 +82,10 @@ class AbstractRelaxation(abc.ABC):
 class PaperQC(AbstractRelaxation):
     """The paper's quadratic constraints, every neuron in the basis unless asked otherwise.
 
-    Products: facet x facet of the set (`Gamma` of proposition 1), `1 x z` (`eta`), `1 x (z - y)`
-    (`nu`), the free `z (z - y)` (`lambda_i`), and with `repeated` the slope restriction between
-    neurons (`lambda_ij` of lemma 1), which is `z_i (z_j - y_j) + z_j (z_i - y_i)` once the
-    complementarities hold.
+    Products: facet x facet of the set (`Gamma` of proposition 1), and for ReLUs `1 x z` (`eta`),
+    `1 x (z - y)` (`nu`), the free `z (z - y)` (`lambda_i`), and with `repeated` the slope
+    restriction between neurons (`lambda_ij` of lemma 1), which is `z_i (z_j - y_j) + z_j (z_i -
+    y_i)` once the complementarities hold. Of other units, what stands in their place.
 
     Args:
         repeated: whether to include `lambda_ij`.
@@ -165,12 +96,12 @@ class PaperQC(AbstractRelaxation):
     repeated: bool = True
     remove_stable: bool = False
 
-    def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
+    def groups(self, facts: FactLayout) -> Groups:
         """Free complementarities, then `Gamma`, `eta`, `nu`, `lambda_ij`."""
-        free = [[pair] for pair in zip(facts.output, facts.slack, strict=True)]
+        free = [[pair] for pair in facts.zero]
         within = (itertools.combinations(facets, 2) for facets in facts.set_facets)
         signed = [[pair] for pair in itertools.chain(*within)]
-        signed += [[(0, i)] for i in (*facts.output, *facts.slack)]
+        signed += [[(0, i)] for i in facts.marked(Mark.SECTOR)]
         if self.repeated:
             signed += _crossed(facts)
         return free + signed, len(free)
@@ -180,9 +111,9 @@ class PaperQC(AbstractRelaxation):
 class LocalBounds(AbstractRelaxation):
     """The paper's constraints and those that pre-activation bounds `l <= y <= u` give.
 
-    Adds `z (u - z)`, `(z - y) (-l - (z - y))` and `(u - z) (-l - (z - y))`, the last being the
-    triangle relaxation; stable neurons leave the basis. This is what the authors' code and DeepSDP
-    (Fazlyab, Morari, Pappas, 2020) use.
+    Adds, for ReLUs, `z (u - z)`, `(z - y) (-l - (z - y))` and `(u - z) (-l - (z - y))`, the last
+    being the triangle relaxation; stable neurons leave the basis. This is what the authors' code
+    and DeepSDP (Fazlyab, Morari, Pappas, 2020) use.
 
     Args:
         repeated: whether to include `lambda_ij`.
@@ -192,16 +123,10 @@ class LocalBounds(AbstractRelaxation):
     repeated: bool = True
     remove_stable: bool = True
 
-    def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
-        """The paper's groups, then the products of caps."""
+    def groups(self, facts: FactLayout) -> Groups:
+        """The paper's groups, then the products that rest on bounds."""
         groups, free = PaperQC(self.repeated).groups(facts)
-        for left, right in (
-            (facts.output, facts.output_cap),
-            (facts.slack, facts.slack_cap),
-            (facts.output_cap, facts.slack_cap),
-        ):
-            groups += [[pair] for pair in zip(left, right, strict=True)]
-        return groups, free
+        return groups + [[pair] for pair in facts.products(Mark.BOUND)], free
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,14 +144,12 @@ class AllProducts(AbstractRelaxation):
 
     linear_bounds: ClassVar[bool] = True
 
-    def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
+    def groups(self, facts: FactLayout) -> Groups:
         """Free complementarities, then every other pair."""
-        free = [[pair] for pair in zip(facts.output, facts.slack, strict=True)]
-        vanishing = {pair for (pair,) in free}
-        pairs = [
-            [pair] for pair in itertools.combinations(facts.linear, 2) if pair not in vanishing
-        ]
-        return free + pairs, len(free)
+        free = facts.zero
+        vanishing = {tuple(sorted(pair)) for pair in free}
+        pairs = (pair for pair in itertools.combinations(facts.linear, 2) if pair not in vanishing)
+        return [[pair] for pair in (*free, *pairs)], len(free)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,12 +185,12 @@ class CuttingPlanes(AbstractRelaxation):
         whole_number("CuttingPlanes.batch", self.batch, 1)
         real_number("CuttingPlanes.gap", self.gap, 0.0)
 
-    def groups(self, facts: FactLayout) -> tuple[list[list[tuple[int, int]]], int]:
+    def groups(self, facts: FactLayout) -> Groups:
         """The products to begin with."""
         return LocalBounds(repeated=False).groups(facts)
 
 
-def _crossed(facts: FactLayout) -> list[list[tuple[int, int]]]:
-    """`z_i (z_j - y_j)` and `z_j (z_i - y_i)` under one multiplier, for every pair of neurons."""
-    z, r = facts.output, facts.slack
-    return [[(z[i], r[j]), (z[j], r[i])] for i, j in itertools.combinations(range(len(z)), 2)]
+def _crossed(facts: FactLayout) -> list[list[Pair]]:
+    """`p_i q_j` and `p_j q_i` under one multiplier, for every two products of slopes `p q`."""
+    slopes = itertools.combinations(facts.products(Mark.SLOPE), 2)
+    return [[(p_i, q_j), (p_j, q_i)] for (p_i, q_i), (p_j, q_j) in slopes]

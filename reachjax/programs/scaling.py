@@ -61,8 +61,7 @@ def _ranges(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " k"], Float[
     """
     y, z = bounds.preactivation, bounds.output
     if prune:
-        gone = bounds.passing | bounds.blocking
-        return jnp.where(gone, 0.0, z.mid), jnp.where(gone, 0.0, z.rad)
+        return jnp.where(bounds.affine, 0.0, z.mid), jnp.where(bounds.affine, 0.0, z.rad)
     size = abs(y.mid) + y.rad
     constant = z.rad <= CONSTANT * size
     # a tenth of the input's size: measured, solvers lose digits at the whole and at a hundredth

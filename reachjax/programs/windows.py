@@ -20,13 +20,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.units import Facts
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.basis import Rows, columns, loop_rows
 from reachjax.programs.bounds import LoopBounds, loop_bounds
+from reachjax.programs.facts import FactLayout, Kind, StepFacts
 from reachjax.programs.lmi import Program
 from reachjax.programs.preactivations import bounds_over, known_inputs, rounded
-from reachjax.programs.relaxations import AbstractRelaxation, FactLayout
+from reachjax.programs.relaxations import AbstractRelaxation
 from reachjax.programs.scaling import scaled_states, scaled_units
 from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection
 
@@ -43,8 +45,8 @@ class Window(Replaceable):
         cone: `(r, n)`, rows of the first set's cone fact.
         state: `(n_x, n)`, the state after these steps, over the basis itself.
         transform: `(n, n)`, `T` with `xi = T eta`, the entries of `eta` being in `[-1, 1]`.
-        facets: how many facets the set of each step has.
-        units: of the loop.
+        steps: what the facts of each step are.
+        units: how many there are in a step.
         start: the time of the first set.
         taken: how many columns are.
         prune: whether units that bounds prove to be affine leave the basis.
@@ -56,7 +58,7 @@ class Window(Replaceable):
     cone: Rows
     state: Rows
     transform: Float[Array, "n n"]
-    facets: tuple[int, ...] = static()
+    steps: tuple[StepFacts, ...] = static()
     units: int = static()
     start: int = static()
     taken: int = static()
@@ -92,7 +94,7 @@ class Window(Replaceable):
             cone=cone,
             state=state,
             transform=T,
-            facets=(),
+            steps=(),
             units=loop.units,
             start=int(t),
             taken=loop.states,
@@ -107,7 +109,7 @@ class Window(Replaceable):
     @property
     def layout(self) -> FactLayout:
         """Where each kind of fact stands among those of the program."""
-        return FactLayout(self.facets, self.units, len(self.cone.mid))
+        return FactLayout(self.steps, len(self.cone.mid))
 
     def extended(
         self, loop: ClosedLoop, X: AbstractSet, box: Box, known: Ball | None = None
@@ -128,12 +130,13 @@ class Window(Replaceable):
         units, state, T = _extended(
             loop, grown.state, grown.transform, bounds, t, places, self.prune
         )
-        block = _block(X, grown.state, units, T)
+        facets, facts = _facts(X, grown.state, units, T)
+        step = StepFacts(len(facets.mid), tuple(map(Kind.of, units)))
         return grown.replace(
-            facts=(*grown.facts, block),
+            facts=(*grown.facts, facts),
             state=state,
             transform=T,
-            facets=(*self.facets, len(block.mid) - 4 * self.units),
+            steps=(*self.steps, step),
             taken=taken,
         )
 
@@ -155,8 +158,7 @@ class Window(Replaceable):
         """The column of each unit of one more step, and how many are taken then."""
         if not self.compact:
             return self.taken + np.arange(self.units), self.taken + self.units
-        passing, blocking = jax.device_get(jax.lax.stop_gradient((bounds.passing, bounds.blocking)))
-        stays = ~(passing | blocking)
+        stays = ~jax.device_get(jax.lax.stop_gradient(bounds.affine))
         places = np.where(stays, self.taken + np.cumsum(stays) - 1, -1)
         return places, self.taken + int(stays.sum())
 
@@ -221,17 +223,21 @@ def _extended(
     t: int,
     places: Int[Array | np.ndarray, " k"],
     prune: bool,
-) -> tuple[Rows, Rows, Float[Array, "n n"]]:
+) -> tuple[tuple[Facts, ...], Rows, Float[Array, "n n"]]:
     """Scaled facts of the units of one step, the state after it, and the scaling with these."""
     rows = loop_rows(loop, state, places, t, bounds, prune)
     T = scaled_units(T, places, bounds, prune)
-    return _joined(*rows.facts) @ T, rows.successor, T
+    scaled = tuple(facts.map(lambda block: block.rows @ T) for facts in rows.facts)
+    return scaled, rows.successor, T
 
 
 @jax.jit
-def _block(X: AbstractSet, state: Rows, units: Rows, T: Float[Array, "n n"]) -> Rows:
-    """Scaled facts of one step: of its set, then of its units."""
-    return _joined(_holding(X.facts(), state) @ T, units)
+def _facts(
+    X: AbstractSet, state: Rows, units: tuple[Facts, ...], T: Float[Array, "n n"]
+) -> tuple[Rows, Rows]:
+    """Scaled facts of a step's set, and with those of its units, block after block, behind them."""
+    facets = _holding(X.facts(), state) @ T
+    return facets, _joined(facets, *(block.rows for facts in units for block in facts.blocks))
 
 
 @jax.jit

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from reachjax.loops.units import Mark
+from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Program
-from reachjax.programs.relaxations import FactLayout, LocalBounds, Products
+from reachjax.programs.relaxations import LocalBounds, Products
 from reachjax.programs.trimming import namespace, trimmed
 
 VIOLATED = 1e-6
@@ -47,12 +49,9 @@ class Candidates:
         pairs = np.array(list(itertools.chain(*groups)), dtype=int).reshape(-1, 2)
         there = np.zeros_like(self.open)
         there[self._entries(pairs)] = True
-        crossed = (
-            self.place[np.array(kind, dtype=int)]
-            for kind in (self.layout.output, self.layout.slack)
-        )
-        z, r = (places[places >= 0] for places in crossed)
-        there[np.ix_(z, r)] = there[np.ix_(r, z)] = True
+        slopes = self.place[np.array(self.layout.products(Mark.SLOPE), dtype=int).reshape(-1, 2)]
+        p, q = (places[places >= 0] for places in slopes.T)
+        there[np.ix_(p, q)] = there[np.ix_(q, p)] = True
         return there & self.open
 
     def _entries(self, pairs: Int[np.ndarray, "p 2"]) -> tuple[np.ndarray, np.ndarray]:
@@ -96,9 +95,9 @@ def _first(program: Program, layout: FactLayout) -> Bool[np.ndarray, " m"]:
     there = (program.facts.mid != 0).any(axis=1)
     first = np.zeros(len(there), dtype=bool)
     first[[0, *layout.set_facets[0], *layout.cone_rows]] = True
-    switching = there[list(layout.output)] & there[list(layout.slack)]
-    for kind in (layout.output, layout.slack, layout.output_cap, layout.slack_cap):
-        first[np.array(kind, dtype=int)[switching]] = True
+    for units in layout.units:
+        switching = there[np.array(units.marked(Mark.SECTOR))].all(axis=0)
+        first[np.array(list(units.rows.values()))[:, switching]] = True
     return first
 
 

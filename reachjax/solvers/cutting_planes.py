@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.numerics.checks import is_concrete
+from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Program
-from reachjax.programs.relaxations import CuttingPlanes, FactLayout, LocalBounds
+from reachjax.programs.relaxations import CuttingPlanes, LocalBounds
 from reachjax.proofs.proposal import Solution
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Program
-from reachjax.programs.relaxations import CuttingPlanes, FactLayout, Products
+from reachjax.programs.relaxations import CuttingPlanes, Products
 from reachjax.proofs.accepted import Judged, judged
 from reachjax.proofs.proposal import Solution, SolverStatus
 from reachjax.proofs.recheck import interval_offsets, sound_offsets

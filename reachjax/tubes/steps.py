@@ -14,6 +14,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import Program
+from reachjax.programs.preactivations import first_inputs, first_rows
 from reachjax.programs.relaxations import AbstractRelaxation
 from reachjax.programs.windows import Window
 from reachjax.proofs.certificates import AbstractCertificate
@@ -123,14 +124,12 @@ class Step:
     @cached_property
     def first_inputs(self) -> Ball | None:
         """The ranges of the first layer's inputs over the set; None where its box says as much."""
-        layers = self.setting.loop.controller.layers
-        if (
-            not (self.setting.relaxation.linear_bounds and isinstance(self.X, Polytope))
-            or len(layers) < 2
-        ):
+        if not (self.setting.relaxation.linear_bounds and isinstance(self.X, Polytope)):
             return None
-        W, b = layers[0]
-        return _inputs(*row_ranges(self.X, W), b)
+        rows = first_rows(self.setting.loop)
+        if rows is None:
+            return None
+        return first_inputs(rows, *row_ranges(self.X, rows.mid[:, :-1]), self.box)
 
     @property
     def offered(self) -> Int[np.ndarray, "p 2"]:
@@ -164,8 +163,3 @@ class Step:
             starts[-1] = column[:n]
         simulations.climb(k, region, np.full(facets, facet), starts)
         return float(simulations.attained(k, region)[0][facet])
-
-
-@jax.jit  # so that the interval arithmetic is compiled as one
-def _inputs(lower: Float[Array, " k"], upper: Float[Array, " k"], b: Float[Array, " k"]) -> Ball:
-    return Ball.between(lower, upper) + b

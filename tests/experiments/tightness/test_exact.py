@@ -14,7 +14,6 @@ from scipy.optimize import OptimizeResult
 import reachjax as rj
 from experiments.tightness import exact
 from experiments.tightness.exact import SHARP, exact_maxima, exact_maximum
-from reachjax.loops import AbstractActivation
 from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import (
     LoopData,
@@ -146,13 +145,13 @@ def test_a_single_point_goes_where_it_is_simulated():
     assert value == pytest.approx(simulate(data, point[None], 3)[-1, 0, 1], abs=ROUNDING)
 
 
-class Absolute(AbstractActivation):
+class Absolute(rj.AbstractUnit):
     """`|y|`, of which the program knows nothing."""
 
     def __call__(self, y):
         return abs(y)
 
-    interval = phases = facts = None
+    interval = lines = facts = None
 
 
 def test_only_relus_are_taken():

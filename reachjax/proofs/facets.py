@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.lmi import Program
-from reachjax.proofs.accepted import accepted_offsets
 from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.proposal import Solution
+from reachjax.proofs.reported import accepted_offsets
 
 
 @pytree

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 from reachjax.numerics.checks import whole_number
-from reachjax.programs.compact import compact
 from reachjax.programs.lmi import Program
+from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
@@ -71,7 +71,7 @@ class Auto(AbstractSolver):
         What counts here is the program without what is unused. Where the one that is chosen fails,
         the other is asked.
         """
-        reduced = compact(program)
+        reduced = presolved(program)
         if _is_lean(len(reduced.kept), len(reduced.columns) + len(program.objective.mid)):
             first, second, enough = self.large, self.small, (SolverStatus.SOLVED,)
         else:  # an inaccurate ellipsoid is centred anyhow

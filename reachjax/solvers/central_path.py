@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from reachjax.solvers.barrier import AbstractBarrier
+from reachjax.solvers.barrier import EllipsoidBarrier
 
 FROM_AFAR = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 1e-5)
 """Weights to begin with far from the path. Measured with every neuron kept: the first takes some 60
@@ -16,7 +16,7 @@ Newton steps and each of the others about ten; beginning at 0.1 takes 200."""
 
 PRICES = (10.0, 100.0, 1000.0)
 """Prices of `t` that are tried, in units of the sizes of basis and successor
-(`AbstractBarrier.unit`). The trace of moments stays below the price; with many neurons kept, 1 was
+(`EllipsoidBarrier.unit`). The trace of moments stays below the price; with many neurons kept, 1 was
 seen to be too low by half."""
 
 LARGEST = 1500
@@ -51,7 +51,7 @@ class Centre(NamedTuple):
 
 
 def path_end(
-    barrier: AbstractBarrier,
+    barrier: EllipsoidBarrier,
     start: Callable[[], np.ndarray | None],
     weights: tuple[float, ...],
     prices: tuple[float, ...] = PRICES,
@@ -71,7 +71,7 @@ def path_end(
     return None
 
 
-def follow(barrier: AbstractBarrier, y: np.ndarray, weights: tuple[float, ...]) -> Centre | None:
+def follow(barrier: EllipsoidBarrier, y: np.ndarray, weights: tuple[float, ...]) -> Centre | None:
     """The last centre that is reached, from one weight to the next; None without any."""
     last = None
     for weight in weights:
@@ -83,7 +83,7 @@ def follow(barrier: AbstractBarrier, y: np.ndarray, weights: tuple[float, ...]) 
 
 
 def minimiser(
-    barrier: AbstractBarrier, y: np.ndarray, weight: float
+    barrier: EllipsoidBarrier, y: np.ndarray, weight: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Newton's method from a point inside: the minimiser and the Hessian there."""
     value, before = barrier.value(y, weight), np.inf

@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from reachjax.numerics.host import all_finite
-from reachjax.programs.compact import compact
 from reachjax.programs.lmi import Program, with_successor
+from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import Enclosure, SolverStatus
 from reachjax.sets import NormalForm
+from reachjax.solvers.barrier import EllipsoidBarrier
 from reachjax.solvers.central_path import FROM_AFAR, LARGEST, Centre, path_end, solved
-from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
 
 WEIGHTS = (1e-6, 1e-7, 1e-8)
 """Barrier weights `mu`, followed downwards. At the last one the logarithm of the volume is off by
@@ -78,7 +78,7 @@ def enclosed(program: Program, given: NormalForm | None = None) -> Enclosure:
     began, proposal = time.perf_counter(), Enclosure.blank(program)
     if not all_finite((program, given)) or (given is not None and not given.A.any()):
         return proposal
-    reduced = compact(program)
+    reduced = presolved(program)
     if len(reduced.kept) > LARGEST or not len(reduced.columns):
         return proposal
     barrier = EllipsoidBarrier(reduced, given)
@@ -102,7 +102,7 @@ def centred(
 
     None where the path is not reached, or the program is so large that it would take long.
     """
-    reduced = compact(program)
+    reduced = presolved(program)
     if len(reduced.kept) > LARGEST or not all_finite((multipliers, form)):
         return None
     barrier = EllipsoidBarrier(reduced)
@@ -128,7 +128,7 @@ def sensitivity(
     """
     if not all_finite((program, multipliers, form, cotangent, frame)):
         return Sensitivity.unknown(program)
-    barrier = EllipsoidBarrier(compact(with_successor(program, frame)))
+    barrier = EllipsoidBarrier(presolved(with_successor(program, frame)))
     found = None
     if barrier.count <= LARGEST:
         found = _centre(barrier, multipliers, form.of(frame.inverse))

@@ -12,8 +12,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from reachjax.programs.compact import compact
 from reachjax.programs.lmi import Program
+from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
@@ -72,7 +72,7 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
         """
         name, options = self.settings()
         _require_installed(name)
-        reduced = compact(program)
+        reduced = presolved(program)
         model = FacetModel(reduced)
         solution = Solution.blank_for(program)
         for i, (row, center, unit) in enumerate(
@@ -108,7 +108,7 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
         """
         name, options = self.settings()
         _require_installed(name)
-        reduced, proposal = compact(program), Enclosure.blank(program)
+        reduced, proposal = presolved(program), Enclosure.blank(program)
         began, status = time.perf_counter(), SolverStatus.FAILED
         scaled = model = None
         for factor in RESCALINGS[: 1 if form is None else None]:

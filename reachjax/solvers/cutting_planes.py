@@ -20,7 +20,7 @@ from reachjax.programs.relaxations import CuttingPlanes, LocalBounds
 from reachjax.proofs.proposal import Solution
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
-from reachjax.solvers.candidates import NONE
+from reachjax.solvers.cut_pool import NONE
 from reachjax.solvers.differentiable import enveloped, proved_offsets
 from reachjax.solvers.rounds import Witness, products_around, solved_in_rounds
 

@@ -38,8 +38,8 @@ from jaxtyping import Array, Float
 
 from reachjax.numerics.host import all_finite, on_host, shapes_of
 from reachjax.programs.lmi import Program, lagrangian
-from reachjax.proofs.accepted import Judged, judged
 from reachjax.proofs.proposal import Solution
+from reachjax.proofs.reported import Judged, judged
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.cotangents import asked_for
 from reachjax.solvers.faults import proposed

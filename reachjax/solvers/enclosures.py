@@ -25,10 +25,10 @@ import numpy as np
 from jaxtyping import Array
 
 from reachjax.numerics.host import all_finite, on_host, shapes_of
-from reachjax.programs.compact import compact
 from reachjax.programs.lmi import Program, form_rows, schur_lagrangian, with_successor
-from reachjax.proofs.accepted import SHORTFALL, accepted_enclosure, largest_factor, log_volume
+from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import ANSWERS, Enclosure, SolverStatus
+from reachjax.proofs.reported import SHORTFALL, accepted_enclosure, largest_factor, log_volume
 from reachjax.proofs.slopes import held_level
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
@@ -79,7 +79,7 @@ def _enclose(
         return blank.form, np.array(np.nan), np.array(False), blank, frame
     for attempt in range(ATTEMPTS):
         framed = with_successor(program, frame) if attempt else program
-        reduced = compact(framed)
+        reduced = presolved(framed)
         if attempt and reduced.is_flat:
             break
         proposed, on_path = _proposed(solver, framed)

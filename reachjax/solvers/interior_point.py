@@ -8,8 +8,8 @@ import time
 import numpy as np
 
 from reachjax.numerics.checks import whole_number
-from reachjax.programs.compact import compact
 from reachjax.programs.lmi import Program
+from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import Enclosure, Solution
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver, require_positive
@@ -52,7 +52,7 @@ class InteriorPoint(AbstractSolver):
         """Propose multipliers for every facet."""
         facets, size = program.objective.mid.shape
         solution = Solution.blank(facets, len(program.products.free), size)
-        reduced = compact(program)
+        reduced = presolved(program)
         used = np.ix_(reduced.columns, reduced.columns)
         for i, row in enumerate(reduced.objective):
             began = time.perf_counter()

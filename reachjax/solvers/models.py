@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
-from reachjax.programs.compact import THINNEST, CompactProgram
+from reachjax.programs.presolve import THINNEST, NormalProgram
 from reachjax.sets import NormalForm
 
 
 class Multipliers:
     """The variables, of generators of unit size, and `sum_k y_k G_k` as a flat expression."""
 
-    def __init__(self, program: CompactProgram):
+    def __init__(self, program: NormalProgram):
         import cvxpy as cp
 
         generators = program.generators.columns()
@@ -46,7 +46,7 @@ class Multipliers:
 class FacetModel:
     """`sum_k y_k G_k + p e' + e p' - 2 b e e' <= 0` with the smallest `b`; `p` is a parameter."""
 
-    def __init__(self, program: CompactProgram):
+    def __init__(self, program: NormalProgram):
         import cvxpy as cp
 
         n = program.objective.shape[1]
@@ -75,7 +75,7 @@ class EllipsoidModel:
     given up to a factor (maximise the factor).
     """
 
-    def __init__(self, program: CompactProgram, given: NormalForm | None = None):
+    def __init__(self, program: NormalProgram, given: NormalForm | None = None):
         import cvxpy as cp
 
         W = program.objective

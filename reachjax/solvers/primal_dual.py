@@ -5,7 +5,7 @@
 
 Cones of general conic solvers hold a dense block of `n (n + 1) / 2` rows for a matrix inequality of
 size `n`. Here a multiplier's matrix is a sum of products of two rows, so Gram matrices of rows are
-enough (`Pairs.schur`), and an iteration costs `O(n^3)` for as many multipliers as columns.
+enough (`Generators.schur`), and an iteration costs `O(n^3)` for as many multipliers as columns.
 
 The offset counts as a last, free multiplier with generator `-e' e`. The direction is that of
 Helmberg, Rendl, Vanderbei and Wolkowicz (HKM), with Mehrotra's predictor and corrector: with
@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from reachjax.programs.pairs import Pairs
+from reachjax.programs.generators import Generators
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.solvers.factorisations import inverse_cholesky, refined_solver
 
@@ -112,7 +112,7 @@ class FacetProgram:
         row: `(n,)`, the objective, of unit 1-norm.
     """
 
-    def __init__(self, generators: Pairs, free: np.ndarray, row: np.ndarray):
+    def __init__(self, generators: Generators, free: np.ndarray, row: np.ndarray):
         n = len(row)
         e = np.eye(n)[-1]
         self.generators = generators.with_square(e, -1.0)

@@ -16,12 +16,12 @@ from jaxtyping import Bool, Float, Int
 from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Program
 from reachjax.programs.relaxations import CuttingPlanes, Products
-from reachjax.proofs.accepted import Judged, judged
 from reachjax.proofs.proposal import Solution, SolverStatus
 from reachjax.proofs.recheck import interval_offsets, sound_offsets
+from reachjax.proofs.reported import Judged, judged
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
-from reachjax.solvers.candidates import NONE, Candidates, joint
+from reachjax.solvers.cut_pool import NONE, CutPool, joint
 from reachjax.solvers.faults import proposed, proposed_enclosure
 
 IDLE = 1e-7
@@ -65,14 +65,14 @@ def solved_in_rounds(
         witness: what simulations attain; rounds do not stop for them if it is None.
         offered: products that the first facet begins with, those that may be added.
     """
-    candidates = Candidates(program, layout)
-    found, used = [], candidates.addable(offered)
+    pool = CutPool(program, layout)
+    found, used = [], pool.addable(offered)
     for facet in range(len(program.objective.mid)):
         one = program.seeking(slice(facet, facet + 1))
         attained = None if witness is None else partial(witness, facet)
-        found.append(_facet(one, candidates, solver, cuts, attained, used))
+        found.append(_facet(one, pool, solver, cuts, attained, used))
         used = found[-1].of_use
-    return _joined(program, candidates, found)
+    return _joined(program, pool, found)
 
 
 def products_around(
@@ -91,16 +91,16 @@ def products_around(
         cuts: how many rounds, and of how many products.
         form: the ellipsoid up to a factor on `A` and `b`; free if it is None.
     """
-    candidates, n = Candidates(program, layout), len(program.transform)
+    pool, n = CutPool(program, layout), len(program.transform)
 
     def solve(pairs: np.ndarray) -> _Round:
-        given = program.replace(products=joint(candidates.core, pairs))
+        given = program.replace(products=joint(pool.core, pairs))
         enclosure = proposed_enclosure(solver, given, form)
         moments = np.asarray(enclosure.moments)
         moment = moments[:n, :n] / moments[n - 1, n - 1]
         return _Round(moment, _idle(np.asarray(enclosure.multipliers), len(pairs)), False)
 
-    return joint(candidates.core, _in_rounds(candidates, cuts, NONE, solve))
+    return joint(pool.core, _in_rounds(pool, cuts, NONE, solve))
 
 
 class _Round(NamedTuple):
@@ -146,7 +146,7 @@ class _Result(NamedTuple):
 
 
 def _in_rounds(
-    candidates: Candidates,
+    pool: CutPool,
     cuts: CuttingPlanes,
     pairs: Int[np.ndarray, "p 2"],
     solve: Callable[[Int[np.ndarray, "q 2"]], _Round],
@@ -158,7 +158,7 @@ def _in_rounds(
     bound is looser than its.
 
     Args:
-        candidates: what may be added.
+        pool: what may be added.
         cuts: how many rounds, and of how many products.
         pairs: what is added from the beginning.
         solve: what a round with these products shows.
@@ -167,12 +167,12 @@ def _in_rounds(
     for number in itertools.count():
         shown = solve(pairs)
         if not np.isfinite(shown.moment).all():
-            if number == 0 and len(missing := candidates.missing(pairs)):
+            if number == 0 and len(missing := pool.missing(pairs)):
                 pairs = np.concatenate([pairs, missing])  # no moment to choose by: all that is due
                 solve(pairs)
             break
         last = shown.enough or number >= cuts.rounds
-        more = candidates.violated(shown.moment, pairs, None if last else cuts.batch)
+        more = pool.violated(shown.moment, pairs, None if last else cuts.batch)
         if not len(more):
             break
         kept = np.full(len(pairs), True) if last else ~(idle & shown.idle)
@@ -183,7 +183,7 @@ def _in_rounds(
 
 def _facet(
     program: Program,
-    candidates: Candidates,
+    pool: CutPool,
     solver: AbstractSolver,
     cuts: CuttingPlanes,
     attained: Callable[[Float[np.ndarray, " n"]], float] | None,
@@ -195,7 +195,7 @@ def _facet(
     results: list[_Result] = []
 
     def solve(pairs: np.ndarray) -> _Round:
-        given = program.replace(products=joint(candidates.core, pairs))
+        given = program.replace(products=joint(pool.core, pairs))
         solution = proposed(solver, given)
         results.append(_Result(pairs, judged(given, solution)))
         moment = np.asarray(solution.moments[0])
@@ -206,7 +206,7 @@ def _facet(
         enough = least - attained(transform @ moment[:, -1]) <= cuts.gap * size
         return _Round(moment, idle, enough)
 
-    _in_rounds(candidates, cuts, pairs, solve)
+    _in_rounds(pool, cuts, pairs, solve)
     least = min(result.offset for result in results)
     near = [result for result in results if result.offset <= least + NEAR * size]
     best = max(near, key=lambda result: result.is_optimal)  # the first that is, if any is
@@ -215,11 +215,11 @@ def _facet(
     return best._replace(judged=spent)
 
 
-def _joined(program: Program, candidates: Candidates, found: list[_Result]) -> Rounds:
+def _joined(program: Program, pool: CutPool, found: list[_Result]) -> Rounds:
     """All facets over the products that any of them has."""
     pairs = np.unique(np.concatenate([result.pairs for result in found]), axis=0)
     number = {tuple(pair): i for i, pair in enumerate(pairs)}
-    products, core = joint(candidates.core, pairs), len(candidates.core.free)
+    products, core = joint(pool.core, pairs), len(pool.core.free)
     size = len(program.transform)
     solution = Solution.blank(len(found), len(products.free), size)
     held = np.zeros_like(solution.multipliers)

@@ -23,7 +23,7 @@ from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, Box, Polytope, Template
 from reachjax.sets.geometry import bounding_box, row_ranges
 from reachjax.solvers import AbstractSolver
-from reachjax.solvers.candidates import NONE
+from reachjax.solvers.cut_pool import NONE
 
 
 def boxed(X: AbstractSet, name: str) -> Box:

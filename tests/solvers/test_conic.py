@@ -6,10 +6,10 @@ import pytest
 from scipy.linalg import eigvalsh
 
 import reachjax as rj
-from reachjax.programs.compact import compact
+from reachjax.programs.presolve import presolved
 from reachjax.programs.windows import step_program
-from reachjax.proofs.accepted import accepted_offsets
 from reachjax.proofs.recheck import interval_offsets
+from reachjax.proofs.reported import accepted_offsets
 from reachjax.solvers.conic import STATUSES
 from tests.loops import closed_loop, one_step, random_loop
 from tests.networks import box_region, directions, simulate
@@ -151,7 +151,7 @@ def test_rows_at_rounding_level_and_empty_columns_do_not_reach_the_solver(settin
     noisy[5] = 1e-17 * np.sign(noisy[5] + 0.5)
     noise = program.facts.rad.copy()
     noise[5] = 1e-17
-    reduced = compact(program.replace(facts=type(program.facts)(noisy, noise)))
+    reduced = presolved(program.replace(facts=type(program.facts)(noisy, noise)))
     touched = (program.products.left == 5) | (program.products.right == 5)
     gone = set(range(len(program.products.free))) - set(reduced.kept.tolist())
     alone = {

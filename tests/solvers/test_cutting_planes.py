@@ -9,7 +9,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.programs.windows import Window
-from reachjax.solvers.candidates import Candidates, joint
+from reachjax.solvers.cut_pool import CutPool, joint
 from reachjax.solvers.rounds import solved_in_rounds
 from tests.loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, saturating_network, simplex_region, simulate
@@ -157,7 +157,7 @@ def test_violated_products_are_those_of_negative_moments():
         closed_loop(data), X0, X0
     )
     program = jax.device_get(window.program(jnp.eye(2), CUTS))
-    candidates = Candidates(program, window.layout)
+    candidates = CutPool(program, window.layout)
     n = len(program.transform)
     point = np.append(np.random.default_rng(0).uniform(-1, 1, n - 1), 1.0)
     moment = np.outer(point, point)  # of a point of the box that is no trajectory

@@ -7,9 +7,9 @@ import pytest
 
 import reachjax as rj
 from reachjax.programs.windows import step_program
-from reachjax.proofs.accepted import accepted_enclosure
 from reachjax.proofs.proposal import Enclosure
 from reachjax.proofs.recheck import sound_level
+from reachjax.proofs.reported import accepted_enclosure
 from reachjax.sets import NormalForm
 from tests.loops import closed_loop, random_loop, recursion
 from tests.solvers.test_differentiable import PARTS, along, central_difference, dot

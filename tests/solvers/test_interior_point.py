@@ -6,19 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reachjax.programs.trimming import trimmed
 from reachjax.solvers.arrangement import arranged, bucket, cut
 from scipy.linalg import eigvalsh
 
 import reachjax as rj
-from reachjax.programs.compact import compact
-from reachjax.programs.trimming import trimmed
+from reachjax.programs.presolve import presolved
 from reachjax.programs.windows import step_program
-from reachjax.proofs.accepted import accepted_enclosure, accepted_offsets, log_volume
 from reachjax.proofs.proposal import ANSWERS
 from reachjax.proofs.recheck import interval_offsets
+from reachjax.proofs.reported import accepted_enclosure, accepted_offsets, log_volume
 from reachjax.sets import NormalForm
 from reachjax.solvers import barrier, centring, interior_point
-from reachjax.solvers.ellipsoid_barrier import EllipsoidBarrier
+from reachjax.solvers.barrier import EllipsoidBarrier
 from reachjax.solvers.factorisations import inverse_factor
 from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import (
@@ -90,7 +90,7 @@ def test_the_schur_matrix_is_that_of_traces_of_explicit_matrices(kind):
     known = generators.paired_gram(generators.gram(X), X)
     np.testing.assert_allclose(known, generators.paired(X), atol=1e-10)
     # and they are the program's own generators
-    reduced, k = compact(given), len(layout.columns)
+    reduced, k = presolved(given), len(layout.columns)
     dense = (
         reduced.generators.columns().T.toarray().reshape(-1, k, k) * reduced.norms[:, None, None]
     )
@@ -351,7 +351,7 @@ def least_log_volume(given, enclosure):
     assert abs(sums[products.free]).max(initial=0.0) <= SIGNS * np.trace(X)
     assert sums[~products.free].min(initial=0.0) >= -SIGNS * np.trace(X)
     assert abs(X[n:, n - 1]).max() <= SIGNS * np.trace(X)
-    K = compact(given).widths
+    K = presolved(given).widths
     D = -2 * X[n:, :n] @ (given.objective.mid / K[:, None]).T
     c = X[n - 1, n - 1] + np.trace(X[n:, n:])
     return np.linalg.slogdet((D + D.T) / 2)[1] - q * np.log(c / q) + np.log(K).sum()
@@ -465,7 +465,7 @@ def test_gradients_of_ellipsoids_of_weights_that_are_no_numbers_are_none(shape):
 def test_the_barrier_s_derivatives_are_its_differences(shape, monkeypatch):
     monkeypatch.setattr(barrier, "DAMPING", 0.3)
     given = None if shape is None else NormalForm(shape, np.array([0.1, -0.2]))
-    function = EllipsoidBarrier(compact(program(n_x=2, X=round_of, rows=np.eye(2))), given)
+    function = EllipsoidBarrier(presolved(program(n_x=2, X=round_of, rows=np.eye(2))), given)
     function.price, weight, rng = 7.0, 0.1, np.random.default_rng(0)
     y = function.inside()
     for _ in range(5):  # away from the edge

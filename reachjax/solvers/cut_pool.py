@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from reachjax.loops.units import Mark
 from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Program
+from reachjax.programs.presolve import presolved
 from reachjax.programs.relaxations import LocalBounds, Products
-from reachjax.programs.trimming import namespace, trimmed
 
 VIOLATED = 1e-6
 """Products more negative than this are, rows of facts and the basis being of unit size."""
@@ -22,7 +21,7 @@ NONE = np.zeros((0, 2), dtype=int)
 """No pairs."""
 
 
-class Candidates:
+class CutPool:
     """The facts of a program that say something, and which of their products may be added.
 
     To begin with there are the products of the first set's facets and of the units that switch.
@@ -30,14 +29,16 @@ class Candidates:
     """
 
     def __init__(self, program: Program, layout: FactLayout):
-        given, products = trimmed(program), program.products
-        norms = np.sqrt((given.facts**2).sum(axis=1))
+        normal, products = presolved(program), program.products
+        facts, self.columns = normal.generators.rows, normal.columns
+        norms = np.sqrt((facts**2).sum(axis=1))
         linear = np.arange(len(norms)) < len(layout.linear)
         self.live = np.flatnonzero((norms > 0) & np.isfinite(norms) & linear)
-        self.rows = given.facts[self.live] / norms[self.live, None]
+        self.rows = facts[self.live] / norms[self.live, None]
         self.place = np.full(len(norms), -1)
         self.place[self.live] = np.arange(len(self.live))
-        self.core = restricted(products, given.kept & _of_facts(products, _first(program, layout)))
+        kept = np.isin(np.arange(len(products.free)), normal.kept)
+        self.core = restricted(products, kept & _of_facts(products, _first(program, layout)))
         self.open = np.triu(np.ones((len(self.live),) * 2, dtype=bool), 1)
         self.open[self._entries(np.stack([self.core.left, self.core.right], axis=1))] = False
         self.layout = layout
@@ -81,7 +82,8 @@ class Candidates:
     ) -> Int[np.ndarray, "q 2"]:
         """The most violated pairs that are not there yet; None for all that `LocalBounds` has."""
         allowed = self._besides(pairs, self.promised if batch is None else self.open)
-        values = np.where(allowed, self.rows @ moment @ self.rows.T, 0.0)
+        X = moment[np.ix_(self.columns, self.columns)]
+        values = np.where(allowed, self.rows @ X @ self.rows.T, 0.0)
         count = int((values < -VIOLATED).sum())
         count = count if batch is None else min(batch, count)
         if not count:
@@ -114,13 +116,13 @@ def restricted(products: Products, kept: np.ndarray) -> Products:
     return Products(left, right, sign, number[products.multiplier[there]], products.free[kept])
 
 
-def joint(core: Products, pairs: Any) -> Products:
+def joint(core: Products, pairs: Int[np.ndarray, "p 2"]) -> Products:
     """Products and pairs of a multiplier each."""
-    xp, count, more = namespace(pairs), len(core.free), len(pairs)
+    count, more = len(core.free), len(pairs)
     return Products(
-        left=xp.concatenate([core.left, pairs[:, 0]]),
-        right=xp.concatenate([core.right, pairs[:, 1]]),
-        sign=xp.concatenate([core.sign, xp.ones(more)]),
-        multiplier=xp.concatenate([core.multiplier, count + xp.arange(more)]),
-        free=xp.concatenate([core.free, xp.zeros(more, dtype=bool)]),
+        left=np.concatenate([core.left, pairs[:, 0]]),
+        right=np.concatenate([core.right, pairs[:, 1]]),
+        sign=np.concatenate([core.sign, np.ones(more)]),
+        multiplier=np.concatenate([core.multiplier, count + np.arange(more)]),
+        free=np.concatenate([core.free, np.zeros(more, dtype=bool)]),
     )

@@ -15,7 +15,7 @@ CHUNK = 256
 """Pairs that are treated together: it bounds the memory that products of them take."""
 
 
-class Pairs(NamedTuple):
+class Generators(NamedTuple):
     """The matrices `G_k`.
 
     Attributes:
@@ -81,10 +81,10 @@ class Pairs(NamedTuple):
         paired = (self.sharing @ gram[left, right] for gram in (A, B))
         return *paired, (self.sharing @ shared.T) / 4
 
-    def with_square(self, row: np.ndarray, weight: float) -> Pairs:
+    def with_square(self, row: np.ndarray, weight: float) -> Generators:
         """With one more matrix, `weight` times a row's square."""
         m = len(self.rows)
-        return Pairs(
+        return Generators(
             rows=np.vstack([self.rows, row]),
             left=np.append(self.left, m),
             right=np.append(self.right, m),

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.numerics.rounding import gamma
-from reachjax.programs.compact import TINY, CompactProgram, compact
 from reachjax.programs.lmi import Program, form_rows
+from reachjax.programs.presolve import LEAST_WIDTH, NormalProgram, presolved
 from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution
 from reachjax.proofs.recheck import interval_offsets, sound_level, sound_offsets
 from reachjax.proofs.slopes import held_offsets
@@ -91,7 +91,7 @@ def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
 
     The optimal value is no smaller (weak duality), but for what they miss their constraints by.
     """
-    reduced = compact(program)
+    reduced = presolved(program)
     values = np.full(len(reduced.centers), -np.inf)
     for i, whole in enumerate(np.asarray(solution.moments)):
         X = whole[np.ix_(reduced.columns, reduced.columns)]
@@ -102,7 +102,7 @@ def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
     return values
 
 
-def _missed(reduced: CompactProgram, moments: np.ndarray) -> float:
+def _missed(reduced: NormalProgram, moments: np.ndarray) -> float:
     """By how much moments over the columns kept miss the sign of a product."""
     products = reduced.generators.paired(moments)
     return float(np.where(reduced.free, abs(products), -products).max(initial=0.0))
@@ -137,7 +137,7 @@ def accepted_enclosure(
         level = max(1.0, level)
     else:
         other = _interval_form(program) if given is None else given
-        least = TINY * float(np.linalg.norm(other.A, 2))
+        least = LEAST_WIDTH * float(np.linalg.norm(other.A, 2))
         proved = max(sound_level(program, multipliers, other), least)
         if not log_volume(form, level) <= log_volume(other, proved):
             form, level = other, proved
@@ -153,7 +153,7 @@ def largest_factor(program: Program, enclosure: Enclosure) -> float:
     n, X = len(program.transform), np.asarray(enclosure.moments)
     if not np.isfinite(X).all() or X[n - 1, n - 1] <= 0:
         return np.inf
-    X, reduced = X / X[n - 1, n - 1], compact(program)
+    X, reduced = X / X[n - 1, n - 1], presolved(program)
     missed = _missed(reduced, X[np.ix_(reduced.columns, reduced.columns)])
     if max(missed, -np.linalg.eigvalsh((X + X.T) / 2)[0]) > SHORTFALL:
         return np.inf
@@ -170,7 +170,7 @@ def log_volume(form: NormalForm, level: float | np.ndarray) -> float:
 
 def _interval_form(program: Program) -> NormalForm:
     """The ellipsoid around the interval bounds of the successor, never quite flat."""
-    reduced = compact(program)
+    reduced = presolved(program)
     A = np.diag(1 / (np.sqrt(len(reduced.widths)) * reduced.widths))
     return NormalForm(A, -A @ reduced.centers)
 

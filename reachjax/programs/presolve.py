@@ -1,0 +1,183 @@
+"""Presolve: the program as a solver should see it, with nothing empty, no noise, nothing implied.
+
+Rows whose coefficients are rounding noise are dropped (one of size 1e-16 scaled up to 1 made a
+solver report "solved" for an offset below the true support), so are columns that the others use at
+that level or not at all, and products that say nothing beyond an ellipsoid's own fact. What stays
+is brought to unit size.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool, Float
+
+from reachjax.numerics.rounding import Ball
+from reachjax.programs.generators import Generators
+from reachjax.programs.lmi import Program
+from reachjax.programs.relaxations import Products
+from reachjax.sets import NormalForm
+
+NOISE = 16.0
+"""Coefficients no larger than this many times the rounding error of their row count as zero."""
+
+GRAZING = 1e-6
+"""A fact negative on an ellipsoid by no more than this part of its size counts as implied by it."""
+
+THINNEST = 1e-4
+"""In the coordinates in which it is sought, an ellipsoid has no half-axis below this part of the
+interval radius: that keeps ellipsoids of least volume around flat sets from degenerating."""
+
+LEAST_WIDTH = 1e-100
+"""The least width of anything that is enclosed, in the units of the state."""
+
+
+class NormalProgram(NamedTuple):
+    """`sum_k y_k G_k + p e' + e p' - 2 b e e' <= 0` with `|G_k|` about 1, in `n` used columns.
+
+    Attributes:
+        generators: the `G_k`.
+        objective: `(f, n)`, of unit 1-norm and without a constant.
+        centers: `(f,)`, the constants; a facet's offset is `centers + units b`.
+        units: `(f,)`; the program's multipliers are those of the scaled objective times this. Zero
+            where the objective has one value.
+        free: `(K',)`, multipliers of either sign.
+        columns: `(n,)`, numbers of the columns kept.
+        kept: `(K',)`, numbers of the multipliers kept.
+        norms: `(K',)`: the program's multiplier is `y_k / norms_k`.
+    """
+
+    generators: Generators
+    objective: np.ndarray
+    centers: np.ndarray
+    units: np.ndarray
+    free: np.ndarray
+    columns: np.ndarray
+    kept: np.ndarray
+    norms: np.ndarray
+
+    @property
+    def widths(self) -> np.ndarray:
+        """The units, none of them at rounding level, nor so small that squares underflow."""
+        return np.maximum(self.units, 1e-9 * (abs(self.centers) + self.units.max()) + LEAST_WIDTH)
+
+    def with_units(self, units: np.ndarray) -> NormalProgram:
+        """The same program with other units of the objective; where it has one value they are 0."""
+        ratios = self.units / np.where(units > 0, units, 1.0)
+        return self._replace(objective=self.objective * ratios[:, None], units=units)
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the objective hardly varies in some coordinate."""
+        return bool(np.any(self.units < self.widths))
+
+    def is_thinnest(self, form: NormalForm) -> bool:
+        """Whether an ellipsoid is about as thin as it may be in these coordinates."""
+        return bool(np.linalg.norm(form.A * self.widths, 2) > 0.5 / THINNEST)
+
+    def to_unit_box(self, form: NormalForm) -> NormalForm:
+        """`|A x + b| <= 1` over the coordinates in which the objective rows are stated."""
+        return NormalForm(form.A * self.units, form.b + form.A @ self.centers)
+
+    def from_unit_box(self, form: NormalForm) -> NormalForm:
+        """The inverse of `to_unit_box`."""
+        A = form.A / self.units
+        return NormalForm(A, form.b - A @ self.centers)
+
+    def cotangent_to_unit_box(self, cotangent: NormalForm) -> NormalForm:
+        """The transpose of `from_unit_box`."""
+        A = (cotangent.A - np.outer(cotangent.b, self.centers)) / self.units
+        return NormalForm(A, cotangent.b)
+
+
+def presolved(program: Program) -> NormalProgram:
+    """The normal program of a program whose leaves are numpy arrays."""
+    products = program.products
+    solid, wanted = _solid(program.facts), _solid(program.objective)
+    used = solid.any(axis=0) | wanted.any(axis=0)
+    facts = np.where(solid.any(axis=1)[:, None] & used, program.facts.mid, 0.0)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is dropped
+        sizes = _sizes(products, facts)
+    kept = np.flatnonzero((sizes > 0) & np.isfinite(sizes) & ~_implied_by_cone(products, facts))
+    number = np.full(len(sizes), -1)
+    number[kept] = np.arange(len(kept))
+    owner, present = number[products.multiplier], facts.any(axis=1)
+    there = np.flatnonzero((owner >= 0) & present[products.left] & present[products.right])
+    owner, norms, columns = owner[there], sizes[kept], np.flatnonzero(used)
+    shares = np.asarray(products.sign)[there] / norms[owner], (owner, np.arange(len(there)))
+    objective = np.where(used, program.objective.mid, 0.0)
+    centers, objective[:, -1] = objective[:, -1].copy(), 0.0
+    # solvers' tolerances are absolute, objectives come in the size of the set of states
+    units = abs(objective).sum(axis=1)
+    return NormalProgram(
+        generators=Generators(
+            rows=facts[:, columns],
+            left=np.asarray(products.left)[there],
+            right=np.asarray(products.right)[there],
+            sharing=sp.csr_array(shares, shape=(len(kept), len(there))),
+        ),
+        objective=objective[:, columns] / np.where(units > 0, units, 1.0)[:, None],
+        centers=centers,
+        units=units,
+        free=np.asarray(products.free)[kept],
+        columns=columns,
+        kept=kept,
+        norms=norms,
+    )
+
+
+def _solid(rows: Ball) -> Bool[np.ndarray, "k n"]:
+    """Which coefficients stand out from the rounding errors of their row."""
+    return abs(rows.mid) > NOISE * np.sqrt((rows.rad**2).sum(axis=1))[:, None]
+
+
+def _sizes(products: Products, facts: np.ndarray) -> Float[np.ndarray, " K"]:
+    """The root of the sum of `|sym(p' q)|^2` over the pairs of each multiplier."""
+    squares = (facts**2).sum(axis=1)
+    inner = (facts[products.left] * facts[products.right]).sum(axis=1)
+    of_pairs = (squares[products.left] * squares[products.right] + inner**2) / 2
+    return np.sqrt(np.bincount(products.multiplier, of_pairs, len(products.free)))
+
+
+def _implied_by_cone(products: Products, facts: np.ndarray) -> Bool[np.ndarray, " K"]:
+    """Multipliers `(K,)` of products that say nothing beyond an ellipsoid's own fact.
+
+    A quadratic function of the state that is not negative on the ellipsoid is a positive multiple
+    of its fact and a positive semidefinite term (the S-lemma loses nothing for one constraint).
+    Products of neurons that are affine on the set are of this kind; kept, hundreds of them made a
+    solver stall at its second digit. So are those of facets that do not cut the ellipsoid.
+    """
+    cone, count = products.sign < 0, len(products.free)
+    if not cone.any():
+        return np.zeros(count, dtype=bool)
+    own = np.bincount(products.multiplier, cone, count) > 0
+    holds = _least_on_ellipsoid(products, facts, own) >= 0
+    present = (facts != 0).any(axis=1)
+    left, right = products.left, products.right
+    beyond = ~(holds[left] & holds[right]) & present[left] & present[right]
+    return ~(np.bincount(products.multiplier, beyond, count) > 0) & ~own
+
+
+def _least_on_ellipsoid(
+    products: Products, facts: np.ndarray, own: np.ndarray
+) -> Float[np.ndarray, " m"]:
+    """A lower bound `(m,)` of each fact on the ellipsoid; `-inf` if it is not one of the state.
+
+    Args:
+        products: whose negative pairs are those of the rows `R` with `|R x| <= s`.
+        facts: `(m, n)`.
+        own: `(K,)`, the multiplier of the ellipsoid's own fact.
+    """
+    cone, (left, right) = products.sign < 0, (facts[products.left], facts[products.right])
+    of_level = own[products.multiplier] & ~cone
+    level = np.sqrt(np.where(of_level, left[:, -1] * right[:, -1], 0.0).sum())
+    R, linear = np.where(cone[:, None], left, 0.0), facts[:, :-1]
+    inverse = np.linalg.pinv(R[:, :-1].T @ R[:, :-1], hermitian=True)
+    middle = facts[:, -1] - linear @ (inverse @ (R[:, :-1].T @ R[:, -1]))
+    squares = ((linear @ inverse) * linear).sum(axis=1)
+    reach = level * np.sqrt(np.maximum(squares, 0.0))
+    elsewhere = ((linear != 0) & ~(R[:, :-1] != 0).any(axis=0)).any(axis=1)
+    least = middle - reach + GRAZING * (abs(middle) + reach)
+    return np.where(elsewhere, -np.inf, least)

@@ -67,3 +67,12 @@ def test_bad_specifications_are_named():
         rj.shortfall(tube(), goal=rj.Box([0], [1]))
     with pytest.raises(TypeError, match="margn"):
         rj.shortfall(tube(), goal=rj.Box([0, 0], [1, 1]), margn=0.1)  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize("scale", [1e155, 1e-170])
+def test_the_shortfall_does_not_depend_on_the_length_of_normals(scale):
+    goal = lambda d: rj.Polytope(np.array([[3.0, 4.0]]) * scale, d[None] * scale)  # noqa: E731
+    missing = lambda d: rj.shortfall(tube(), goal=goal(d))  # noqa: E731
+    value, slope = jax.value_and_grad(missing)(jnp.array(1.5))
+    assert float(value) == pytest.approx((7 / 4 - 1.5) / 5, abs=1e-7)
+    assert float(slope) == pytest.approx(-1 / 5)

@@ -146,3 +146,61 @@ def test_a_violation_that_rounding_makes_is_no_counterexample():
     verdict = rj.verify(tube, goal=rj.Box([-1.0], [high]))
     assert np.nanmin(verdict.simulated["goal"]) < -1e-9
     assert verdict.status is not rj.VerdictStatus.REFUTED
+
+
+SCALES = [1e155, 1e-170, 1e300, 1e-300]
+
+
+def test_nothing_is_proved_by_normals_whose_squares_are_no_numbers():
+    """The sum of 13 coordinates reaches 6.5, where no corner is simulated."""
+    start = rj.Box(-np.ones(13), np.ones(13))
+    tube = recursion(contraction(13), start, 1, rj.Template.box(13))
+    for scale in SCALES:
+        goals = [rj.Polytope(np.full((1, 13), scale), [most * scale]) for most in (6, 7)]
+        beyond, inside = (rj.verify(tube, goal=goal, samples=100) for goal in goals)
+        assert beyond.status is not rj.VerdictStatus.PROVED
+        assert beyond.margins["goal"][1] == pytest.approx(-0.5 / np.sqrt(13), abs=1e-6)
+        assert inside.status is rj.VerdictStatus.PROVED
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_verdict_does_not_depend_on_the_length_of_normals(tube, scale):
+    for offset in (0.2, 0.4):  # the sum reaches 1/2 at last, and is 1/4 at least
+        normal, other = np.full((1, 2), scale), rj.Polytope([[1.0, 1.0]], [offset])
+        goal = rj.Polytope(normal, [offset * scale])
+        for spec, same in (({"goal": goal}, {"goal": other}),
+                           ({"avoid": {2: [goal]}}, {"avoid": {2: [other]}})):  # fmt: skip
+            verdict, expected = (rj.verify(tube, **each, samples=20) for each in (spec, same))
+            assert verdict.status is expected.status
+            for name, margins in expected.margins.items():
+                np.testing.assert_allclose(verdict.margins[name], margins, rtol=1e-9, atol=1e-12)
+
+
+def test_products_that_underflow_prove_and_refute_nothing():
+    """At most 1e-200, where 1e-200 x <= 0 rounds to 0 <= 0."""
+    tube = recursion(contraction(1), rj.Box([0.0], [2e-200]), 1, rj.Template.box(1))
+    below = rj.Polytope([[1e-200]], [0.0])
+    assert rj.verify(tube, goal=below, samples=20).status is not rj.VerdictStatus.PROVED
+    apart = recursion(contraction(1), rj.Box([1e-200], [2e-200]), 1, rj.Template.box(1))
+    assert rj.verify(apart, avoid=[below], samples=20).status is rj.VerdictStatus.PROVED
+
+
+@pytest.mark.parametrize("goal", [[[1e-170, 0.0]], [[1e300, 1e-300]]], ids=str)
+def test_offsets_out_of_reach_have_verdicts_too(tube, goal):
+    for offset, status in (1e308, rj.VerdictStatus.PROVED), (-1e308, rj.VerdictStatus.REFUTED):
+        assert rj.verify(tube, goal=rj.Polytope(goal, [offset]), samples=20).status is status
+
+
+def test_what_is_avoided_may_be_as_far_away_as_floats_go(tube):
+    for lower, upper in ((1e20, 2e20), (1e150, 1e308), (-1e308, -1e150)):
+        away = rj.verify(tube, avoid=[rj.Box([lower] * 2, [upper] * 2)], samples=20)
+        assert away.status is rj.VerdictStatus.PROVED
+        assert np.nanmin(away.margins["avoid[0]"]) == pytest.approx(min(abs(lower), abs(upper)))
+
+
+def test_a_tube_from_a_set_too_thin_to_be_sampled_has_bounds_and_no_witnesses():
+    cap = rj.Intersection(rj.Box([1 - 1e-12], [2.0]), rj.Ellipsoid([0.0], [[1.0]]))
+    thin = recursion(contraction(1), cap, 1, rj.Template.box(1))
+    assert np.isnan(thin.proof(1).witnesses).all()
+    assert rj.verify(thin, goal=rj.Box([0.4], [0.6]), samples=20).status is rj.VerdictStatus.PROVED
+    assert rj.verify(thin, goal=rj.Box([0.0], [0.1]), samples=20).status is rj.VerdictStatus.UNKNOWN

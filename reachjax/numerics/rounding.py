@@ -43,6 +43,7 @@ def shifted(numbers, by) -> Any:
 
     In two factors, neither of which leaves the range of floats before the product does.
     """
+    by = jnp.clip(by, -2044, 2046)  # beyond, everything overflows or underflows
     half = by // 2
     return numbers * _power(half) * _power(by - half)
 
@@ -55,9 +56,7 @@ def raised(numbers, by) -> Any:
 
 def _power(exponent) -> Any:
     """`2^exponent` from -1022 to 1023: the bits, since a compiled power may be rounded."""
-    kind = jnp.finfo(
-        jnp.result_type(float)
-    )  # float32 where 64-bit floats are off, and a smaller range
+    kind = jnp.finfo(jnp.result_type(float))  # that of float32 where 64-bit floats are off
     bits = (jnp.asarray(exponent, dtype=f"int{kind.bits}") + kind.maxexp - 1) << kind.nmant
     return jax.lax.bitcast_convert_type(bits, kind.dtype)
 

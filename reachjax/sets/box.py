@@ -19,6 +19,9 @@ from reachjax.sets.base import PolyhedralSet
 
 MOST_CORNERS = 2**16
 
+LOWEST = 2**20
+"""Less than any exponent of a product, its sign turned."""
+
 
 @pytree
 class Box(PolyhedralSet):
@@ -153,11 +156,19 @@ class Box(PolyhedralSet):
 def _support(
     lower: Float[Array, " n"], upper: Float[Array, " n"], directions: Float[Array, "m n"]
 ) -> Float[Array, " m"]:
-    by = exponents(directions)
-    D = shifted(directions, -by[:, None])
-    terms = D * jnp.where(D > 0, upper, lower)
+    chosen = jnp.where(directions > 0, upper, lower)
+    (D, powers), (ends, others) = _normalised(directions), _normalised(chosen)
+    terms, logs = D * ends, powers + others
+    by = jnp.max(jnp.where(terms != 0, logs, -LOWEST), axis=1)
+    by = jnp.where(by > -LOWEST, by, 0)
+    terms = shifted(terms, logs - by[:, None])
     # along an axis nothing is rounded, and nothing is added
-    inexact = jnp.sum(directions != 0, axis=1) > jnp.max(abs(D) == 1, axis=1)
-    lost = TINY * (len(lower) + jnp.sum(jnp.maximum(abs(lower), abs(upper))))  # by underflow
-    rounding = gamma(len(lower)) * jnp.sum(abs(terms), axis=1) + lost
+    inexact = jnp.sum(terms != 0, axis=1) > jnp.max(abs(D) == 1, axis=1)
+    rounding = gamma(len(lower)) * jnp.sum(abs(terms), axis=1) + len(lower) * TINY
     return raised(jnp.sum(terms, axis=1) + jnp.where(inexact, rounding, 0.0), by)
+
+
+def _normalised(numbers: Float[Array, "*batch n"]) -> tuple[Array, Array]:
+    """Numbers in `[1, 2)`, or zero, and the powers of two that they are multiplied by."""
+    powers = exponents(numbers[..., None])
+    return shifted(numbers, -powers), powers

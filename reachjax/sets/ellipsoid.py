@@ -230,17 +230,24 @@ class Ellipsoid(AbstractSet):
 def _support(
     q: Float[Array, " n"], Q: Float[Array, "n n"], directions: Float[Array, "m n"]
 ) -> Float[Array, " m"]:
-    n, by = len(q), exponents(directions)
-    D, unit = shifted(directions, -by[:, None]), jnp.max(exponents(Q)) // 2
-    S = shifted(Q, -2 * unit)
+    n, some = len(q), jnp.any(directions != 0, axis=1)
+    by = exponents(directions)
+    D = shifted(directions, -by[:, None])
+    lost = jnp.where(some, n * TINY * (1 + jnp.max(abs(q))), 0.0)  # by underflow
+    middle = raised(D @ q + gamma(n + 4) * (abs(D) @ abs(q)) + lost, by)
+    # half-axes as units: whatever underflows is little beside the largest of a direction
+    units = exponents(jnp.diag(Q)[:, None]) // 2
+    S = shifted(Q, -(units[:, None] + units))
+    logs = jnp.where(directions != 0, jnp.frexp(directions)[1] - 1 + units, -(2**20))
+    by = jnp.where(some, jnp.max(logs, axis=1), 0)
+    D = shifted(directions, units - by[:, None])
     squares = jnp.einsum("mi,ij,mj->m", D, S, D)
     sizes = jnp.einsum("mi,ij,mj->m", abs(D), abs(S), abs(D))
-    some = sizes > 0  # the root has no derivative at zero
-    above = squares + gamma(2 * n) * sizes + 16 * n**2 * TINY  # the last by underflow
-    reach = shifted(jnp.where(some, jnp.sqrt(jnp.where(some, above, 1.0)), 0.0), unit)
-    lost = n * TINY * (1 + jnp.max(abs(q)) + 4 * shifted(1.0, unit))
-    rounding = gamma(n + 4) * (abs(D) @ abs(q) + reach) + jnp.where(some, lost, 0.0)
-    return raised(D @ q + reach + rounding, by)
+    above = squares + gamma(2 * n) * sizes + 64 * n**2 * TINY
+    # the root has no derivative at zero
+    root = jnp.where(some, jnp.sqrt(jnp.where(some, above, 1.0)), 0.0)
+    reach = raised(root * (1 + gamma(n + 4)), by)
+    return middle + reach + gamma(4) * (abs(middle) + reach)
 
 
 def _require_positive_definite(matrix: np.ndarray) -> None:

@@ -14,10 +14,13 @@ import scipy.sparse as sp
 from scipy.optimize import linprog
 
 from reachjax.numerics.rounding import TINY, gamma
-from reachjax.sets.balance import Balanced, balanced, lengths, upwards
+from reachjax.sets.balance import Balanced, balanced, exponents, lengths, upwards
 
 UNEVEN = 10
 """Coordinates whose sizes are further from 1, as powers of two, are scaled anew."""
+
+FAR = 1e12
+"""Beside facets that many times its size away a polytope is a point: one of them says it all."""
 
 
 def maximiser(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,7 +192,7 @@ def support_and_multipliers(
 
 def separation_and_multipliers(
     A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray
-) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """How far the facets of `C x <= d` may move outward before it meets the bounded `A x <= b`.
 
     A lower bound whatever the linear program's accuracy; positive means disjoint. Minimises `s`
@@ -249,12 +252,14 @@ def _by_program(
 ) -> _Apart | None:
     """The separation by a linear program over the facets that tell; None if it is not solved."""
     (m, n), C, d = region.A.shape, other.A[telling], other.b[telling]
-    if len(d) == 0 or not np.isfinite(norms[telling]).all():
+    if len(d) == 0 or abs(d).max() > FAR or not np.isfinite(norms[telling]).all():
         return None
+    by = int(exponents(norms[telling]))  # the separation, too, in a unit of its own
+    units = np.ldexp(norms[telling], -by)
     unit = 2.0 ** float(np.frexp(max(abs(d).max(), 1.0))[1])
     result = linprog(
         np.r_[np.zeros(n), 1.0],
-        A_ub=np.block([[region.A, np.zeros((m, 1))], [C, -norms[telling, None]]]),
+        A_ub=np.block([[region.A, np.zeros((m, 1))], [C, -units[:, None]]]),
         b_ub=np.r_[region.b, d] / unit,
         bounds=(None, None),
         method="highs",
@@ -262,7 +267,7 @@ def _by_program(
     if result.status != 0:
         return None
     duals = np.maximum(-result.ineqlin.marginals, 0.0)
-    total = duals[m:] @ norms[telling]
+    total = duals[m:] @ units
     if not total > 0:
         return None
     y, w = duals[:m] / total, duals[m:] / total
@@ -271,8 +276,9 @@ def _by_program(
     residual = abs(y @ region.A + w @ C) + error * (y @ abs(region.A) + w @ abs(C)) + lost
     cost = error * (y @ abs(region.b) + w @ abs(d)) + residual @ box.size * (1 + error) + lost
     x, weights = result.x[:n] * unit, np.zeros(len(norms))
-    weights[telling] = w
-    return _Apart(float(-(y @ region.b + w @ d) - cost), y[:, None] * x, y, weights, x)
+    value = float(np.ldexp(-(y @ region.b + w @ d) - cost, -by))
+    y, weights[telling] = np.ldexp(y, -by), np.ldexp(w, -by)
+    return _Apart(value, y[:, None] * x, y, weights, x)
 
 
 def _better(one: _Apart, every: _Apart | None) -> _Apart:

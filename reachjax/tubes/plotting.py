@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet
+from reachjax.sets.balance import exponents
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
 
@@ -90,8 +91,8 @@ def _outline(region: AbstractSet, i: int, j: int) -> np.ndarray:
         i, j = 0, 1
     assert isinstance(region, PolyhedralSet)
     corners = np.asarray(region.vertices())[:, [i, j]]
-    try:
-        return corners[ConvexHull(corners).vertices]
+    try:  # in units of their own: Qhull takes small differences for none
+        return corners[ConvexHull(np.ldexp(corners, -exponents(corners.T))).vertices]
     except QhullError:  # on a line: its two ends
         return corners[np.lexsort(corners.T)[[0, -1]]]
 
@@ -149,7 +150,10 @@ def _plot_cell(
 ) -> None:
     """The sets of one tube over its simulated states, with an entry each in the legend."""
     simulated, initial, certified = labels
-    trajectories = np.asarray(tube.simulate(samples))[:, :, [i, j]]
+    try:
+        trajectories = np.asarray(tube.simulate(samples))[:, :, [i, j]]
+    except RuntimeError:  # the initial set is too thin to be sampled: the sets alone
+        trajectories = np.zeros((0, tube.horizon + 1, 2))
     for t, region in enumerate(tube.sets):
         ax.scatter(*trajectories[:, t].T, **SAMPLES, label=None if t else simulated)
         first = {"edgecolor": "black", "label": initial}

@@ -28,7 +28,8 @@ from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
 from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.witnesses import Simulations, initial_states
-from reachjax.sets import AbstractSet, AbstractTemplate
+from reachjax.sets import AbstractSet, AbstractTemplate, Intersection
+from reachjax.sets.geometry import separation
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
 from reachjax.tubes.steps import Setting, Step, boxed
@@ -186,7 +187,8 @@ def reach(
         solver: what solves the semidefinite programs.
         start: the time of `X0`, for time-varying loops.
         samples: how many trajectories are simulated for witnesses, besides those from corners. None
-            are inside `jax.jit`: witnesses and gaps are NaN there.
+            are inside `jax.jit`, or from an `X0` too thin to be sampled: witnesses and gaps are NaN
+            there.
         seed: of the samples.
         progress: wraps the iteration over steps to show a progress bar, such as `tqdm.tqdm`; inside
             `jax.jit` it sees them once, while the loop is traced.
@@ -224,7 +226,7 @@ def reach(
     fixed = jax.lax.stop_gradient((loop, X0))
     simulations = None
     if is_concrete(fixed):
-        simulations = Simulations(*fixed, horizon, start, samples, seed)
+        simulations = _simulations(*fixed, horizon, start, samples, seed)
     setting = Setting(
         loop=loop,
         start=start,
@@ -251,6 +253,24 @@ def reach(
         certificates = _with_witnesses(certificates, sets, simulations, steps)
     proved = loop, template, tuple(sets), (None, *owned(certificates))
     return ReachTube(*proved, start, seal_of(*proved, start=start))
+
+
+def _simulations(
+    loop: ClosedLoop, X0: AbstractSet, horizon: int, start: int, samples: int, seed: int
+) -> Simulations | None:
+    """Trajectories from the initial set; None if it is too thin for states to be drawn from it.
+
+    Raises:
+        ValueError: it surely is empty.
+    """
+    try:
+        return Simulations(loop, X0, horizon, start, samples, seed)
+    except RuntimeError:
+        if isinstance(X0, Intersection) and separation(X0.ellipsoid, X0.polytope) > 0:
+            raise ValueError(
+                "X0 is empty: its polytope and its ellipsoid have no point in common"
+            ) from None
+    return None
 
 
 def _with_witnesses(

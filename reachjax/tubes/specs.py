@@ -110,12 +110,11 @@ def _decided(
 def _trajectories(tube: ReachTube, samples: int, seed: int) -> Float[np.ndarray, "c h+1 n_x"]:
     """Trajectories from witnesses, corners and samples, as far as there are any."""
     found = [np.zeros((0, tube.horizon + 1, tube.loop.states))]
-    proofs = (tube.proof(t) for t in range(1, tube.horizon + 1))
-    states = [proof.witness_states for proof in proofs if proof.witness_states.size]
-    if states:  # a tube from inside jax.jit has none
-        found.append(tube.loop.simulate(jnp.concatenate(states), tube.horizon, tube.start))
+    states = jnp.concatenate([tube.proof(t).witness_states for t in range(1, tube.horizon + 1)])
+    if states.shape[1] == tube.loop.states:  # a tube from a thin set, or of jax.jit, has none
+        found.append(np.asarray(tube.loop.simulate(states, tube.horizon, tube.start)))
     with contextlib.suppress(RuntimeError):  # a set that is too thin to be sampled
-        found.append(tube.simulate(samples, seed))
+        found.append(np.asarray(tube.simulate(samples, seed)))
     trajectories = np.concatenate(found)
     return trajectories[np.isfinite(trajectories).all(axis=(1, 2))]
 

@@ -130,3 +130,23 @@ def test_a_constant_box_is_itself_at_every_time():
 def test_a_box_with_too_many_corners_says_so():
     with pytest.raises(ValueError, match="dimension 17 has 131072 corners"):
         rj.Box(jnp.zeros(17), jnp.ones(17)).vertices()
+
+
+def test_supports_are_upper_bounds_whatever_underflows_or_overflows():
+    box, D = rj.Box([-1e-160, 1e-170], [1e-160, 1e200]), [[1e-200, 0.0], [1e300, 1e-300]]
+    for row, value in zip(D, np.asarray(box.support(D)), strict=True):
+        ends = [(-1e-160, 1e-160), (1e-170, 1e200)]
+        exact = sum(
+            max(Fraction(a) * Fraction(end) for end in each)
+            for a, each in zip(row, ends, strict=True)
+        )
+        assert Fraction(float(value)) >= exact
+        assert float(value) <= float(exact) * (1 + 1e-12) + 1e-307
+
+
+def test_a_point_beside_a_set_by_less_than_products_can_tell_is_not_in_it():
+    region = rj.Polytope([[1e-170, 0.0]], [0.0])
+    assert not region.surely_contains([1e-170, 0.0])
+    assert region.surely_contains([-1e-100, 0.0])
+    assert rj.Polytope([[1e-170, 0.0]], [1e200]).surely_contains([1e300, 0.0])
+    assert not rj.Box([0.0], [1.0]).surely_contains([-1e-310])

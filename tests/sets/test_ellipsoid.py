@@ -182,3 +182,16 @@ def test_a_shape_that_is_not_quite_symmetric_in_its_own_units_is_refused():
         rj.Ellipsoid([0.0, 0.0], [[1.0, 0.0], [0.9e-12, 1e-24]])
     rounded = rj.Ellipsoid([0.0, 0.0], [[1.0, 0.1 + 1e-17], [0.1, 1.0]])
     np.testing.assert_array_equal(rounded.shape, rounded.shape.T)
+
+
+@pytest.mark.parametrize("axes", [(1e150, 1e-150), (1e150, 1e150), (1e-150, 1e-150), (1e20, 1.0)])
+@pytest.mark.parametrize("length", [1e-155, 1.0, 1e155])
+def test_supports_of_ellipsoids_of_any_scale_in_directions_of_any_length(axes, length):
+    region = rj.Ellipsoid([0.0, 0.0], np.diag(np.square(axes)))
+    values = np.asarray(region.support(length * np.eye(2)))
+    with np.errstate(over="ignore"):
+        expected = length * np.array(axes)
+    assert (values >= expected).all()
+    kept = expected > 1e-300
+    np.testing.assert_allclose(values[kept], expected[kept], rtol=1e-12)
+    np.testing.assert_array_equal(region.support(np.zeros((1, 2))), 0.0)

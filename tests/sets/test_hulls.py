@@ -30,3 +30,20 @@ def test_samples_of_a_simplex_have_its_moments(n):
     x = hulls.uniform(A, b, np.random.default_rng(0), 20_000)
     np.testing.assert_allclose(x.mean(axis=0), 1 / (n + 1), atol=0.01)
     np.testing.assert_allclose(x.var(axis=0), n / ((n + 1) ** 2 * (n + 2)), rtol=0.05)
+
+
+def test_volumes_and_corners_of_a_box_whose_sides_are_of_different_scales():
+    A, b = np.vstack([np.eye(2), -np.eye(2)]), np.array([1e60, 1e-60, 0.0, 0.0])
+    assert hulls.volume(A, b) == pytest.approx(1.0)
+    corners = hulls.vertices(A, b)
+    assert {tuple(row) for row in np.round(corners / [1e60, 1e-60], 9) + 0.0} == {
+        (0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0)
+    }  # fmt: skip
+    np.testing.assert_allclose(hulls.facet_areas(A, b)[1], [1e-60, 1e60, 1e-60, 1e60])
+
+
+def test_an_interval_without_points_is_refused():
+    with pytest.raises(ValueError, match="empty"):
+        hulls.volume(np.array([[1.0], [-1.0]]), np.array([0.0, -1.0]))
+    with pytest.raises(ValueError, match="unbounded"):
+        hulls.vertices(np.array([[1.0]]), np.array([0.0]))

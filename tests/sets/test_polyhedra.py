@@ -122,3 +122,43 @@ def test_the_margin_is_that_of_a_convex_program(n, seed, distance):
     margin = polyhedra.separation_and_multipliers(first.A, first.b, C, d)[0]
     assert margin == pytest.approx(expected, abs=1e-6)
     assert distance not in (0.0, 4.0) or (expected > 0) == (distance == 4.0)
+
+
+@pytest.mark.parametrize(("lower", "upper"), [
+    ([-1e150, -1e150], [1e150, 1e150]),
+    ([0.0, 0.0], [1e60, 1e-60]),
+    ([1e-30, 1e30], [1.1e-30, 1.1e30]),
+    ([0.0, 1.0], [1e300, 1.5]),
+    ([-1e-160, 1e-170], [1e-160, 2e-170]),
+], ids=str)  # fmt: skip
+@pytest.mark.parametrize("rows", [1.0, 1e155, 1e-170])
+def test_boxes_of_any_scale_are_found_with_facets_of_any_length(lower, upper, rows):
+    A, b = cube(lower, upper)
+    logs = np.log10(np.where(b == 0, 1.0, abs(b))) + np.log10(rows)
+    kept = (b == 0) | (abs(logs) < 300)  # offsets that floats hold
+    A, b = np.vstack([A, A[kept] * rows]), np.r_[b, b[kept] * rows]
+    found = polyhedra.bounding_box(A, b)
+    size = 1e-12 * np.maximum(np.abs(lower), np.abs(upper))
+    assert (found[0] <= lower).all()
+    assert (found[1] >= upper).all()
+    assert (found[0] >= lower - size).all()
+    assert (found[1] <= upper + size).all()
+
+
+def test_a_small_facet_tells_two_sets_apart():
+    small = np.array([[1e-170, 0.0]]), np.array([-1e-165])  # x <= -1e5
+    margin = polyhedra.separation_and_multipliers(*cube([-1, -1], [1, 1]), *small)[0]
+    assert margin == pytest.approx(1e5 - 1)
+
+
+@pytest.mark.parametrize("size", [1e-160, 1e-60, 1e60, 1e150])
+def test_separations_and_supports_grow_with_their_sets(size):
+    triangle, box = simplex_region(2, 3), cube([3.0, 3.0], [4.0, 5.0])
+    once = polyhedra.separation_and_multipliers(triangle.A, triangle.b, *box)[0]
+    scaled = polyhedra.separation_and_multipliers(
+        triangle.A, size * triangle.b, box[0], size * box[1]
+    )[0]
+    assert scaled == pytest.approx(size * once, rel=1e-9)
+    D = np.array([[1.0, 2.0], [-1.0, 0.5]])
+    values = polyhedra.support(triangle.A, size * triangle.b, D)
+    np.testing.assert_allclose(values, size * polyhedra.support(triangle.A, triangle.b, D), 1e-9)

@@ -1,4 +1,4 @@
-"""Claims about tubes as proofs: they hold for their own loop, set and start, and for nothing else."""
+"""Claims about tubes as proofs: they hold for their own loop, set and start only."""
 
 import dataclasses
 import pickle

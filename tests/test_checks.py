@@ -149,7 +149,7 @@ def test_dates_and_ragged_lists_are_no_numbers():
 
 def test_a_margin_that_float64_does_not_hold_is_refused():
     assert real_number("margin", Fraction(1, 2).numerator, 0.0) == 1.0
-    with pytest.raises(ValueError, match=r"margin must hold numbers .* 9007199254740993"):
+    with pytest.raises(ValueError, match="margin must hold numbers of float64"):
         real_number("margin", 2**53 + 1, 0.0)
 
 

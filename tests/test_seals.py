@@ -1,4 +1,4 @@
-"""Claims about tubes as proofs: they hold for their own loop, set and start, and nothing else."""
+"""Claims about tubes as proofs: they hold for their own loop, set and start only."""
 
 import dataclasses
 import pickle

@@ -35,8 +35,9 @@ def _own(leaf: Any) -> Any:
 
 
 def _gathered(value: Any) -> Any:
-    """A concrete array of several devices on the host; anything else as it is."""
-    if isinstance(value, jax.Array) and len(value.sharding.device_set) > 1:
+    """A concrete array that is laid out over a mesh on the host; anything else as it is."""
+    single = jax.sharding.SingleDeviceSharding
+    if isinstance(value, jax.Array) and not isinstance(value.sharding, single):
         return np.asarray(value)
     return value
 
@@ -290,4 +291,5 @@ def require_double_precision(**arguments: Any) -> None:
 
 def floats_of(tree: Any) -> list[Any]:
     """The leaves that hold no whole numbers."""
-    return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    leaves = jax.tree.leaves(tree)
+    return [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)]

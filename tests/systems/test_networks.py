@@ -250,7 +250,8 @@ def test_linen_parameters_need_an_activation_or_their_module():
     class Tanh(linen.Module):
         @linen.compact
         def __call__(self, x):
-            return linen.Dense(1)(linen.tanh(linen.Dense(3)(x)))
+            hidden = linen.tanh(linen.Dense(3)(x))
+            return linen.Dense(1)(hidden)
 
     variables = Tanh().init(jax.random.key(0), jnp.ones(2))
     with pytest.raises(ValueError, match="do not tell what is between the layers: give"):

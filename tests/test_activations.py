@@ -53,33 +53,33 @@ def test_facts_products_and_successors_hold_on_simulated_trajectories(options, n
     case, X = controlled(n_x=n_x, seed=n_x, **options), initial_box(n_x)
     loop, x = case.loop, samples(X)
     xi, following = basis_points(loop, x), case.successors(x)
-    for relaxation in (rj.PaperQC(), rj.LocalBounds()):
-        program = jax.device_get(step_program(loop, X, X, np.eye(n_x), 0, relaxation))
-        used = program.used
-        eta = np.zeros_like(xi)
-        T = program.transform[np.ix_(used, used)]
-        eta[:, used] = np.linalg.solve(T, xi[:, used].T).T
-        assert abs(eta).max() <= 1 + 1e-9
-        np.testing.assert_allclose(eta @ program.objective.mid.T, following, atol=1e-11)
-        facts = eta @ program.facts.mid.T
-        assert facts.min() >= -1e-11
-        products = facts[:, program.products.left] * facts[:, program.products.right]
-        zero = program.products.free[program.products.multiplier]
-        assert zero.any()
-        assert abs(products[:, zero]).max() <= 1e-11
-        assert abs(program.facts.mid[program.products.left]).max() > 0
+    relaxation = rj.LocalBounds(remove_stable=n_x % 2 == 0)
+    program = jax.device_get(step_program(loop, X, X, np.eye(n_x), 0, relaxation))
+    used = program.used
+    eta = np.zeros_like(xi)
+    T = program.transform[np.ix_(used, used)]
+    eta[:, used] = np.linalg.solve(T, xi[:, used].T).T
+    assert abs(eta).max() <= 1 + 1e-9
+    np.testing.assert_allclose(eta @ program.objective.mid.T, following, atol=1e-11)
+    facts = eta @ program.facts.mid.T
+    assert facts.min() >= -1e-11
+    products = facts[:, program.products.left] * facts[:, program.products.right]
+    zero = program.products.free[program.products.multiplier]
+    assert zero.sum() == loop.units
+    assert abs(products[:, zero]).max() <= 1e-11
+    assert abs(program.facts.mid[program.products.left[zero]]).max() > 0
 
 
 @each_controller
 def test_the_units_of_a_loop_are_those_that_its_forward_pass_meets(options):
     loop = controlled(n_x=3, **options).loop
     columns = 2 if options["activation"] == rj.HardTanh() else 1  # a neuron
-    assert [layer.size for layer in loop.layers] == [4] * columns + [3] * columns + [2, 2]
+    assert [layer.size for layer in loop.unit_layers] == [4] * columns + [3] * columns + [2, 2]
     assert loop.units == 7 * columns + 4
-    assert {type(layer.unit) for layer in loop.layers[-2:]} == {rj.ReLU}
+    assert {type(layer.unit) for layer in loop.unit_layers[-2:]} == {rj.ReLU}
     seen = []
     loop.step(jnp.zeros(3), 0, lambda unit, y: seen.append((unit, len(y))) or unit(y))
-    assert list(loop.layers) == seen
+    assert list(loop.unit_layers) == seen
 
 
 @each_controller
@@ -95,8 +95,8 @@ def test_intervals_hold_what_is_simulated(options):
 
 @each_controller
 def test_units_that_are_affine_leave_the_basis_and_the_set_is_then_exact(options):
-    # wide enough for no bias to be near a kink: all units are affine on a tiny set
-    case, X = controlled(n_x=2, seed=5, boxed=False, **options), initial_box(2, 1e-4)
+    # no input is near a kink: all units are affine on a tiny set
+    case, X = controlled(n_x=2, seed=4, boxed=False, **options), initial_box(2, 1e-4)
     bounds = loop_bounds(case.loop, X, 0)
     assert np.all(bounds.affine)
     slopes = set(np.asarray(bounds.lines.above.slope).tolist())
@@ -104,8 +104,8 @@ def test_units_that_are_affine_leave_the_basis_and_the_set_is_then_exact(options
     assert slopes == {low, 1.0}
     following, certificate = rj.reach_step(case.loop, X, rj.Template.box(2))
     assert int(np.sum(certificate.program.used)) == 3  # two states and the constant
-    ends = case.successors(np.asarray(X.vertices()))
-    np.testing.assert_allclose(following.b, np.r_[ends.max(axis=0), -ends.min(axis=0)], atol=1e-12)
+    ends = case.successors(np.asarray(X.vertices())) @ np.asarray(following.A).T
+    np.testing.assert_allclose(following.b, ends.max(axis=0), atol=1e-12)
 
 
 @pytest.fixture(scope="module", params=range(len(CONTROLLERS)), ids=NAMES)
@@ -153,27 +153,22 @@ def test_the_gradient_in_all_weights_is_the_central_difference(options):
     loop, weights = case.loop, jnp.linspace(0.5, 2.0, 4)
 
     @jax.jit
+    @jax.value_and_grad
     def size(net):
-        moved = loop.replace(controller=net)
-        return (
-            weights @ rj.reach_step(moved, X, rj.Template.box(2), relaxation=rj.LocalBounds())[0].b
-        )
+        moved, template = loop.replace(controller=net), rj.Template.box(2)
+        return weights @ rj.reach_step(moved, X, template, relaxation=rj.LocalBounds())[0].b
 
-    net = loop.controller
-    leaves, structure = jax.tree.flatten(net)
+    leaves, structure = jax.tree.flatten(loop.controller)
     rng, h = np.random.default_rng(1), 1e-5
-    directions = [rng.normal(size=leaf.shape) for leaf in leaves]
-    ends = (
-        size(
-            jax.tree.unflatten(
-                structure, [a + s * b for a, b in zip(leaves, directions, strict=True)]
-            )
-        )
-        for s in (h, -h)
-    )
-    difference = (next(ends) - next(ends)) / (2 * h)
-    slopes = jax.tree.leaves(jax.grad(size)(net))
-    along = sum(float(np.sum(g * d)) for g, d in zip(slopes, directions, strict=True))
+    direction = [rng.normal(size=leaf.shape) for leaf in leaves]
+
+    def moved(by):
+        pairs = zip(leaves, direction, strict=True)
+        return size(jax.tree.unflatten(structure, [leaf + by * d for leaf, d in pairs]))
+
+    difference = (moved(h)[0] - moved(-h)[0]) / (2 * h)
+    slopes = jax.tree.leaves(moved(0.0)[1])
+    along = sum(float(np.sum(g * d)) for g, d in zip(slopes, direction, strict=True))
     assert along == pytest.approx(float(difference), rel=1e-3)
 
 

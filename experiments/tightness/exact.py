@@ -73,9 +73,12 @@ def exact_maxima(
     """
     if not isinstance(X0, rj.PolyhedralSet):
         raise TypeError(f"X0 must be a Box or a Polytope, but {type(X0).__name__} arrived")
-    activation = loop.controller.activation
-    if not isinstance(activation, rj.ReLU):
-        raise TypeError(f"loop.controller must be a network of ReLUs, but of {activation}")
+    activation = getattr(loop.controller, "activation", None)
+    if not (isinstance(loop.controller, rj.MLP) and isinstance(activation, rj.ReLU)):
+        kind = type(loop.controller).__name__
+        raise TypeError(
+            f"loop.controller must be an MLP, a network of ReLUs, but is {kind} of {activation}"
+        )
     loop.check_horizon(k, start)
     rows = np.asarray(directions, float)
     if rows.ndim != 2 or not loop.states == X0.dimension == rows.shape[1]:

@@ -95,7 +95,7 @@ class ClosedLoop(Replaceable):
         return self.plant.states
 
     @property
-    def layers(self) -> tuple[UnitLayer, ...]:
+    def unit_layers(self) -> tuple[UnitLayer, ...]:
         """The layers of units in the order of the forward pass, the projection's last."""
         leaves, structure = jax.tree.flatten(self)
         return _recorded(structure, tuple(jnp.shape(leaf) for leaf in leaves))
@@ -103,7 +103,7 @@ class ClosedLoop(Replaceable):
     @property
     def units(self) -> int:
         """The number of units of one step."""
-        return sum(layer.size for layer in self.layers)
+        return sum(layer.size for layer in self.unit_layers)
 
     @property
     def steps(self) -> int | None:

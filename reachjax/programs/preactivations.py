@@ -81,7 +81,7 @@ def bounds_over(
     # unused, so that one pass is all that is compiled
     shapes = jax.eval_shape(loop_bounds, loop, box, t, known)
     blank = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)
-    return jax.lax.fori_loop(0, len(loop.layers) + 1, once, (known, blank))[1]
+    return jax.lax.fori_loop(0, len(loop.unit_layers) + 1, once, (known, blank))[1]
 
 
 def _meet(one: Ball, other: Ball) -> Ball:

@@ -41,8 +41,8 @@ ATTEMPTS = 3
 
 
 Proved = tuple[NormalForm, Array, Enclosure]
-"""`A` and `b`, the level `s` of what is proved, `|A x + b| <= s`, and what the solver proposed, which
-has no derivative and whose multipliers prove the level."""
+"""`A` and `b`, the level `s` of what is proved, `|A x + b| <= s`, and what the solver proposed,
+which has no derivative and whose multipliers prove the level."""
 
 
 def proved_ellipsoid(program: Program, solver: AbstractSolver) -> Proved:

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 import reachjax as rj
 from reachjax.programs.compact import compact
 from reachjax.programs.windows import step_program
-from reachjax.proofs.recheck import interval_offsets
+from reachjax.proofs.recheck import interval_offsets, sound_offsets
 from reachjax.solvers import facet_centres
 from reachjax.solvers.central_path import PRICES
 from reachjax.solvers.primal_dual import DAMPING
@@ -218,19 +218,34 @@ def lost(monkeypatch, **replaced):
     return facet_centres.facet_centres(PROGRAM, 1e-2)
 
 
-def test_a_path_that_is_lost_leaves_what_is_proved_and_no_derivative(monkeypatch):
+def proved_along(move, solution, h=1e-6):
+    """How fast what the first facet's multipliers prove changes as the facts move."""
+    ends = [
+        sound_offsets(
+            PROGRAM.with_midpoints(PROGRAM.facts.mid + s * h * move, PROGRAM.objective.mid),
+            solution.multipliers,
+        )[0]
+        for s in (1, -1)
+    ]
+    return (ends[0] - ends[1]) / (2 * h)
+
+
+def test_a_path_that_is_lost_leaves_what_is_proved_and_its_derivative(monkeypatch):
     path_end = facet_centres.path_end
     early = lost(monkeypatch, path_end=lambda *args: path_end(*args)._replace(weight=1e-3))
     assert np.all(early.solution.statuses == rj.SolverStatus.INACCURATE)
     assert np.all(early.offsets < interval_offsets(PROGRAM))
-    assert np.isnan(derivative_of(lambda offsets, _: offsets[0])).all()
+    move = np.random.default_rng(0).normal(size=PROGRAM.facts.mid.shape) * abs(PROGRAM.facts.mid)
+    mine = np.sum(derivative_of(lambda offsets, _: offsets[0]) * move)
+    assert mine == pytest.approx(proved_along(move, early.solution), rel=1e-5)
 
 
 def test_no_path_and_too_many_multipliers_leave_intervals(monkeypatch):
     for found in (lost(monkeypatch, path_end=lambda *args: None), lost(monkeypatch, LARGEST=3)):
         assert np.all(found.solution.statuses == rj.SolverStatus.FAILED)
         np.testing.assert_allclose(found.offsets, interval_offsets(PROGRAM), rtol=1e-9)
-        assert np.isnan(derivative_of(lambda offsets, _: offsets[0])).all()
+        # an interval bound knows of no facts
+        np.testing.assert_array_equal(derivative_of(lambda offsets, _: offsets[0]), 0.0)
 
 
 def test_a_centre_that_its_multipliers_do_not_prove_is_none(monkeypatch):
@@ -238,7 +253,7 @@ def test_a_centre_that_its_multipliers_do_not_prove_is_none(monkeypatch):
     found = lost(monkeypatch, sound_offsets=lambda *args: sound(*args) + 1.0)
     assert np.all(found.solution.statuses == rj.SolverStatus.INACCURATE)
     assert np.isnan(found.centres).all()
-    assert np.isnan(derivative_of(lambda offsets, _: offsets[0])).all()
+    assert np.isfinite(derivative_of(lambda offsets, _: offsets[0])).all()
 
 
 @pytest.mark.parametrize("width", [0.0, 1e-9])

@@ -82,6 +82,19 @@ def test_garbage_multipliers_never_give_an_offset_below_the_true_support(case, k
         assert np.all(np.isfinite(offsets))
 
 
+def test_products_without_weight_change_nothing_that_is_proved(case):
+    program, solution, _ = case
+    given, count = program.products, len(program.products.free)
+    twice = jax.tree.map(lambda part: np.concatenate([part, part]), given).replace(
+        multiplier=np.concatenate([given.multiplier, count + np.asarray(given.multiplier)])
+    )
+    padded = np.pad(solution.multipliers, ((0, 0), (0, count)))
+    np.testing.assert_array_equal(
+        sound_offsets(program.replace(products=twice), padded),
+        sound_offsets(program, solution.multipliers),
+    )
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_multipliers_that_are_not_finite_are_a_clear_failure(case, bad):
     program, solution, _ = case

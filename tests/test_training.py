@@ -70,20 +70,16 @@ def test_a_schedule_warms_up_ramps_and_leaves_steps_out():
 
 @dataclasses.dataclass(frozen=True)
 class Counting(rj.AbstractSolver):
-    """Clarabel, which notes the programs that it is asked to solve, and fails on some."""
+    """Clarabel, which notes the programs that it is asked to solve, and breaks down on some."""
 
     asked: list = dataclasses.field(default_factory=list, hash=False, compare=False)
-    failing: tuple[int, ...] = ()
+    failing: int | None = None
 
     def solve(self, program):
         self.asked.append(program)
-        solution = rj.Clarabel().solve(program)
-        if len(self.asked) - 1 in self.failing:
-            return solution._replace(
-                statuses=np.full_like(solution.statuses, rj.SolverStatus.FAILED),
-                multipliers=np.zeros_like(solution.multipliers),
-            )
-        return solution
+        if self.failing and len(self.asked) % self.failing == 0:
+            raise ArithmeticError("one call in so many")
+        return rj.Clarabel().solve(program)
 
 
 @pytest.mark.parametrize("compiled", [False, True])
@@ -107,26 +103,53 @@ def test_nothing_is_solved_at_steps_without_a_weight(case, compiled):
     assert len(solver.asked) == 2  # one solve for value and gradient together
 
 
-def test_a_failed_solve_is_skipped_and_counted(case):
+@pytest.mark.filterwarnings("ignore:the solver Counting counts as FAILED:RuntimeWarning")
+@pytest.mark.parametrize("failing", [None, 3])
+def test_a_run_whose_solver_fails_at_every_third_call_keeps_improving(case, failing):
+    """It says how often: no step is skipped, each follows the gradient of what is reported."""
     loop, X0 = case
+    solver = Counting(failing=failing)
+    optimizer = rj.skip_failures(optax.adam(1e-2))
+
+    def loss(net):
+        tube = recursion(loop.replace(controller=net), X0, 1, TEMPLATE, solver=solver)
+        return rj.log_volume(tube), rj.unsolved(tube)
+
+    @jax.jit
+    def advance(net, state):
+        (value, unsolved), gradient = jax.value_and_grad(loss, has_aux=True)(net)
+        updates, state = optimizer.update(gradient, state, net)
+        return optax.apply_updates(net, updates), state, value, unsolved
+
+    net, state, values, failed = loop.controller, optimizer.init(loop.controller), [], []
+    for _ in range(12):
+        net, state, value, unsolved = advance(net, state)
+        values.append(float(value))
+        failed.append(int(unsolved))
+    assert rj.failures(state) == 0
+    assert failed == [
+        len(TEMPLATE) * (failing is not None and step % 3 == 0) for step in range(1, 13)
+    ]
+    solved = [value for value, count in zip(values, failed, strict=True) if not count]
+    assert all(after < before for before, after in pairwise(solved))
+    broken = [value for value, count in zip(values, failed, strict=True) if count]
+    assert all(after < before for before, after in pairwise(broken))
+
+
+def test_a_step_without_a_gradient_is_skipped_and_counted(case):
+    loop, _ = case
     optimizer = rj.skip_failures(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-2)))
 
     def trained(failing):
-        solver = Counting(failing=failing)
-
         @jax.jit
-        def advance(net, state):
-            gradient = jax.grad(
-                lambda net: rj.volume_penalty(
-                    loop.replace(controller=net), X0, 1, TEMPLATE, solver=solver
-                )
-            )(net)
+        def advance(net, state, lost):
+            gradient = jax.tree.map(lambda w: jnp.where(lost, jnp.nan, w), net)
             updates, state = optimizer.update(gradient, state, net)
             return optax.apply_updates(net, updates), state
 
         nets, state = [loop.controller], optimizer.init(loop.controller)
-        for _ in range(4):
-            net, state = advance(nets[-1], state)
+        for step in range(4):
+            net, state = advance(nets[-1], state, step in failing)
             nets.append(net)
         return nets, rj.failures(state)
 
@@ -137,6 +160,76 @@ def test_a_failed_solve_is_skipped_and_counted(case):
     whole, none = trained(failing=())
     assert none == 0
     assert same(nets[-1], whole[2])  # also the optimiser's state was left alone
+
+
+JAX_RAISES = (ValueError, jax.errors.JaxRuntimeError)
+"""What JAX makes of an error in a callback, when it starts a computation or waits for it."""
+
+
+@pytest.mark.parametrize("how", ["plain", "jit", "scan", "vmap"])
+def test_more_skipped_steps_in_a_row_than_the_limit_are_an_error(how):
+    optimizer = rj.skip_failures(optax.sgd(0.1), limit=3)
+
+    def advance(weights, state, gradient):
+        updates, state = optimizer.update(gradient, state)
+        return optax.apply_updates(weights, updates), state
+
+    if how == "vmap":
+        advance = jax.vmap(advance)
+    if how in ("jit", "vmap"):
+        advance = jax.jit(advance)
+
+    def run(weights, state, steps, gradient):
+        if how == "scan":
+            several = lambda carry, _: (advance(*carry, gradient), None)  # noqa: E731
+            return jax.lax.scan(several, (weights, state), length=steps)[0]
+        for _ in range(steps):
+            weights, state = advance(weights, state, gradient)
+        return weights, state
+
+    shape = (2, 2) if how == "vmap" else (2,)
+    weights, lost = jnp.ones(shape), jnp.full(shape, jnp.nan).at[0].set(1.0)
+    state = jax.vmap(optimizer.init)(weights) if how == "vmap" else optimizer.init(weights)
+    if how == "vmap":  # one of the batch is stuck, the other is not
+        lost = lost.at[0].set(1.0)
+    weights, state = run(weights, state, 3, lost)
+    assert rj.failures(state) == 3
+    weights, state = run(weights, state, 1, jnp.ones(shape))  # a good step, and the row is broken
+    weights, state = run(weights, state, 3, lost)
+    assert rj.failures(state) == 6
+    message = r"(?s)the last 4 steps had no finite gradient.*limit="
+    with pytest.raises(RuntimeError if how == "plain" else JAX_RAISES, match=message):
+        jax.block_until_ready(run(weights, state, 1, lost))
+
+
+def test_a_compiled_loop_that_is_stuck_ends_by_itself():
+    """Nobody looks at the state: the next step is handed what cannot be had."""
+    optimizer = rj.skip_failures(optax.sgd(0.1))
+
+    @jax.jit
+    def advance(weights, state):
+        updates, state = optimizer.update(jnp.nan * weights, state)
+        return optax.apply_updates(weights, updates), state
+
+    done = []
+
+    def train(weights):
+        state = optimizer.init(weights)
+        for _ in range(1000):
+            weights, state = advance(weights, state)
+            done.append(1)
+
+    with pytest.raises(JAX_RAISES, match="the last 11 steps"):
+        train(jnp.ones(2))
+    assert len(done) < 100
+
+
+@pytest.mark.parametrize(
+    ("limit", "error"), [(-1, ValueError), (2.5, TypeError), ("many", TypeError)]
+)
+def test_a_limit_that_is_none_is_named(limit, error):
+    with pytest.raises(error, match="limit must be"):
+        rj.skip_failures(optax.sgd(0.1), limit=limit)
 
 
 @pytest.mark.parametrize("factor", [np.nan, np.inf, 1e200, 1e12, 1e4])

@@ -84,7 +84,7 @@ def _repaired(solution: Solution, name: str) -> Solution:
     finite = np.isfinite(multipliers).all(axis=1)
     broken = ~known | (np.isin(statuses, CLAIMING) & ~finite)
     for facet in np.flatnonzero(broken)[:1]:
-        _warn(name, _why(known[facet], statuses[facet], f" of facet {facet}"))
+        _warn(name, _why(bool(known[facet]), statuses[facet], f" of facet {facet}"))
     usable = finite & known
     offsets, moments = np.asarray(solution.offsets), np.asarray(solution.moments)
     whole = usable & np.isfinite(moments).all(axis=(1, 2))
@@ -183,7 +183,8 @@ def _array(name: str, value: Any, like: np.ndarray) -> np.ndarray:
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise _FaultError(f"{wanted}, but {described(value)} arrived: {error}") from None
     if array.dtype.kind not in ("iu" if whole else "iuf"):
-        raise _FaultError(f"{wanted}, but an array of {array.dtype} arrived")
+        kind = described(value) if array.dtype.kind == "O" else f"an array of {array.dtype}"
+        raise _FaultError(f"{wanted}, but {kind} arrived")
     if array.shape != like.shape:
         raise _FaultError(f"{wanted}, but an array of shape {array.shape} arrived")
     with np.errstate(over="ignore"):  # what is too large is no number, which is looked at later

@@ -233,7 +233,7 @@ def _joined(program: Program, pool: CutPool, found: list[_Result]) -> Rounds:
         solution.moments[i], solution.seconds[i] = mine.moments[0], mine.seconds[0]
     # proved with all products, which are in another order and so round otherwise
     whole = program.replace(products=products)
-    again = np.fmin(sound_offsets(whole, solution.multipliers), interval_offsets(whole))
+    again = np.fmin(sound_offsets(whole, np.asarray(solution.multipliers)), interval_offsets(whole))
     joined = Judged(
         offsets=np.fmax(np.array([result.offset for result in found]), again),
         optimal=np.array([result.judged.optimal[0] for result in found]),

@@ -29,8 +29,9 @@ def skip_failures(
 
     Where the loss is the same at every step, so are the weights after a step that is skipped, and
     all later steps are skipped too. So more than `limit` of them in a row are an error: a
-    `RuntimeError` of the call, and inside `jax.jit` of what the compiled function returns, which
-    JAX raises when it is waited for or handed to the next step.
+    `RuntimeError`, and where the step is compiled JAX's own error with the same message
+    (`ValueError` or `jax.errors.JaxRuntimeError`), raised when what the step returns is waited for
+    or handed to the next one.
 
     Args:
         optimizer: any optax optimiser.
@@ -65,10 +66,10 @@ def skip_failures(
     skipping = optax.apply_if_finite(optimizer, max_consecutive_errors=FOREVER)
 
     def update(updates, state, params=None, **extra_args):
-        updates, state = skipping.update(updates, state, params, **extra_args)
-        count: Any = state.notfinite_count  # pyright: ignore[reportAttributeAccessIssue]
+        found: Any = skipping.update(updates, state, params, **extra_args)
+        updates, state = found
         # the state holds what the check returns, so that no compiler can leave the check out
-        return updates, state._replace(notfinite_count=_checked(limit, count))
+        return updates, state._replace(notfinite_count=_checked(limit, state.notfinite_count))
 
     return optax.GradientTransformationExtraArgs(skipping.init, update)
 

@@ -201,12 +201,11 @@ def reach(
             overflow, or `progress` leaves out steps. What depends on traced values is NaN instead,
             inside `jax.jit`.
 
-    The offsets of the sets have first derivatives in everything but facet normals (reverse mode):
-    in the loop's weights, plant and input box, and in a box's ends or a polytope's offsets. In the
-    normals of `X0` and of the template the derivative is NaN where a bound of a coordinate, or of
-    an input of the first layer, is attained on a whole face. Centre and shape of ellipsoids have
-    them too, in all of the above and in the centre and shape of an ellipsoid `X0`. They are NaN
-    where a program was not solved.
+    The offsets of the sets have first derivatives (reverse mode) in the loop's weights, plant and
+    input box, in a box's ends and in a polytope's normals and offsets; so have centre and shape of
+    ellipsoids, also in centre and shape of an ellipsoid `X0`. A derivative is that of the bound
+    that is reported: where a program was not solved, of what is proved without its optimum. It is
+    NaN where there is no bound.
 
     Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 

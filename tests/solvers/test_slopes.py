@@ -1,0 +1,109 @@
+"""Derivatives of proved bounds at held multipliers: those of what the recheck proves."""
+
+import jax
+import numpy as np
+import pytest
+from reachjax.solvers.slopes import held_level, held_offsets
+
+import reachjax as rj
+from reachjax.programs.lmi import lagrangian, schur_lagrangian
+from reachjax.proofs.recheck import interval_offsets, sound_level, sound_offsets
+from reachjax.sets import NormalForm
+from tests.solvers.test_enclosures import case, program
+
+STEP = 1e-6
+"""Rounding, which the recheck pays for, is some 1e-13 of a bound: 1e-7 of a difference over it."""
+
+
+@pytest.fixture(scope="module", params=[1, 2, 3])
+def held(request):
+    """A program and Clarabel's multipliers for it, off by up to a third."""
+    found = program(*case(request.param, seed=request.param))
+    noise = np.random.default_rng(0).uniform(0.7, 1.3, found.products.free.shape)
+    return found, noise * np.asarray(rj.Clarabel().solve(found).multipliers)
+
+
+def moves(held):
+    """The program moved by `h` along a random direction in its rows, and that direction."""
+    rng = np.random.default_rng(1)
+    facts, objective = (
+        rng.normal(size=rows.mid.shape) * abs(rows.mid) for rows in (held.facts, held.objective)
+    )
+
+    def moved(h):
+        return held.with_midpoints(held.facts.mid + h * facts, held.objective.mid + h * objective)
+
+    return moved, (facts, objective)
+
+
+def along(value, held, direction):
+    """The derivative of a function of rows along a direction in them."""
+    at = held.facts.mid, held.objective.mid
+    return jax.jvp(lambda *rows: value(held.with_midpoints(*rows)), at, direction)[1]
+
+
+def difference(f):
+    return (f(STEP) - f(-STEP)) / (2 * STEP)
+
+
+def test_offsets_that_multipliers_prove_have_the_derivative_of_what_is_proved(held):
+    held, multipliers = held
+    moved, direction = moves(held)
+    slopes = held_offsets(held, multipliers, np.full(len(multipliers), True))
+    mine = along(lambda rows: lagrangian(rows, *slopes), held, direction)
+    proved = difference(lambda h: sound_offsets(moved(h), multipliers))
+    np.testing.assert_allclose(mine, proved, rtol=1e-5, atol=1e-6)
+
+
+def test_offsets_by_intervals_have_theirs(held):
+    held, multipliers = held
+    moved, direction = moves(held)
+    slopes = held_offsets(held, multipliers, np.full(len(multipliers), False))
+    mine = along(lambda rows: lagrangian(rows, *slopes), held, direction)
+    proved = difference(lambda h: interval_offsets(moved(h)))
+    np.testing.assert_allclose(mine, proved, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.0], ids=["multipliers", "intervals"])
+def test_levels_have_the_derivative_of_what_is_proved(held, factor):
+    held, _ = held
+    enclosure = rj.Clarabel().enclose(held)
+    noise = np.random.default_rng(0).uniform(0.9, 1.1, enclosure.multipliers.shape)
+    multipliers, form = factor * noise * enclosure.multipliers, enclosure.form
+    moved, direction = moves(held)
+    weights, moments = held_level(held, multipliers, form)
+    assert bool(weights.any()) == bool(factor)
+    mine = along(lambda rows: schur_lagrangian(rows, weights, form, moments), held, direction)
+    proved = difference(lambda h: sound_level(moved(h), multipliers, form))
+    assert float(mine) == pytest.approx(proved, rel=1e-5, abs=1e-6)
+
+
+def test_where_the_ball_alone_bounds_a_direction_the_derivative_holds_too():
+    """No `v` in the direction of the largest eigenvalue: two maximisers, one on either side."""
+    held = program(*case(2, seed=0))
+    k = int(np.argmax(~held.products.free))
+    pair = np.flatnonzero(held.products.multiplier == k)
+    n = len(held.transform)
+    facts = np.zeros_like(held.facts.mid)
+    facts[held.products.left[pair], 0] = facts[held.products.right[pair], 0] = 1.0  # eta_0^2
+    objective = np.zeros((1, n))
+    objective[0, [1, -1]] = 0.1, 1.0
+    bare = held.seeking(slice(1)).replace(
+        facts=type(held.facts)(facts, 0 * facts),
+        objective=type(held.facts)(objective, 0 * objective),
+    )
+    multipliers = np.where(np.arange(len(held.products.free)) == k, 1.0, 0.0)[None]
+    moved, direction = moves(bare)
+    slopes = held_offsets(bare, multipliers, np.array([True]))
+    assert slopes[1][0, 0, 0] == pytest.approx(bare.used.sum() - 1, abs=0.1)  # the ball's radius
+    mine = along(lambda rows: lagrangian(rows, *slopes), bare, direction)
+    proved = difference(lambda h: sound_offsets(moved(h), multipliers))
+    np.testing.assert_allclose(mine, proved, rtol=1e-5, atol=1e-6)
+
+
+def test_a_point_has_a_level_without_a_derivative():
+    held = program(*case(2, seed=0))
+    zero = NormalForm(np.zeros((2, 2)), np.zeros(2))
+    weights, moments = held_level(held, np.zeros(len(held.products.free)), zero)
+    assert not weights.any()
+    assert not moments.any()

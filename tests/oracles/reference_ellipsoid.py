@@ -38,7 +38,7 @@ UNDECOMPOSED = CLARABEL_TIGHT | {"chordal_decomposition_enable": False}
 
 SAMPLES = 2000
 """States that are simulated for the coordinates; these do not change what is proved."""
-UNITS = (1.0, 8.0, 0.125, 64.0)
+UNITS = (1.0, 8.0, 0.125, 64.0, 2.0, 0.5)
 """Units of the successor, in spreads of the samples, tried in turn while the solver stalls: what
 theorem 1 proves may be far larger than what is sampled."""
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from reachjax.numerics.checks import described, is_concrete, whole_number
+from reachjax.numerics.host import on_host
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.tubes.reach import ReachTube
 
@@ -86,11 +87,7 @@ def _checked(limit: int, count: Array) -> Array:
             raise RuntimeError(_stuck(int(np.max(count))))
         return np.asarray(count)
 
-    if is_concrete(count):
-        check(count)
-        return count
-    shape = jax.ShapeDtypeStruct(count.shape, count.dtype)
-    return jax.pure_callback(check, shape, count, vmap_method="expand_dims")
+    return on_host(check, jax.ShapeDtypeStruct(count.shape, count.dtype), count)
 
 
 def _stuck(count: int) -> str:

@@ -1,4 +1,4 @@
-"""The same code on an accelerator, where facets and networks are solved in one batch."""
+"""The same code on an accelerator: programs go from there to the host."""
 
 import jax
 import jax.numpy as jnp

@@ -107,7 +107,6 @@ def test_without_rounds_the_products_of_local_bounds_are_there_all_the_same():
         rj.Clarabel(max_iterations=1),
         rj.InteriorPoint(max_iterations=1),
         rj.SCS(max_iterations=5),
-        rj.CentralPath(1e-2),
     ],
     ids=str,
 )

@@ -159,23 +159,20 @@ def test_faults_inside_jit_are_failed_proposals_too(fault):
     ids=["nothing", "too few multipliers", "NaN", "unknown status"],
 )
 @pytest.mark.parametrize("compiled", [False, True])
-def test_a_solver_that_says_itself_how_it_is_traced_may_be_wrong_too(answer, compiled):
+def test_a_solver_may_be_wrong_in_a_compiled_step_too(answer, compiled):
     @dataclasses.dataclass(frozen=True)
-    class Traced(rj.AbstractSolver):
+    class Wrong(rj.AbstractSolver):
         def solve(self, program):
-            return rj.Clarabel().solve(program)
-
-        def propose(self, program):
-            return answer(super().propose(program))
+            return answer(rj.Clarabel().solve(program))
 
     loop, X0 = planar(0)
 
     def codes(net):
         closed = loop.replace(controller=net)
-        tube = rj.reach(closed, X0, 1, TEMPLATE, rj.LocalBounds(), 1, Traced(), samples=50)
+        tube = rj.reach(closed, X0, 1, TEMPLATE, rj.LocalBounds(), 1, Wrong(), samples=50)
         return tube.proof(1).codes
 
-    with pytest.warns(RuntimeWarning, match="the solver Traced counts as FAILED"):
+    with pytest.warns(RuntimeWarning, match="the solver Wrong counts as FAILED"):
         found = jax.block_until_ready((jax.jit(codes) if compiled else codes)(loop.controller))
     assert (np.asarray(found) == FAILED).all()
 

@@ -64,7 +64,8 @@ class EllipsoidCertificate(AbstractCertificate):
             ValueError: the multipliers contain NaN or infinity, or have another shape.
 
         Example:
-            >>> from reachjax import AffinePlant, ClosedLoop, EllipsoidTemplate, MLP, reach_step
+            >>> from reachjax import AffinePlant, ClosedLoop, Ellipsoid, EllipsoidTemplate, MLP
+            >>> from reachjax import reach_step
             >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
             >>> X0 = Ellipsoid([1.0], [[1.0]])
             >>> following, certificate = reach_step(loop, X0, EllipsoidTemplate())

@@ -1,0 +1,64 @@
+"""Errors as messages to a user: clear ones name an argument and come from the library itself."""
+
+import re
+import traceback
+from pathlib import Path
+
+import reachjax as rj
+from tests.campaign.faults import LicenceError
+
+PACKAGE = str(Path(rj.__file__).parent)
+
+ARGUMENTS = (
+    r"X0|loop|plant|controller|input_box|template|relaxation|window|solver|horizon|start|samples|"
+    r"seed|progress|tube|goal|safe|avoid|Box|Polytope|Ellipsoid|Intersection|Template|"
+    r"EllipsoidTemplate|MixedTemplate|AffinePlant|MLP|ClosedLoop|shape|directions"
+)
+NAMES = re.compile(rf"\b({ARGUMENTS})\b")
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*(e[-+]?\d+)?|\binf\b|\bnan\b)", re.IGNORECASE)
+
+
+def unclear(error: BaseException) -> str | None:
+    """What is wrong with an error as a message to a user; None if it is a clear one.
+
+    A clear one is raised by a statement of the library, is of a plain kind and names an argument.
+
+    Example:
+        >>> unclear(IndexError("tuple index out of range"))
+        'IndexError from elsewhere'
+    """
+    if isinstance(error, LicenceError):  # the solver's own, passed on
+        return None
+    last = traceback.extract_tb(error.__traceback__)[-1:]
+    inside = bool(last) and last[0].filename.startswith(PACKAGE)
+    raised = inside and str(last[0].line).startswith("raise ")
+    if type(error) not in (ValueError, TypeError, RuntimeError, NotImplementedError) or not raised:
+        return f"{type(error).__name__} from {'within' if inside else 'elsewhere'}"
+    if "please report" in str(error):
+        return "a proved specification is broken"
+    if not NAMES.search(str(error)):
+        return "no argument named"
+    return None
+
+
+def message_kind(error: BaseException) -> str:
+    """The message with its numbers left out, on one line.
+
+    Example:
+        >>> message_kind(ValueError("horizon must be at least 1, but -3 arrived"))
+        'ValueError: horizon must be at least #, but # arrived'
+    """
+    text = NUMBER.sub("#", " ".join(str(error).split()))
+    text = re.sub(r"\[[\[\]#, ]*\]", "[#]", text)
+    return f"{type(error).__name__}: {text[:140]}"
+
+
+def place(error: BaseException) -> str:
+    """Where in the package an error comes from."""
+    frames = [
+        f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(PACKAGE)
+    ]
+    if not frames:
+        return "outside of the package"
+    name = Path(frames[-1].filename).relative_to(PACKAGE)
+    return f"reachjax/{name}:{frames[-1].lineno}"

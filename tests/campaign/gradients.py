@@ -1,0 +1,86 @@
+"""The third claim: derivatives of the reported bounds are their differences."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import reachjax as rj
+
+STEP = 1e-4
+"""Relative: of each number."""
+
+CLOSE = 2e-3
+"""Of the derivative, or of the sets' width: what solvers leave to digits."""
+
+
+@cache
+def _compiled(template: str, relaxation: str, solver: str, horizon: int):
+    """The weighted bounds of a tube with its derivative, and bounds with statuses; jitted."""
+    names = {"rj": rj}
+    template, relaxation, solver = (eval(e, names) for e in (template, relaxation, solver))
+
+    def bounds(given):
+        loop, X0 = given
+        tube = rj.reach(loop, X0, horizon, template, relaxation, 1, solver, samples=16)
+        codes = jnp.concatenate([tube.proof(t).codes for t in range(1, horizon + 1)])
+        return tube.sets[horizon].b, codes
+
+    def weighed(given, weights):
+        found, codes = bounds(given)
+        return weights @ found, (found, codes)
+
+    return jax.jit(jax.value_and_grad(weighed, has_aux=True))
+
+
+def compared(case, loop, X0, rng: np.random.Generator) -> tuple[str, str | None]:
+    """How a derivative along a random direction compares with differences.
+
+    Returns:
+        A word for the count, and a sentence if the derivative is wrong.
+    """
+    parts, solver = case.parts, "rj.Clarabel()"
+    value = _compiled(parts["template"], parts["relaxation"], solver, case.shapes.horizon)
+    facets = 2 * case.shapes.states
+    weights = rng.uniform(0.1, 1.0, facets)
+    leaves, structure = jax.tree.flatten((loop, X0))
+    along = [np.asarray(leaf) * rng.normal(size=leaf.shape) for leaf in leaves]
+
+    def moved(part: float):
+        pairs = zip(leaves, along, strict=True)
+        return jax.tree.unflatten(structure, [leaf + part * d for leaf, d in pairs])
+
+    (middle, (b, codes)), slopes = value((loop, X0), weights)
+    if not np.isfinite(b).all():
+        return "no bound", None
+    pairs = zip(jax.tree.leaves(slopes), along, strict=True)
+    slope = sum(float(np.sum(np.asarray(g) * d)) for g, d in pairs)
+    solved = int(rj.SolverStatus.SOLVED)
+    if np.isnan(slope):
+        names = sorted({rj.SolverStatus(int(code)).name for code in np.asarray(codes)})
+        return "NaN", f"the gradient is NaN, but the bounds {b.tolist()} are finite ({names})"
+    if np.any(np.asarray(codes) != solved):
+        return "not solved", None
+    ends = {}
+    for part in (-STEP, STEP, -STEP / 2, STEP / 2):
+        (ends[part], (_, codes)), _ = value(moved(part), weights)
+        if not np.isfinite(ends[part]) or np.any(np.asarray(codes) != solved):
+            return "not solved", None
+    before = (float(middle) - float(ends[-STEP])) / STEP
+    after = (float(ends[STEP]) - float(middle)) / STEP
+    near = (float(ends[STEP / 2]) - float(ends[-STEP / 2])) / STEP
+    width = float(np.sum(abs(np.asarray(b[: facets // 2] + b[facets // 2 :]))))
+    rounding = 1e-15 * float(abs(b).max()) * facets / STEP
+    slack = CLOSE * max(abs(before), abs(after), width) + 10 * rounding
+    if abs(near - (before + after) / 2) > slack:
+        return "several kinks", None
+    if abs(before - after) > slack:  # a kink: the derivative is a generalised one
+        low, high = min(before, after) - slack, max(before, after) + slack
+        if not low <= slope <= high:
+            said = f"the derivative {slope!r} is not between {before!r} and {after!r}"
+            return "wrong at a kink", said
+        return "within a kink", None
+    if abs(slope - near) > 2 * slack:
+        return "wrong", f"the derivative is {slope!r}, but differences are {near!r}"
+    return "agrees", None

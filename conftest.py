@@ -15,6 +15,9 @@ from pathlib import Path
 import jax
 import pytest
 
+pytest_plugins = ["tests.campaign.session"]
+"""Its options have to be known before the folder of the campaign is read."""
+
 ROOT = Path(__file__).parent
 
 QUICKER = {

@@ -2,6 +2,7 @@
 
 import re
 import time
+import traceback
 import warnings
 from collections import Counter
 
@@ -40,6 +41,11 @@ def finite(region: Region) -> bool:
     return all(v is None or np.isfinite(v).all() for v in vars(region).values())
 
 
+def same(one: Region, other: Region) -> bool:
+    """Whether two sets have the same numbers."""
+    return all(np.array_equal(value, getattr(other, name)) for name, value in vars(one).items())
+
+
 class Trial:
     """One case under way.
 
@@ -70,7 +76,11 @@ class Trial:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with np.errstate(all="ignore"):
-                self._checked()
+                try:
+                    self._checked()
+                except Exception:  # the campaign's own: the others of the block go on
+                    said = traceback.format_exc().strip().splitlines()
+                    self.fails(f"the campaign broke: {said[-1][:60]}", " / ".join(said[-4:]))
         self.outcome.seconds = time.process_time() - began
         return self.outcome
 
@@ -112,18 +122,21 @@ class Trial:
             return
         self.outcome.counts["tubes"] += 1
         proofs = [tube.proof(t) for t in range(1, case.shapes.horizon + 1)]
-        for proof in proofs:
-            statuses = self.attempt("statuses", "proof.statuses", {"proof": proof})
+        for t, proof in enumerate(proofs, start=1):
+            lines = [f"tube = {case.reach}", f"proof = tube.proof({t})"]
+            statuses = self.attempt("statuses", "proof.statuses", {"proof": proof}, *lines)
             ends = Counter(status.name for status in statuses or ())
             self.outcome.statuses += ends
             useless = case.fault in USELESS and case.every == 1 and type(proof) is rj.Certificate
-            if useless and set(ends) > {"FAILED"}:
+            if useless and set(ends) - {"FAILED"}:
                 said = f"useless answers ({case.fault}) are reported as {dict(ends)}"
-                self.fails(f"a useless answer does not count as failed: {case.fault}", said)
+                self.fails("a useless answer does not count as failed", said, *lines)
         sets = [case.initial.region, *map(plain, tube.sets[1:])]
         if not all(map(finite, sets)):
             self.fails("a set that is no number", f"{tube.sets[1:]}", f"tube = {case.reach}")
             return
+        if not same(plain(tube.sets[0]), case.initial.region):
+            self.fails("the initial set is another one", f"{tube.sets[0]}", f"tube = {case.reach}")
         rng = case.rng
         found = searched(case.loop, case.initial, sets, rng)
         self.outcome.counts["states"] += found.checked

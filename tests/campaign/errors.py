@@ -55,10 +55,8 @@ def message_kind(error: BaseException) -> str:
 
 def place(error: BaseException) -> str:
     """Where in the package an error comes from."""
-    frames = [
-        f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(PACKAGE)
-    ]
-    if not frames:
+    frames = traceback.extract_tb(error.__traceback__)
+    within = [frame for frame in frames if frame.filename.startswith(PACKAGE)]
+    if not within:
         return "outside of the package"
-    name = Path(frames[-1].filename).relative_to(PACKAGE)
-    return f"reachjax/{name}:{frames[-1].lineno}"
+    return f"reachjax/{Path(within[-1].filename).relative_to(PACKAGE)}, {within[-1].name}"

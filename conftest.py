@@ -56,8 +56,6 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
 jax.config.update("jax_enable_x64", True)
 
-pytest_plugins = ["tests.campaign.session"]
-
 
 def taken() -> int:
     """Bytes of memory that this process takes; 0 where the system does not tell."""

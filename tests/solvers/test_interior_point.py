@@ -261,7 +261,7 @@ def test_scan_and_vmap_equal_one_at_a_time(planar_gradient):
         return value(loop.replace(controller=net), X0)
 
     single = [f(loop.replace(controller=net), X0) for net in nets]
-    np.testing.assert_allclose(jax.vmap(of)(stack), single, atol=1e-7)
+    np.testing.assert_allclose(jax.jit(jax.vmap(of))(stack), single, atol=1e-7)
     scanned = jax.lax.scan(lambda carry, net: (carry, of(net)), 0, stack)[1]
     np.testing.assert_allclose(scanned, single, atol=1e-7)
 

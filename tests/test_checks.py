@@ -168,3 +168,19 @@ def test_an_array_that_is_sharded_comes_to_one_device():
     for array in (Numbers("(n, n)")(A), owned({"A": A})["A"]):
         assert isinstance(array.sharding, jax.sharding.SingleDeviceSharding)
         np.testing.assert_array_equal(array, EYE)
+
+
+def test_masked_numbers_are_none():
+    with pytest.raises(TypeError, match="some of its entries are masked"):
+        rj.Box(np.ma.array([1.0, 2.0], mask=[True, False]), [1.0, 2.0])
+    assert rj.Box(np.ma.array([1.0, 2.0]), [1.0, 2.0]).dimension == 2
+
+
+def test_tensors_of_other_libraries_are_arrays():
+    class Tensor:
+        dtype = "float32 of another library"
+
+        def __array__(self, dtype=None, copy=None):
+            return np.array([1.0, 2.0], dtype)
+
+    np.testing.assert_array_equal(rj.Box(Tensor(), [1.0, 2.0]).lower, [1.0, 2.0])

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from reachjax.programs.compact import compact
-from reachjax.solvers.proposals import ANSWERS, Enclosure
 
 import reachjax as rj
+from reachjax.proofs.proposal import ANSWERS, Enclosure
 from reachjax.sets import NormalForm
 from reachjax.solvers import enclosures
 from tests.loops import closed_loop, one_step, random_loop, recursion

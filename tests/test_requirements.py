@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.tubes.requirements import Compared, Requirement
 from tests.loops import recursion
 
 
@@ -76,3 +77,10 @@ def test_the_shortfall_does_not_depend_on_the_length_of_normals(scale):
     value, slope = jax.value_and_grad(missing)(jnp.array(1.5))
     assert float(value) == pytest.approx((7 / 4 - 1.5) / 5, abs=1e-7)
     assert float(slope) == pytest.approx(-1 / 5)
+
+
+def test_what_overflows_proves_nothing():
+    far, inside = np.array([-np.inf]), Requirement("goal", 1, rj.Box([0.0], [1.0]), True)
+    assert not inside.proved(Compared(far, far, np.ones(1)))
+    assert not inside.proved(Compared(-far, -far, np.ones(1)))
+    assert inside.proved(Compared(np.zeros(1), np.zeros(1), np.ones(1)))

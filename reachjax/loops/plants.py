@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,7 +19,10 @@ def _one_array(constant: str, varying: str) -> Callable[..., Array]:
     numbers, ndim = Numbers(constant, varying), constant.count(",") + (not constant.endswith(",)"))
 
     def convert(value: Any, name: str = "value") -> Array:
-        if isinstance(value, tuple | list) and any(np.ndim(e) >= ndim for e in _arrays(value)):
+        if isinstance(value, tuple | list) and any(
+            (isinstance(value, tuple) or hasattr(entry, "dtype")) and _depth(entry) >= ndim
+            for entry in value
+        ):
             kind = type(value).__name__
             raise TypeError(
                 f"{name} must be one array of shape {constant} or {varying}, but a {kind} of "
@@ -32,8 +35,11 @@ def _one_array(constant: str, varying: str) -> Callable[..., Array]:
     return convert
 
 
-def _arrays(values: Iterable[Any]) -> list[Any]:
-    return [value for value in values if hasattr(value, "dtype")]
+def _depth(value: Any) -> int:
+    """The number of axes of an array, or of numbers in nested sequences."""
+    if isinstance(value, tuple | list):
+        return 1 + max(map(_depth, value), default=0)
+    return np.ndim(value)
 
 
 @pytree

@@ -127,8 +127,11 @@ def _first_changed(leaf: Any) -> Any:
         raise TypeError("it is text")
     if isinstance(leaf, complex):
         raise TypeError("its entries are complex")
+    if np.ma.is_masked(leaf):
+        raise TypeError("some of its entries are masked")
     kind = getattr(leaf, "dtype", None)
-    if kind is None and not isinstance(leaf, int) and hasattr(leaf, "__array__"):
+    foreign = not isinstance(kind, np.dtype) and not isinstance(leaf, int | jax.Array)
+    if foreign and hasattr(leaf, "__array__"):  # such as a tensor, whose dtype is its own
         leaf = np.asarray(leaf)
         kind = leaf.dtype
     if kind is None:

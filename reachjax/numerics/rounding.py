@@ -31,7 +31,7 @@ def gamma(operations: int) -> float:
 
 
 def exponents(rows) -> Any:
-    """Whole numbers `e`, one a row, with the row's largest entry in `[2^e, 2^(e+1))`; 0 for zeros.
+    """Whole numbers `e`, one a row, with the row's largest entry in `[2^e, 2^(e+1))`; -1 for zeros.
 
     Derivatives take them for constants.
     """

@@ -50,7 +50,7 @@ class Generators(NamedTuple):
         half = self.rows @ factor.T
         gram = half @ half.T
         by_left, by_right = gram[:, self.left], gram[:, self.right]
-        shared: np.ndarray = np.zeros_like(self.sharing.toarray())
+        shared: np.ndarray = np.zeros(self.sharing.shape)
         for first in range(0, len(self.left), CHUNK):
             here = slice(first, first + CHUNK)
             crossed = by_left[self.left[here]] * by_right[self.right[here]]

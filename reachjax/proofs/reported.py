@@ -11,7 +11,7 @@ from reachjax.numerics.rounding import gamma
 from reachjax.programs.lmi import Program, form_rows
 from reachjax.programs.presolve import LEAST_WIDTH, NormalProgram, presolved
 from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution
-from reachjax.proofs.recheck import interval_offsets, sound_level, sound_offsets
+from reachjax.proofs.recheck import clipped, interval_offsets, sound_level, sound_offsets
 from reachjax.proofs.slopes import held_offsets
 from reachjax.sets import NormalForm
 
@@ -66,7 +66,7 @@ def judged(program: Program, solution: Solution) -> Judged:
     proved = offsets <= claims + slack  # False where the claim is NaN
     borne_out = proved & np.isfinite(claims) & (_attained(program, solution) >= claims - slack)
     optimal = np.isin(solution.statuses, ANSWERS) & borne_out
-    slope, moments = multipliers.copy(), np.array(solution.moments)
+    slope, moments = clipped(program, multipliers), np.array(solution.moments)
     held, used = np.flatnonzero(~borne_out), by_multipliers < by_intervals
     slope[held], moments[held] = held_offsets(program.seeking(held), multipliers[held], used[held])
     return Judged(

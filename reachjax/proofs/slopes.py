@@ -8,7 +8,7 @@ duality of trust regions; `eta` as in `recheck`, with `n` entries of which one i
 With `X` the moments of a maximiser, `db = <X / 2, dM>`: the derivative of a bound that holds,
 however far the multipliers are from the best ones. Where they are the best, `b` has a kink in most
 programs, and the moments of the dual, which are those of several maximisers, tell more than one of
-them does: where a solver has them they are used instead (`accepted`). A bound by intervals is
+them does: where a solver has them they are used instead (`reported`). A bound by intervals is
 `p [s, 1]` with `s` the signs of `p`, which is the same with no multipliers.
 """
 

@@ -1,7 +1,7 @@
 """Simulated trajectories as lower bounds of what is reachable.
 
 A witness is an initial state whose trajectory attains a value of a direction: no sound offset can
-be smaller. CutPool are the corners of the initial set, points drawn from it, and what gradient
+be smaller. Candidates are the corners of the initial set, points drawn from it, and what gradient
 ascent finds from these and from the states that the dual of a semidefinite program proposes.
 """
 

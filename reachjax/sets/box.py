@@ -162,8 +162,9 @@ def _support(
     by = jnp.max(jnp.where(terms != 0, logs, -LOWEST), axis=1)
     by = jnp.where(by > -LOWEST, by, 0)
     terms = shifted(terms, logs - by[:, None])
-    # along an axis nothing is rounded, and nothing is added
-    inexact = jnp.sum(terms != 0, axis=1) > jnp.max(abs(D) == 1, axis=1)
+    # products of powers of two are exact, and where there is one term nothing is added
+    rounded = (terms != 0) & (abs(D) != 1) & (abs(ends) != 1)
+    inexact = jnp.any(rounded, axis=1) | (jnp.sum(terms != 0, axis=1) > 1)
     rounding = gamma(len(lower)) * jnp.sum(abs(terms), axis=1) + len(lower) * TINY
     return raised(jnp.sum(terms, axis=1) + jnp.where(inexact, rounding, 0.0), by)
 

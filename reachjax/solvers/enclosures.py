@@ -232,7 +232,9 @@ def _size_backward(solver, residual, cotangents):
     held: Any = _held_level(program, enclosure.multipliers, scaled)
     # stationarity in the factor gives the dual its scale, whatever the solver's objective was
     unit = -2 * jnp.sum(moments[n:, :n] * form_rows(program, given).mid)
-    factors = (enclosure.multipliers, jnp.where(optimal, moments, 0.0))
+    free, weights = program.products.free, enclosure.multipliers
+    proving = jnp.where(free, weights, jnp.maximum(weights, 0.0))  # negative ones prove nothing
+    factors = (proving, jnp.where(optimal, moments, 0.0))
 
     def value(facts, objective, given, multipliers, moments):
         scaled = NormalForm(factor * given.A, factor * given.b)

@@ -117,11 +117,14 @@ def _asked(solver: AbstractSolver, answer: Callable[[], NamedTuple]) -> Any:
     name = type(solver).__name__
     try:
         return answer()
-    except (SetupError, KeyboardInterrupt, SystemExit, GeneratorExit):
+    except SetupError:
         raise
     except _FaultError as fault:
         _warn(name, str(fault))
-    except BaseException as error:  # a panic of compiled code is no Exception
+    except BaseException as error:
+        # a panic of compiled code is no Exception; what else is none (an interrupt) has to pass
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
         _warn(name, f"{type(error).__name__} was raised: {error}")
     return None
 

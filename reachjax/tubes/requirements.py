@@ -80,11 +80,13 @@ class Requirement:
     def proved(self, compared: Compared) -> bool:
         """Whether every state surely is on the right side. Sets are closed: touching is inside.
 
-        Only comparisons are made, which no rounding can turn; with what is no number they fail.
+        Only comparisons are made, which no rounding can turn; what is no number, or too large for
+        one, proves nothing.
         """
         attained, limits = np.asarray(compared.attained), np.asarray(compared.limits)
+        known = np.isfinite(attained) & np.isfinite(limits)
         right = attained <= limits if self.inside else attained < limits
-        return bool(np.all(right))
+        return bool(np.all(known & right))
 
 
 def of_tube(

@@ -150,3 +150,15 @@ def test_a_point_beside_a_set_by_less_than_products_can_tell_is_not_in_it():
     assert region.surely_contains([-1e-100, 0.0])
     assert rj.Polytope([[1e-170, 0.0]], [1e200]).surely_contains([1e300, 0.0])
     assert not rj.Box([0.0], [1.0]).surely_contains([-1e-310])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_supports_are_rounded_up_where_ends_are_zero_or_one(n):
+    rng = np.random.default_rng(n)
+    for _ in range(50):
+        upper = rng.choice([0.0, 1.0, rng.uniform()], size=n)
+        lower = np.minimum(upper, rng.choice([0.0, -1.0, -rng.uniform()], size=n))
+        row = rng.choice([0.0, 1.0, -1.0, rng.uniform(-1, 1)], size=n)
+        ends = np.where(row > 0, upper, lower)
+        exact = sum(Fraction(a) * Fraction(b) for a, b in zip(row, ends, strict=True))
+        assert Fraction(float(rj.Box(lower, upper).support(row[None])[0])) >= exact

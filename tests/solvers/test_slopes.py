@@ -3,11 +3,12 @@
 import jax
 import numpy as np
 import pytest
-from reachjax.solvers.slopes import held_level, held_offsets
 
 import reachjax as rj
 from reachjax.programs.lmi import lagrangian, schur_lagrangian
 from reachjax.proofs.recheck import interval_offsets, sound_level, sound_offsets
+from reachjax.proofs.reported import judged
+from reachjax.proofs.slopes import held_level, held_offsets
 from reachjax.sets import NormalForm
 from tests.solvers.test_enclosures import case, program
 
@@ -107,3 +108,15 @@ def test_a_point_has_a_level_without_a_derivative():
     weights, moments = held_level(held, np.zeros(len(held.products.free)), zero)
     assert not weights.any()
     assert not moments.any()
+
+
+def test_multipliers_that_prove_nothing_are_not_in_the_derivative():
+    """Negative ones are clipped in the proof, and so they are where the optimum is borne out."""
+    given = program(*case(1, seed=1))
+    found = rj.InteriorPoint().solve(given)
+    signed, small = ~given.products.free, abs(found.multipliers) < 1e-6
+    assert (signed & small).any()
+    spoilt = found._replace(multipliers=np.where(signed & small, -3.0, found.multipliers))
+    mine, clean = judged(given, spoilt), judged(given, found)
+    assert mine.optimal.all()
+    np.testing.assert_allclose(mine.multipliers, clean.multipliers, atol=1e-6)

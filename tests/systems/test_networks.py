@@ -310,3 +310,34 @@ def test_linen_parameters_of_something_else_are_refused(params, message):
 def test_what_is_not_flax_at_all_is_refused(source):
     with pytest.raises(TypeError, match="source must be a flax nnx module or the parameters"):
         rj.MLP.from_flax(source)
+
+
+SATURATING = {
+    "relu6": jax.nn.relu6,
+    "clipped at 1e5": lambda y: jnp.clip(y, 0.0, 1e5),
+    "clipped below": lambda y: jnp.maximum(jnp.maximum(y, -50.0), 0.1 * y),
+}
+
+
+@pytest.mark.parametrize("name", SATURATING)
+def test_an_activation_that_differs_far_out_is_another_one(name):
+    source = nnx.Sequential(nnx.Linear(1, 2, rngs=nnx.Rngs(0)), SATURATING[name])
+    layers = {"Dense_0": {"kernel": np.ones((2, 3)), "bias": np.zeros(3)}}
+    layers["Dense_1"] = {"kernel": np.ones((3, 1)), "bias": np.zeros(1)}
+    with pytest.raises(ValueError, match="activation must compute what one of"):
+        rj.MLP.from_flax({"params": layers}, activation=SATURATING[name])
+    source = nnx.Sequential(*source.layers, nnx.Linear(2, 1, rngs=nnx.Rngs(1)))
+    with pytest.raises(ValueError, match="must alternate"):
+        rj.MLP.from_flax(source)
+
+
+def test_a_module_that_saturates_far_out_is_not_read():
+    class Saturating(linen.Module):
+        @linen.compact
+        def __call__(self, x):
+            return linen.Dense(1)(jax.nn.relu6(linen.Dense(3)(x)))
+
+    module = Saturating()
+    params = module.init(jax.random.key(0), jnp.ones((1, 2)))
+    with pytest.raises(ValueError, match="something else"):
+        rj.MLP.from_flax(params, module=module)

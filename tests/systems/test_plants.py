@@ -56,6 +56,12 @@ def test_a_tuple_of_matrices_is_neither_read_as_times_nor_as_an_interval(name):
         TUPLES[name]()
 
 
+def test_a_tuple_of_nested_lists_is_refused_too():
+    with pytest.raises(TypeError, match="needs a disturbance"):
+        rj.AffinePlant(([[0.9]], [[1.1]]), [[1.0]])  # type: ignore[arg-type]
+    assert rj.AffinePlant(((1.0, 0.0), (0.0, 1.0)), ((1.0,), (0.0,))).steps is None
+
+
 def test_lists_of_numbers_and_of_rows_are_matrices():
     rows = rj.AffinePlant([np.ones(2), jnp.zeros(2)], [[1.0], [2.0]], [np.float64(1.0), 2])
     np.testing.assert_array_equal(rows.A, [[1.0, 1.0], [0.0, 0.0]])

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reachjax.programs.compact import compact
 
 import reachjax as rj
+from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import ANSWERS, Enclosure
 from reachjax.sets import NormalForm
 from reachjax.solvers import enclosures
@@ -225,7 +225,7 @@ class Held(rj.AbstractSolver):
     def enclose(self, program, form=None):
         if not self.answering:
             return Enclosure.blank(program)
-        reduced = compact(program)
+        reduced = presolved(program)
         if not self.said:
             found = rj.Clarabel().enclose(program, form)
             noise = np.random.default_rng(0).normal(size=found.multipliers.shape)

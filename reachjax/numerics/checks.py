@@ -220,10 +220,7 @@ def real_number(name: str, value: Any, least: float) -> float:
 def require_kind(name: str, value: Any, kind: type, expected: str) -> None:
     """Raise a `TypeError` that says what was expected if `value` is of another kind."""
     if not isinstance(value, kind):
-        arrived = described(value)
-        if type(value).__name__ == kind.__name__:  # a class of the same name, of another library
-            arrived += f" of {type(value).__module__}"
-        raise TypeError(f"{name} must be {expected}, but {arrived} arrived")
+        raise TypeError(f"{name} must be {expected}, but {described(value)} arrived")
 
 
 def wrapped(progress: Any, items: Iterable[Any]) -> Iterable[Any]:
@@ -260,8 +257,10 @@ def described(value: Any) -> str:
     """A short word for what arrived: classes and plain values as they are, objects by kind."""
     if isinstance(value, type | str | int | float | list | None):
         return repr(value) if len(repr(value)) < 80 else type(value).__name__
-    kind = type(value).__name__
-    return f"{'an' if kind == 'MLP' or kind[0] in 'AEIO' else 'a'} {kind}"
+    kind, library = type(value).__name__, type(value).__module__
+    article = "an" if kind == "MLP" or kind[0] in "AEIO" else "a"
+    known = library.partition(".")[0] in ("reachjax", "builtins", "jax", "jaxlib", "numpy")
+    return f"{article} {kind}" + ("" if known else f" of {library}")
 
 
 def same_size(expected: str, arrived: str, sizes: tuple[int | None, int | None]) -> None:

@@ -238,16 +238,17 @@ def test_the_gradient_in_the_initial_set_is_that_of_differences(kind):
     assert float(jax.grad(total)(0.0)) == pytest.approx(float(difference), rel=1e-3)
 
 
-def test_compiled_bounds_are_those_of_plain_ones():
+def test_compiled_bounds_are_between_those_of_cuts_and_of_local_bounds():
+    """Where numbers are traced nobody sees what a moment violates: products are LocalBounds'."""
     data = random_loop(2, hidden=(4, 3), seed=5)
     X0, _ = initial("box", 2, seed=5)
     layers = [tuple(map(jnp.asarray, pair)) for pair in data.layers]
     cuts = rj.CuttingPlanes(rounds=2, batch=20, gap=0.0)
-    plain = sizes(layers, X0, data, 1, cuts)
+    tight, loose = (sizes(layers, X0, data, 1, by) for by in (cuts, rj.LocalBounds()))
     value, slope = jax.jit(jax.value_and_grad(lambda layers: sizes(layers, X0, data, 1, cuts)))(
         layers
     )
-    assert float(value) == pytest.approx(float(plain), abs=2e-3)
+    assert float(tight) - 1e-6 <= float(value) <= float(loose) + 1e-6
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
 
 

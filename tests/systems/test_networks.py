@@ -335,7 +335,8 @@ def test_a_module_that_saturates_far_out_is_not_read():
     class Saturating(linen.Module):
         @linen.compact
         def __call__(self, x):
-            return linen.Dense(1)(jax.nn.relu6(linen.Dense(3)(x)))
+            hidden = linen.Dense(3)(x)
+            return linen.Dense(1)(jax.nn.relu6(hidden))
 
     module = Saturating()
     params = module.init(jax.random.key(0), jnp.ones((1, 2)))

@@ -50,11 +50,16 @@ def searched(loop: Loop, initial: Initial, sets: list[Region], rng: np.random.Ge
     error[:corners] = 2 * UNIT * abs(starts[:corners])
     found = Found(starts, loop.simulate_wide(starts, error, horizon))
     for t, region in enumerate(sets):
-        room, off = region.room_wide(*found.states[t])
-        found.checked += len(room)
-        for column in range(room.shape[1]):
-            _judge(loop, initial, region, found, (t, column), room[:, column], off[:, column])
+        compared_with(loop, initial, region, found, t)
     return found
+
+
+def compared_with(loop: Loop, initial: Initial, region: Region, found: Found, t: int) -> None:
+    """Compare the states at time `t` with a set."""
+    room, off = region.room_wide(*found.states[t])
+    found.checked += len(room)
+    for column in range(room.shape[1]):
+        _judge(loop, initial, region, found, (t, column), room[:, column], off[:, column])
 
 
 def start_of(initial: Initial, found: Found, k: int) -> np.ndarray:

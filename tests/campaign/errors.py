@@ -12,7 +12,7 @@ PACKAGE = str(Path(rj.__file__).parent)
 ARGUMENTS = (
     r"X0|loop|plant|controller|input_box|template|relaxation|window|solver|horizon|start|samples|"
     r"seed|progress|tube|goal|safe|avoid|Box|Polytope|Ellipsoid|Intersection|Template|"
-    r"EllipsoidTemplate|MixedTemplate|AffinePlant|MLP|ClosedLoop|shape|directions"
+    r"EllipsoidTemplate|MixedTemplate|AffinePlant|MLP|ClosedLoop"
 )
 NAMES = re.compile(rf"\b({ARGUMENTS})\b")
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*(e[-+]?\d+)?|\binf\b|\bnan\b)", re.IGNORECASE)

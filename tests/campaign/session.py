@@ -5,7 +5,6 @@ Every finished case is a line of `results/campaign-<seed>.jsonl`, with which `--
 
 import json
 import os
-from pathlib import Path
 
 import pytest
 
@@ -77,8 +76,9 @@ class Journal:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Begin the file, before any process runs a case."""
-    chosen = any(item.path.parent == Path(__file__).parent for item in session.items)
-    if chosen and os.environ.get("PYTEST_XDIST_WORKER", "gw0") == "gw0":
+    chosen = any("block" in getattr(item, "fixturenames", ()) for item in session.items)
+    runs = not session.config.getoption("collectonly")
+    if chosen and runs and os.environ.get("PYTEST_XDIST_WORKER", "gw0") == "gw0":
         Journal(session.config).begin()
 
 

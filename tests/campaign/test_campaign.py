@@ -15,7 +15,7 @@ import pytest
 
 from tests.campaign.architectures import ARCHITECTURES, BLOCK, architecture
 from tests.campaign.cases import drawn
-from tests.campaign.claims import Trial
+from tests.campaign.claims import tried
 from tests.campaign.outcomes import Outcome
 from tests.campaign.session import PROPERTY, Journal, numbers
 
@@ -68,7 +68,7 @@ def test_nothing_that_is_said_is_false(block, journal, finished, compiled, reque
     for number in block:
         outcome = finished.get(number)
         if outcome is None:
-            outcome = Trial(drawn(number, journal.seed)).run()
+            outcome = tried(drawn(number, journal.seed))
             journal.add(outcome)
         outcomes.append(outcome)
         request.node.user_properties.append((PROPERTY, json.dumps(outcome.record())))

@@ -124,19 +124,26 @@ def test_the_change_of_basis_is_that_of_propositions_three_to_five(n_x, boxed, t
             np.testing.assert_array_equal(actual[:, :-1], matrix[:, :-1], err_msg=name)
 
 
-def test_every_facet_agrees_with_the_reference_from_the_same_set(tube_of):
+@pytest.mark.parametrize(
+    "which",
+    [slice(-1, None), pytest.param(slice(None), marks=pytest.mark.long)],
+    ids=["one", "all"],
+)
+def test_every_facet_agrees_with_the_reference_from_the_same_set(tube_of, which):
+    """An oblique one of the last step, of all sets and options; by `-m long` every one."""
     case, tube = tube_of
-    for t in range(STEPS):
+    facets = case.facets[which]
+    for t in range(STEPS)[which]:
         start = tube.sets[t]
         reference, _ = paper_step(
             case.loop.layers,
             *case.loop.at(t),
             np.asarray(start.A),
             np.asarray(start.b),
-            case.directions[case.facets],
+            case.directions[facets],
             repeated=case.repeated,
         )
-        offsets = np.asarray(tube.sets[t + 1].b)[case.facets]
+        offsets = np.asarray(tube.sets[t + 1].b)[facets]
         error = np.abs(offsets - reference) / np.maximum(1.0, np.abs(reference))
         assert error.max() <= 1e-5, f"step {t + 1}: {offsets} against {reference}"
 

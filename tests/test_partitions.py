@@ -187,7 +187,6 @@ def test_any_executor_runs_the_cells(loop, partitioned):
         np.testing.assert_array_equal(tube.bounds(t), partitioned.bounds(t))
 
 
-@pytest.mark.slow
 def test_a_cluster_runs_the_cells(loop, partitioned):
     from distributed import Client, LocalCluster
 

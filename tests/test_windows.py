@@ -10,7 +10,7 @@ import pytest
 import reachjax as rj
 from reachjax.programs.windows import COLUMNS, Window
 from reachjax.sets.geometry import bounding_box
-from tests.loops import closed_loop, initial_set, random_loop, recursion
+from tests.loops import closed_loop, initial_set, random_loop
 from tests.networks import box_region, simulate
 
 HORIZON = 3
@@ -120,12 +120,19 @@ def unrolled(loop, states):
     return jax.vmap(trajectory)(states)
 
 
+def around(loop, X0):
+    """Polytopes around simulated states at times 1 to `HORIZON - 1`."""
+    reached = np.asarray(loop.simulate(X0.sample(jax.random.key(2), 2000), HORIZON - 1))[:, 1:]
+    boxes = (rj.Box(x.min(axis=0), x.max(axis=0)) for x in np.moveaxis(reached, 1, 0))
+    return [rj.Polytope(*box.facets) for box in boxes]
+
+
 @pytest.mark.parametrize("relaxation", [rj.PaperQC(), rj.CuttingPlanes()], ids=str)
 @pytest.mark.parametrize("kind", ["box", "polytope", "ellipsoid", "intersection"])
 @pytest.mark.parametrize("n_x", [1, 2, 6])
 def test_facts_hold_of_every_trajectory(n_x, kind, relaxation):
     loop, X0 = closed_loop(random_loop(n_x, hidden=(5, 4), seed=3)), initial_set(kind, n_x)
-    sets = recursion(loop, X0, HORIZON, rj.Template.box(n_x)).sets[:HORIZON]
+    sets = [X0, *around(loop, X0)]
     windows = [
         Window.beginning(loop, X0, bounding_box(X0), 0, relaxation, compact)
         for compact in (False, True)

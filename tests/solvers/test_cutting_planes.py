@@ -184,7 +184,7 @@ def sizes(layers, X0, data, window, cuts=CUTS):
     return jnp.sum(tube.sets[2].b)
 
 
-@pytest.mark.parametrize("window", [1, 2, None])
+@pytest.mark.parametrize("window", [1, pytest.param(2, marks=pytest.mark.long), None])
 def test_the_gradient_is_that_of_differences(window):
     data = random_loop(2, hidden=(4, 3), seed=5)
     X0, _ = initial("box", 2, seed=5)

@@ -49,10 +49,13 @@ def cone_program(loop, X0, direction, repeated):
     return data["A"], data["b"], data["c"], cones
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("repeated", [False, True])
+OTHERS = [(1, (3,), 0, False), (2, (3,), 0, True), (2, (3,), 1, False), (2, (3,), 1, True)]
+OTHERS += [(1, (3,), 0, True), (2, (2, 2), 1, False), (2, (2, 2), 1, True)]
+
+
 @pytest.mark.parametrize(
-    ("n", "hidden", "seed"), [(1, (3,), 0), (2, (3,), 0), (2, (3,), 1), (2, (2, 2), 1)]
+    ("n", "hidden", "seed", "repeated"),
+    [(2, (3,), 0, False), *(pytest.param(*case, marks=pytest.mark.long) for case in OTHERS)],
 )
 def test_the_gradient_agrees_with_diffcp(n, hidden, seed, repeated):
     loop = closed_loop(random_loop(n, hidden=hidden, seed=seed))

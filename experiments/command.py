@@ -36,11 +36,12 @@ def require_folder(output: Path) -> None:
 
 
 def configure_jax(output: Path) -> None:
-    """64-bit floats, and a compilation cache in the folder of results."""
+    """64-bit floats, and a compilation cache in the folder of results unless there is one."""
     require_folder(output)
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", str(output / "jax_cache"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    if jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(output / "jax_cache"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 def bar(progress=True):

@@ -264,6 +264,8 @@ def _simulations(
     """
     try:
         return Simulations(loop, X0, horizon, start, samples, seed)
+    except ValueError as error:
+        raise ValueError(f"X0 cannot be used: {error}") from None
     except RuntimeError:
         if isinstance(X0, Intersection) and separation(X0.ellipsoid, X0.polytope) > 0:
             raise ValueError(

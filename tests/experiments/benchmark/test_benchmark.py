@@ -156,14 +156,13 @@ def test_the_table_of_growth_fits_in_eighty_columns(growing):
     assert sum("InteriorPoint" in line for line in lines) == 2
 
 
-@pytest.mark.slow
 def test_a_new_process_gives_the_same_bounds(growing):
     row = in_new_process(grown, 3, "Clarabel", GROWTH)
     np.testing.assert_array_equal(row["bounds"], growing[1]["bounds"])
     assert row["memory"] > 2**20  # the program was compiled there, and nothing before it
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tubes_of_all_ways_agree_and_training_steps_are_timed(tmp_path, capsys, monkeypatch):
     layers = he_network((2, 3, 1), seed=0)
     monkeypatch.setattr(study, "controller", lambda settings: layers)
@@ -179,7 +178,7 @@ def test_tubes_of_all_ways_agree_and_training_steps_are_timed(tmp_path, capsys, 
     assert max(map(len, capsys.readouterr().out.splitlines())) <= COLUMNS
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_part_of_a_step_can_be_timed():
     ready = parts(4, rj.LocalBounds(), rj.Clarabel())
     assert tuple(ready) == PARTS

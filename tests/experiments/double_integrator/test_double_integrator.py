@@ -42,7 +42,6 @@ def test_the_controller_as_printed_is_refuted_by_a_trajectory_below_the_constrai
     assert np.all(example.states[0] <= INITIAL_BOX[1])
 
 
-@pytest.mark.slow
 def test_the_command_writes_everything_and_uses_the_networks_again(tmp_path, capsys):
     settings = Settings(
         horizon=2,

@@ -179,7 +179,6 @@ def test_extremes_tell_a_loop_that_breaks_each_requirement():
     assert simulation.margin(*rows[1][2:]) == pytest.approx(-0.25)
 
 
-@pytest.mark.slow
 def test_no_simulated_state_is_outside_its_ellipsoid_and_none_is_much_too_large(analysis):
     tube = analysis.tube
     starts = 100_000
@@ -218,7 +217,6 @@ def stranger():
     return rj.ClosedLoop(dynamics, net, rj.Box(*INPUT_LIMITS))
 
 
-@pytest.mark.slow
 def test_no_state_of_a_network_trained_elsewhere_is_outside_its_ellipsoid(stranger):
     tube = recursion(stranger, initial_set(), STEPS, rj.EllipsoidTemplate())
     states = simulation.simulate(stranger, initial_set(), STEPS, 100_000, seed=5, progress=False)
@@ -228,7 +226,6 @@ def test_no_state_of_a_network_trained_elsewhere_is_outside_its_ellipsoid(strang
     assert np.ptp(np.asarray(jax.vmap(stranger.input)(states[:, 0])), axis=0).max() > 0.01
 
 
-@pytest.mark.slow
 def test_volumes_are_those_of_an_independent_program(learned, analysis):
     layers = [
         (np.asarray(W, dtype=float), np.asarray(b, dtype=float)) for W, b in learned[1].layers
@@ -242,7 +239,6 @@ def test_volumes_are_those_of_an_independent_program(learned, analysis):
         assert after.volume() == pytest.approx(volume, rel=1e-5)
 
 
-@pytest.mark.slow
 def test_the_report_agrees_with_the_verdict(analysis):
     margins = {
         (requirement, name): simulation.margin(certified, allowed)
@@ -269,7 +265,7 @@ def test_goal_and_safe_set_bound_positions_and_on_request_velocities():
     assert slow.contains(states).tolist() == [False, True, False]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_with_velocity_limits_these_replace_the_goal(flights, tmp_path):
     loop, states = flights
     settings = Settings(velocity_limits=True, simulations=1000, output=tmp_path)
@@ -342,7 +338,7 @@ def certify_one_step(loop, states, settings):
     return Analysis("any", settings.relaxation, tube, verdict, states, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_uses_the_committed_data_and_never_changes_it(tmp_path, capsys, monkeypatch):
     def untrained(*_):
         sizes = [6, 32, 32, 3]

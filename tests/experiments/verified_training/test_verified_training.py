@@ -25,7 +25,6 @@ def as_printed():
     return layers, sample_policy(linear_mpc(0.0), 400, 0, progress=False)
 
 
-@pytest.mark.slow
 def test_the_penalty_turns_a_refuted_controller_into_a_proved_one(as_printed, tmp_path):
     outcomes = {
         way: run(*as_printed, tuning, tmp_path / f"{way}.npz")
@@ -60,7 +59,7 @@ def test_a_finished_job_is_not_done_again(as_printed, tmp_path, monkeypatch):
         run(*as_printed, replace(tuning, learning_rate=0.1), tmp_path / "plain.npz")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_prints_tables_and_writes_figures_and_results(tmp_path, capsys):
     settings = Settings(
         seeds=1,

@@ -39,7 +39,7 @@ def configure_jax(output: Path) -> None:
     """64-bit floats, and a compilation cache in the folder of results unless there is one."""
     require_folder(output)
     jax.config.update("jax_enable_x64", True)
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(output / "jax_cache"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 

@@ -5,7 +5,6 @@ import pytest
 from docs.tools.tutorials import NOTEBOOKS, executed
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(path):
     printed = [out for cell in executed(path).cells for out in cell.get("outputs", [])]

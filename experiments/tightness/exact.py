@@ -114,7 +114,9 @@ def _affine(W: ArrayLike, rows: Float[ndarray, "n size"], b: ArrayLike) -> ndarr
 
 def _successor(loop: rj.ClosedLoop, program: "_Program", state: ndarray, t: int) -> ndarray:
     """Rows of the state one step later."""
-    *hidden, (W, b) = loop.controller.layers
+    net = loop.controller
+    assert isinstance(net, rj.MLP)
+    *hidden, (W, b) = net.layers
     z = state
     for V, a in hidden:
         z = program.relu(_affine(V, z, a))

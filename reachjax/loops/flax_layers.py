@@ -41,7 +41,7 @@ def read_activation(activation: Any) -> Any:
     if isinstance(activation, AbstractActivation | type) or not callable(activation):
         return activation
     with jax.ensure_compile_time_eval():
-        leak = float(activation(jnp.asarray(-1.0)) / -1.0)
+        leak = -float(np.asarray(activation(jnp.asarray(-1.0))))
         known = [ReLU(), HardTanh(), *([LeakyReLU(leak)] if 0 <= leak < 1 else [])]
         for each in known:
             if _agree(activation, each):

@@ -50,7 +50,7 @@ class Generators(NamedTuple):
         half = self.rows @ factor.T
         gram = half @ half.T
         by_left, by_right = gram[:, self.left], gram[:, self.right]
-        shared: np.ndarray = np.zeros(self.sharing.shape)
+        shared = np.zeros((self.size, len(self.left)))
         for first in range(0, len(self.left), CHUNK):
             here = slice(first, first + CHUNK)
             crossed = by_left[self.left[here]] * by_right[self.right[here]]
@@ -69,7 +69,7 @@ class Generators(NamedTuple):
         left, right = self.left, self.right
         A, B = self.rows @ X @ self.rows.T, self.rows @ W @ self.rows.T
         A_left, A_right, B_left, B_right = A[:, left], A[:, right], B[:, left], B[:, right]
-        shared = np.zeros(self.sharing.shape)
+        shared = np.zeros((self.size, len(self.left)))
         for first in range(0, len(left), CHUNK):
             here = slice(first, first + CHUNK)
             p, q = left[here], right[here]
@@ -78,8 +78,8 @@ class Generators(NamedTuple):
             crossed += A_left[q] * B_right[p]
             crossed += A_right[q] * B_left[p]
             shared += self.sharing[:, here] @ crossed
-        paired = (self.sharing @ gram[left, right] for gram in (A, B))
-        return *paired, (self.sharing @ shared.T) / 4
+        paired, paired_W = (self.sharing @ gram[left, right] for gram in (A, B))
+        return paired, paired_W, (self.sharing @ shared.T) / 4
 
     def with_square(self, row: np.ndarray, weight: float) -> Generators:
         """With one more matrix, `weight` times a row's square."""

@@ -96,14 +96,14 @@ def presolved(program: Program) -> NormalProgram:
     """The normal program of a program whose leaves are numpy arrays."""
     products = program.products
     solid, wanted = _solid(program.facts), _solid(program.objective)
-    used = solid.any(axis=0) | wanted.any(axis=0)
-    facts = np.where(solid.any(axis=1)[:, None] & used, program.facts.mid, 0.0)
+    used = np.any(solid, axis=0) | np.any(wanted, axis=0)
+    facts = np.where(np.any(solid, axis=1)[:, None] & used, program.facts.mid, 0.0)
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is dropped
         sizes = _sizes(products, facts)
     kept = np.flatnonzero((sizes > 0) & np.isfinite(sizes) & ~_implied_by_cone(products, facts))
     number = np.full(len(sizes), -1)
     number[kept] = np.arange(len(kept))
-    owner, present = number[products.multiplier], facts.any(axis=1)
+    owner, present = number[products.multiplier], np.any(facts != 0, axis=1)
     there = np.flatnonzero((owner >= 0) & present[products.left] & present[products.right])
     owner, norms, columns = owner[there], sizes[kept], np.flatnonzero(used)
     shares = np.asarray(products.sign)[there] / norms[owner], (owner, np.arange(len(there)))
@@ -130,7 +130,8 @@ def presolved(program: Program) -> NormalProgram:
 
 def _solid(rows: Ball) -> Bool[np.ndarray, "k n"]:
     """Which coefficients stand out from the rounding errors of their row."""
-    return abs(rows.mid) > NOISE * np.sqrt((rows.rad**2).sum(axis=1))[:, None]
+    noise = NOISE * np.sqrt((rows.rad**2).sum(axis=1))
+    return np.asarray(abs(rows.mid) > noise[:, None])
 
 
 def _sizes(products: Products, facts: np.ndarray) -> Float[np.ndarray, " K"]:

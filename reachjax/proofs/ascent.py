@@ -16,7 +16,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet
 
 STEPS = 80
-"""Gradient steps of an ascent. After 60 one on a polytope of six dimensions lacked 1e-4 of a range."""
+"""Gradient steps of an ascent. After 60, one on a polytope of six dimensions lacked 1e-4."""
 
 SWEEPS = 20
 """Rounds of projections onto the facets of a polytope, one after the other."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -119,10 +120,13 @@ def restricted(products: Products, kept: np.ndarray) -> Products:
 def joint(core: Products, pairs: Int[np.ndarray, "p 2"]) -> Products:
     """Products and pairs of a multiplier each."""
     count, more = len(core.free), len(pairs)
-    return Products(
-        left=np.concatenate([core.left, pairs[:, 0]]),
-        right=np.concatenate([core.right, pairs[:, 1]]),
-        sign=np.concatenate([core.sign, np.ones(more)]),
-        multiplier=np.concatenate([core.multiplier, count + np.arange(more)]),
-        free=np.concatenate([core.free, np.zeros(more, dtype=bool)]),
+    added: tuple[Any, ...] = (
+        pairs[:, 0],
+        pairs[:, 1],
+        np.ones(more),
+        count + np.arange(more),
+        np.zeros(more, dtype=bool),
     )
+    own = core.left, core.right, core.sign, core.multiplier, core.free
+    joined: Any = [np.concatenate(both) for both in zip(own, added, strict=True)]
+    return Products(*joined)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
 
 REGULAR = 1e-14
 """What is added to the unit diagonal of a scaled Schur matrix at first."""
@@ -25,7 +25,7 @@ def inverse_cholesky(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     unit = 1e-16 * np.trace(matrix) / len(matrix)
     factor, shift = _factor(matrix, unit, 0.0)
-    inverse, _ = lapack.dtrtri(factor, lower=1)
+    inverse = solve_triangular(factor, np.eye(len(matrix)), lower=True, check_finite=False)
     return inverse, matrix + shift * np.eye(len(matrix)) if shift else matrix
 
 
@@ -44,7 +44,7 @@ def refined_solver(schur: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         solution, least = np.zeros_like(vector), np.inf
         enough = 1e-15 * np.linalg.norm(vector)
         for _ in range(1 + REFINEMENTS):
-            candidate = solution + lapack.dpotrs(factor, residual, lower=1)[0]
+            candidate = solution + cho_solve((factor, True), residual, check_finite=False)
             left = vector - matrix @ candidate
             size = float(np.linalg.norm(left))
             if not size < least:
@@ -62,8 +62,11 @@ def _factor(matrix: np.ndarray, unit: float, first: float) -> tuple[np.ndarray, 
     shift, eye = first, np.eye(len(matrix))
     for _ in range(SHIFTS):
         shifted = matrix + shift * eye if shift else matrix
-        factor, info = lapack.dpotrf(shifted, lower=1, clean=1)
-        if info == 0 and np.isfinite(factor[-1, -1]):
+        try:
+            factor = cholesky(shifted, lower=True, check_finite=False)
+        except LinAlgError:
+            factor = None
+        if factor is not None and np.isfinite(factor[-1, -1]):
             return factor, shift
         shift = max(10 * shift, unit)
-    raise np.linalg.LinAlgError("a matrix is not definite for any shift")
+    raise LinAlgError("a matrix is not definite for any shift")

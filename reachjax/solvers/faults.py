@@ -166,7 +166,7 @@ def _enclosure(found: Any, blank: Enclosure) -> Enclosure:
     if not isinstance(form, tuple) or len(form) != 2:
         raise _FaultError(f"enclosure.form must be a NormalForm, but {described(form)} arrived")
     parts = (
-        _array(f"enclosure.form.{name}", part, like)
+        _array(f"enclosure.form.{name}", part, np.asarray(like))
         for name, part, like in zip("Ab", form, blank.form, strict=True)
     )
     numbers = {

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.gradients import error_in_all_parts
+from tests.differences import error_in_all_parts
 from tests.loops import one_step, recursion
 from tests.networks import box_region, simplex_region
 from tests.sets.test_intersection import intersection

@@ -11,7 +11,7 @@ from reachjax.proofs.proposal import Enclosure
 from reachjax.proofs.recheck import sound_level
 from reachjax.proofs.reported import accepted_enclosure
 from reachjax.sets import NormalForm
-from tests.gradients import error_in_all_parts
+from tests.differences import error_in_all_parts
 from tests.loops import closed_loop, random_loop, recursion
 
 

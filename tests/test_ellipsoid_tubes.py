@@ -12,7 +12,7 @@ import reachjax as rj
 from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import ANSWERS, Enclosure
 from reachjax.sets import NormalForm
-from reachjax.solvers import enclosures
+from reachjax.solvers import ellipsoids
 from tests.differences import error_in_all_parts
 from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import box_region, simplex_region
@@ -243,7 +243,7 @@ class Held(rj.AbstractSolver):
 @pytest.mark.parametrize("shape", [None, np.eye(2)], ids=["free", "given"])
 @pytest.mark.parametrize("answering", [True, False], ids=["inaccurate", "failed"])
 def test_the_gradient_of_what_is_reported_is_the_central_difference(answering, shape, monkeypatch):
-    monkeypatch.setattr(enclosures, "ATTEMPTS", 1)  # others would begin where the first one ended
+    monkeypatch.setattr(ellipsoids, "ATTEMPTS", 1)  # others would begin where the first one ended
     args, template = case(2, 0, hidden=(4, 3)), rj.EllipsoidTemplate(shape)
     f = final(template, 1, solver=Held(answering))
     assert f(*args) > final(template, 1)(*args) + 1e-3

@@ -17,8 +17,10 @@ For an ellipsoid `|A x+ + b| <= 1` the last three terms are `V' V - e e'`, `V` b
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+from typing import NamedTuple
+
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float
 
 from reachjax.numerics.pytrees import Replaceable, pytree
@@ -95,35 +97,62 @@ def with_successor(program: Program, form: NormalForm) -> Program:
     return program.replace(objective=form_rows(program, form))
 
 
-def lagrangian(
-    program: Program, multipliers: Float[Array, "f K"], moments: Float[Array, "f n n"]
-) -> Float[Array, " f"]:
-    """`<X / 2, F' Gamma F + p e' + e p'>` of each facet, over the scaled basis.
+class Slopes(NamedTuple):
+    """The derivative of a number in a program's rows.
 
-    With multipliers and moments held at their optimal values, its derivative is that of the optimal
-    offset (the envelope theorem).
+    Attributes:
+        facts: `(m, n)`.
+        objective: `(f, n)`.
     """
-    F, products = program.facts.mid, program.products
-    values = F @ moments @ F.T
-    pairs = values[:, products.left, products.right]
-    weights = products.sign * multipliers[:, products.multiplier]
-    weighted = jnp.sum(weights * pairs, axis=1) / 2
-    return weighted + jnp.einsum("fi,fi->f", program.objective.mid, moments[:, :, -1])
+
+    facts: Float[Array | np.ndarray, "m n"]
+    objective: Float[Array | np.ndarray, "f n"]
 
 
-def schur_lagrangian(
+def lagrangian_slopes(
     program: Program,
-    multipliers: Float[Array, " K"],
-    form: NormalForm,
-    moments: Float[Array, "n+q n+q"],
-) -> Float[Array, ""]:
-    """`<X, [e e' - F' Gamma F, V'; V, I]>` less what does not depend on rows, `V = A x+ + b`.
+    multipliers: Float[Array | np.ndarray, "f K"],
+    moments: Float[Array | np.ndarray, "f n n"],
+    weights: Float[np.ndarray, " f"],
+) -> Slopes:
+    """The derivative of `sum_i weights_i <X_i / 2, F' Gamma_i F + p_i e' + e p_i'>` on the host.
 
-    That matrix is positive semidefinite where `V' V - e e' + F' Gamma F <= 0`, which is theorem 1
-    for the ellipsoid `|A x + b| <= 1`; it is affine in the multipliers, `A` and `b`.
+    With multipliers and moments held at their optimal values, each term's derivative is that of the
+    optimal offset (the envelope theorem).
     """
-    F, products, n = program.facts.mid, program.products, len(program.transform)
-    pairs = (F @ moments[:n, :n] @ F.T)[products.left, products.right]
+    facts = np.zeros_like(program.facts.mid)
+    for each, X, weight in zip(multipliers, moments, weights, strict=True):
+        if weight != 0:
+            facts += weight / 2 * _products_slope(program, each, X)
+    asked = weights[:, None] != 0  # what has no bound has no part in the derivative of others
+    return Slopes(facts, np.where(asked, weights[:, None] * moments[:, :, -1], 0.0))
+
+
+def schur_slopes(
+    program: Program,
+    multipliers: Float[Array | np.ndarray, " K"],
+    form: NormalForm,
+    moments: Float[Array | np.ndarray, "n+q n+q"],
+) -> tuple[Slopes, NormalForm]:
+    """The derivative of `<X, [e e' - F' Gamma F, V'; V, I]>` in rows and in `A` and `b`.
+
+    With `V = A x+ + b` that matrix is positive semidefinite where `V' V - e e' + F' Gamma F <= 0`:
+    theorem 1 for the ellipsoid `|A x + b| <= 1`. It is affine in the multipliers, `A` and `b`. On
+    the host.
+    """
+    n, P = len(program.transform), program.objective.mid
+    V = 2 * moments[n:, :n]
+    facts = -_products_slope(program, multipliers, moments[:n, :n])
+    return Slopes(facts, form.A.T @ V), NormalForm(V @ P.T, V[:, -1])
+
+
+def _products_slope(
+    program: Program,
+    multipliers: Float[Array | np.ndarray, " K"],
+    X: Float[Array | np.ndarray, "n n"],
+) -> Float[np.ndarray, "m n"]:
+    """The derivative of `<X, F' Gamma F>` in `F`."""
+    products, F = program.products, program.facts.mid
     weights = products.sign * multipliers[products.multiplier]
-    V = form_rows(program, form).mid
-    return 2 * jnp.sum(moments[n:, :n] * V) - jnp.sum(weights * pairs)
+    pairs = sp.coo_array((weights, (products.left, products.right)), shape=(len(F), len(F)))
+    return (pairs + pairs.T) @ (F @ X)

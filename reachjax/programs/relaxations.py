@@ -61,6 +61,11 @@ class AbstractRelaxation(abc.ABC):
     remove_stable: bool
     linear_bounds: ClassVar[bool] = False
 
+    @property
+    def cuts(self) -> CuttingPlanes | None:
+        """By which rounds products are added; None if a program has all of them at once."""
+        return None
+
     @abc.abstractmethod
     def groups(self, facts: FactLayout) -> Groups:
         """Pairs of facts that share a multiplier, the free groups first, and how many are free."""
@@ -184,6 +189,11 @@ class CuttingPlanes(AbstractRelaxation):
         whole_number("CuttingPlanes.rounds", self.rounds, 0)
         whole_number("CuttingPlanes.batch", self.batch, 1)
         real_number("CuttingPlanes.gap", self.gap, 0.0)
+
+    @property
+    def cuts(self) -> CuttingPlanes:
+        """These."""
+        return self
 
     def groups(self, facts: FactLayout) -> Groups:
         """The products to begin with."""

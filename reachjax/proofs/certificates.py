@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import abc
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from reachjax.numerics.checks import floats_of, require_double_precision
+from reachjax.numerics.checks import floats_of, is_concrete, require_double_precision
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.lmi import Program
 from reachjax.proofs.proposal import SolverStatus
@@ -52,6 +53,15 @@ class AbstractCertificate(Replaceable, abc.ABC):
     def gaps(self) -> Float[Array | np.ndarray, " f"]:
         """`bounds - witnesses`: how much tightness may be left; negative by rounding at most."""
         return self.bounds - self.witnesses
+
+    @property
+    def products_in_use(self) -> Int[np.ndarray, "p 2"]:
+        """Pairs of facts, by number, of positive multipliers; none where these are traced."""
+        products, weights = jax.lax.stop_gradient((self.program.products, self.multipliers))
+        if not is_concrete(products, weights):
+            return np.zeros((0, 2), dtype=int)
+        pairs = np.stack([products.left, products.right], axis=1)
+        return pairs[np.any(np.asarray(weights) > 0, axis=0)[np.asarray(products.multiplier)]]
 
     @abc.abstractmethod
     def recheck(self, multipliers: Float[np.ndarray, "f K"] | None = None) -> np.ndarray:

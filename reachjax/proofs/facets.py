@@ -10,7 +10,7 @@ from reachjax.numerics.pytrees import pytree
 from reachjax.programs.lmi import Program
 from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.proposal import Solution
-from reachjax.proofs.reported import accepted_offsets
+from reachjax.proofs.reported import judged_offsets
 
 
 @pytree
@@ -70,4 +70,4 @@ class Certificate(AbstractCertificate):
         program, back = jax.device_get(self.program), np.linalg.pinv(self.program.transform)
         moments = back @ np.asarray(self.moments) @ back.T
         solution = Solution(self.solver_offsets, proposed, moments, self.codes, self.seconds)
-        return accepted_offsets(program, solution)[0]
+        return judged_offsets(program, solution).value

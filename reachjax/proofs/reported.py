@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -24,24 +24,34 @@ ROUNDING = 1e-12
 
 
 class Judged(NamedTuple):
-    """What a solver proposed for the facets of a program, and what that proves.
+    """What a solver proposed for a goal, and what that proves.
 
     Attributes:
-        offsets: `(f,)`, proved.
-        optimal: `(f,)`, which of them are the relaxation's optimal values.
-        multipliers: `(f, K)` and
-        moments: `(f, n, n)` of the Lagrangian (`lmi.lagrangian`) whose derivative is the offsets'.
-        solution: what the solver proposed.
+        value: what is proved: the offsets `(f,)`, or an ellipsoid.
+        optimal: whether it is the relaxation's optimum, of each facet or of the ellipsoid.
+        held: what its derivative rests on.
+        proposal: what the solver proposed.
     """
 
-    offsets: Float[Array | np.ndarray, " f"]
-    optimal: Bool[Array | np.ndarray, " f"]
+    value: Any
+    optimal: Bool[Array | np.ndarray, "*f"]
+    held: Any
+    proposal: Any
+
+
+class Held(NamedTuple):
+    """What the derivative of offsets rests on: that of the Lagrangian, these being held.
+
+    Attributes:
+        multipliers: `(f, K)`.
+        moments: `(f, n, n)`.
+    """
+
     multipliers: Float[Array | np.ndarray, "f K"]
     moments: Float[Array | np.ndarray, "f n n"]
-    solution: Solution
 
 
-def judged(program: Program, solution: Solution) -> Judged:
+def judged_offsets(program: Program, solution: Solution) -> Judged:
     """The rechecked offsets, never below what the relaxation itself gives, and their derivative.
 
     The recheck knows that the basis is bounded, so it may prove less than the program's optimal
@@ -69,21 +79,8 @@ def judged(program: Program, solution: Solution) -> Judged:
     slope, moments = clipped(program, multipliers), np.array(solution.moments)
     held, used = np.flatnonzero(~borne_out), by_multipliers < by_intervals
     slope[held], moments[held] = held_offsets(program.seeking(held), multipliers[held], used[held])
-    return Judged(
-        offsets=np.where(optimal, np.fmax(offsets, claims), offsets),
-        optimal=optimal,
-        multipliers=slope,
-        moments=moments,
-        solution=solution,
-    )
-
-
-def accepted_offsets(
-    program: Program, solution: Solution
-) -> tuple[Float[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
-    """The rechecked offsets, and for each whether it is the relaxation's optimal value."""
-    found = judged(program, solution)
-    return np.asarray(found.offsets), np.asarray(found.optimal)
+    value = np.where(optimal, np.fmax(offsets, claims), offsets)
+    return Judged(value, optimal, Held(slope, moments), solution)
 
 
 def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
@@ -108,7 +105,7 @@ def _missed(reduced: NormalProgram, moments: np.ndarray) -> float:
     return float(np.where(reduced.free, abs(products), -products).max(initial=0.0))
 
 
-def accepted_enclosure(
+def judged_form(
     program: Program,
     enclosure: Enclosure,
     given: NormalForm | None = None,

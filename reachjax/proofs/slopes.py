@@ -39,7 +39,7 @@ def held_offsets(
     multipliers: Float[np.ndarray, "f K"],
     by_multipliers: Bool[np.ndarray, " f"],
 ) -> Held:
-    """Multipliers `(f, K)` and moments `(f, n, n)` of `lmi.lagrangian` for each offset.
+    """Multipliers `(f, K)` and moments `(f, n, n)` of `lmi.lagrangian_slopes` for each offset.
 
     Args:
         program: of finite numbers.
@@ -58,7 +58,7 @@ def held_offsets(
 
 
 def held_level(program: Program, multipliers: Float[np.ndarray, " K"], form: NormalForm) -> Held:
-    """Multipliers `(K,)` and moments `(n + q, n + q)` of `lmi.schur_lagrangian` for a level.
+    """Multipliers `(K,)` and moments `(n + q, n + q)` of `lmi.schur_slopes` for a level.
 
     The level `s` is `sound_level`'s; with `V = A x+ + b`, `s ds = <X / 2, d(F' Gamma F + V' V)>`.
     Zero where the level is.

@@ -2,22 +2,24 @@
 
 from reachjax.solvers.auto import Auto
 from reachjax.solvers.base import AbstractSolver
-from reachjax.solvers.cutting_planes import proved_with_cuts, with_cuts_around
-from reachjax.solvers.differentiable import proved_offsets
-from reachjax.solvers.enclosures import proved_ellipsoid, proved_size
+from reachjax.solvers.ellipsoids import GivenShape, LeastVolume
+from reachjax.solvers.facets import Facets
+from reachjax.solvers.goals import AbstractGoal, proved
 from reachjax.solvers.interior_point import InteriorPoint
 from reachjax.solvers.named import SCS, Clarabel, CvxpySolver
+from reachjax.solvers.rounds import Rounds
 
 __all__ = [
     "SCS",
+    "AbstractGoal",
     "AbstractSolver",
     "Auto",
     "Clarabel",
     "CvxpySolver",
+    "Facets",
+    "GivenShape",
     "InteriorPoint",
-    "proved_ellipsoid",
-    "proved_offsets",
-    "proved_size",
-    "proved_with_cuts",
-    "with_cuts_around",
+    "LeastVolume",
+    "Rounds",
+    "proved",
 ]

@@ -34,7 +34,7 @@ USEFUL = 1e-3
 
 
 class Sensitivity(NamedTuple):
-    """A derivative of `A` and `b` as that of two Lagrangians, `lmi.schur_lagrangian`.
+    """A derivative of `A` and `b` as that of two Lagrangians, `lmi.schur_slopes`.
 
     The derivative in the rows of `<cotangent, (A, b)>` is that of the Lagrangian at the first three
     less that at the last three.

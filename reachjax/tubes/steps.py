@@ -11,16 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import Program
 from reachjax.programs.preactivations import first_inputs, first_rows
 from reachjax.programs.relaxations import AbstractRelaxation
 from reachjax.programs.windows import Window
 from reachjax.proofs.certificates import AbstractCertificate
-from reachjax.proofs.facets import Certificate
 from reachjax.proofs.witnesses import Simulations
-from reachjax.sets import AbstractSet, Box, Polytope, Template
+from reachjax.sets import AbstractSet, Box, Polytope
 from reachjax.sets.geometry import bounding_box, row_ranges
 from reachjax.solvers import AbstractSolver
 from reachjax.solvers.cut_pool import NONE
@@ -135,20 +133,15 @@ class Step:
     def offered(self) -> Int[np.ndarray, "p 2"]:
         """Products that prove the set of states, where this window begins with the same facts."""
         grown = bool(self.before) and len(self.window) == len(self.before[-1].window) + 1
-        if not grown or not isinstance(self.proof, Certificate):
-            return NONE
-        products = self.proof.program.products
-        weights = jax.lax.stop_gradient(self.proof.multipliers)
-        if not is_concrete(products, weights):
-            return NONE
-        pairs = np.stack([products.left, products.right], axis=1)
-        return pairs[np.any(np.asarray(weights) > 0, axis=0)[np.asarray(products.multiplier)]]
+        return self.proof.products_in_use if grown and self.proof is not None else NONE
 
     def program(self, directions: Float[Array, "f n_x"]) -> Program:
         """Theorem 1 with these directions of the successor for an objective."""
         return self.window.program(directions, self.setting.relaxation)
 
-    def attained(self, template: Template, facet: int, column: Float[np.ndarray, " n"]) -> float:
+    def attained(
+        self, directions: Float[Array, "f n_x"], facet: int, column: Float[np.ndarray, " n"]
+    ) -> float:
         """What simulations attain of a facet of the successors.
 
         Among them are ascents from the best ones and, where the window begins at the initial set,
@@ -156,8 +149,8 @@ class Step:
         """
         simulations = self.setting.simulations
         assert simulations is not None
-        facets, n, k = len(template), self.setting.loop.states, self.k + 1
-        region = jax.lax.stop_gradient(template.polytope(jnp.zeros(facets)))
+        facets, n, k = len(directions), self.setting.loop.states, self.k + 1
+        region = jax.lax.stop_gradient(Polytope(directions, jnp.zeros(facets)))
         starts = simulations.best(k, region, facet, facets)
         if len(self.window) == k:
             starts[-1] = column[:n]

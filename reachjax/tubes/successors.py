@@ -1,19 +1,32 @@
-"""The smallest set of a template that surely holds the successors of a step, and its proof."""
+"""One step of equation (seq_SDP): the smallest set of a template that holds all successors.
+
+**Theorem 1** (Hu, Fazlyab, Morari, Pappas, CDC 2020), over the basis `xi = [x; z; 1]` of the
+window's states and units: `F xi >= 0` stacks the facts of the set (`E_in`) and of the units
+(`E_mid`), `p xi = a . x+` is a row of the successor (`E_out`). If for some `Gamma` of the right
+signs
+
+    F' Gamma F  +  p e' + e p'  -  2 b e e'  <=  0,
+
+then `a . x+ <= b` for every successor: multiplied from both sides by `xi`, it says
+`2 (a . x+ - b) <= -(sum of products of facts) <= 0`. For an ellipsoid `|A x+ + b| <= 1` the last
+terms are `V' V - e e'` with `V xi = A x+ + b`. The smallest `b`, or `-log det A`, is a semidefinite
+program; whatever solves it only proposes `Gamma`, and the set is what that proves.
+"""
 
 from __future__ import annotations
 
-from functools import partial
+from functools import partial, singledispatch
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
 
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.host import all_finite
 from reachjax.programs.lmi import Program
-from reachjax.programs.relaxations import CuttingPlanes
 from reachjax.proofs.certificates import AbstractCertificate
-from reachjax.proofs.ellipsoids import EllipsoidCertificate
-from reachjax.proofs.facets import Certificate
 from reachjax.proofs.mixed import MixedCertificate
 from reachjax.sets import (
     AbstractSet,
@@ -22,17 +35,12 @@ from reachjax.sets import (
     EllipsoidTemplate,
     Intersection,
     MixedTemplate,
-    Polytope,
     Template,
 )
-from reachjax.solvers import (
-    proved_ellipsoid,
-    proved_offsets,
-    proved_size,
-    proved_with_cuts,
-    with_cuts_around,
-)
+from reachjax.solvers import AbstractGoal, Facets, GivenShape, LeastVolume, Rounds, proved
 from reachjax.tubes.steps import Step
+
+T = TypeVar("T")
 
 
 def successors(step: Step, template: AbstractTemplate) -> tuple[AbstractSet, AbstractCertificate]:
@@ -42,69 +50,78 @@ def successors(step: Step, template: AbstractTemplate) -> tuple[AbstractSet, Abs
         TypeError: the template is of an unknown kind.
         ValueError: the set of states is empty or unbounded, or states overflow.
     """
-    if isinstance(template, Template):
-        return _polytope(step, template, step.program(template.directions))
-    successor = jnp.eye(step.setting.loop.states)
-    if isinstance(template, EllipsoidTemplate):
-        return _ellipsoid(step, template, step.program(successor))
-    if isinstance(template, MixedTemplate):
-        directions = jnp.concatenate([template.facets.directions, successor])
-        return _intersection(step, template, step.program(directions))
-    raise TypeError(f"there is no step for templates of kind {type(template).__name__}")
+    goals = goals_of(template, step)
+    rows = [goal.rows(step.setting.loop.states) for goal in goals]
+    program = _finite(step, step.program(jnp.concatenate(rows)))
+    programs = (program.seeking(where) for where in _slices(rows))
+    parts = [_proved(step, goal, each) for goal, each in zip(goals, programs, strict=True)]
+    return _together(program, parts)
 
 
-def _require_finite(step: Step, numbers) -> None:
+def _proved(
+    step: Step, goal: AbstractGoal, program: Program
+) -> tuple[AbstractSet, AbstractCertificate]:
+    """The set of one goal, and its proof."""
+    cuts, witness, rounds = step.setting.relaxation.cuts, None, None
+    if cuts is not None:
+        if step.setting.simulations is not None:
+            witness = partial(step.attained, goal.rows(step.setting.loop.states))
+        rounds = Rounds(step.window.layout, cuts, witness, step.offered)
+    program, value, proposal = proved(goal, program, step.setting.solver, rounds)
+    region = goal.region(_finite(step, value))
+    return region, goal.certificate(program, value, proposal)
+
+
+def _together(
+    program: Program, parts: list[tuple[AbstractSet, AbstractCertificate]]
+) -> tuple[AbstractSet, AbstractCertificate]:
+    """One set of all parts: itself, or the intersection of facets and an ellipsoid."""
+    if len(parts) == 1:
+        return parts[0]
+    sets, proofs = zip(*parts, strict=True)
+    return Intersection(*sets), MixedCertificate.joining(program, *proofs)
+
+
+def _slices(rows: list[Array]) -> list[slice]:
+    """Where the rows of each goal stand among those of all."""
+    ends = np.cumsum([len(each) for each in rows])
+    return [slice(end - len(each), end) for end, each in zip(ends, rows, strict=True)]
+
+
+def _finite(step: Step, numbers: T) -> T:
+    """The numbers themselves.
+
+    Raises:
+        ValueError: one of them is known not to be finite.
+    """
     fixed = jax.lax.stop_gradient(numbers)
     if is_concrete(fixed) and not all_finite(jax.device_get(fixed)):
         raise ValueError(
             f"the loop's states at t = {step.t + 1} overflow or are not numbers: check the "
             "weights of loop.controller and the entries of loop.plant"
         )
+    return numbers
 
 
-def _polytope(step: Step, template: Template, program: Program) -> tuple[Polytope, Certificate]:
-    """Problem (sdp::poly): the smallest offset for each facet."""
-    setting = step.setting
-    _require_finite(step, program)
-    if isinstance(setting.relaxation, CuttingPlanes):
-        witness = None if setting.simulations is None else partial(step.attained, template)
-        program, offsets, solution = proved_with_cuts(
-            program, step.window.layout, setting.solver, setting.relaxation, witness, step.offered
-        )
-    else:
-        offsets, solution = proved_offsets(program, setting.solver)
-    _require_finite(step, offsets)
-    certificate = Certificate.from_solution(program, offsets, solution)
-    return template.polytope(offsets), certificate
+@singledispatch
+def goals_of(template: AbstractTemplate, step: Step) -> tuple[AbstractGoal, ...]:
+    """What is sought of a step's successors: one goal for each part of the template's sets."""
+    raise TypeError(f"there is no step for templates of kind {type(template).__name__}")
 
 
-def _ellipsoid(
-    step: Step, template: EllipsoidTemplate, program: Program
-) -> tuple[Ellipsoid, EllipsoidCertificate]:
-    """Problem (sdp::ellips): the minimum volume, or the smallest size of a given shape."""
-    setting, form = step.setting, None
-    if template.shape is not None:
-        middle = step.X.center if isinstance(step.X, Ellipsoid) else step.box.center
-        form = Ellipsoid(setting.loop.step(middle, step.t), template.shape).normal_form
-    _require_finite(step, program)
-    if isinstance(setting.relaxation, CuttingPlanes):
-        program = with_cuts_around(
-            program, step.window.layout, setting.solver, setting.relaxation, form
-        )
-    if form is None:
-        form, level, enclosure = proved_ellipsoid(program, setting.solver)
-    else:
-        form, level, enclosure = proved_size(program, form, setting.solver)
-    region = Ellipsoid.enclosing(form, level)
-    _require_finite(step, region.shape)
-    return region, EllipsoidCertificate.from_enclosure(program, form, level, enclosure)
+@goals_of.register
+def _(template: Template, step: Step) -> tuple[AbstractGoal, ...]:
+    return (Facets(template.directions),)
 
 
-def _intersection(
-    step: Step, template: MixedTemplate, program: Program
-) -> tuple[Intersection, MixedCertificate]:
-    """Both problems, over the same facts."""
-    m = len(template.facets)
-    polytope, first = _polytope(step, template.facets, program.seeking(slice(m)))
-    ellipsoid, second = _ellipsoid(step, template.ellipsoid, program.seeking(slice(m, None)))
-    return Intersection(polytope, ellipsoid), MixedCertificate.joining(program, first, second)
+@goals_of.register
+def _(template: EllipsoidTemplate, step: Step) -> tuple[AbstractGoal, ...]:
+    if template.shape is None:
+        return (LeastVolume(),)
+    middle = step.setting.loop.step(step.box.center, step.t)
+    return (GivenShape(Ellipsoid(middle, template.shape).normal_form),)
+
+
+@goals_of.register
+def _(template: MixedTemplate, step: Step) -> tuple[AbstractGoal, ...]:
+    return goals_of(template.facets, step) + goals_of(template.ellipsoid, step)

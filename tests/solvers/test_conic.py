@@ -9,7 +9,7 @@ import reachjax as rj
 from reachjax.programs.presolve import presolved
 from reachjax.programs.windows import step_program
 from reachjax.proofs.recheck import interval_offsets
-from reachjax.proofs.reported import accepted_offsets
+from reachjax.proofs.reported import judged_offsets
 from reachjax.solvers.conic import STATUSES
 from tests.loops import closed_loop, one_step, random_loop
 from tests.networks import box_region, directions, simulate
@@ -113,7 +113,7 @@ def test_bounds_are_sound_under_every_status_that_cvxpy_has(setting, monkeypatch
     monkeypatch.setattr(cp.Problem, "solve", solve)
     solution = rj.Clarabel().solve(program)
     assert set(solution.statuses) == {STATUSES[word]}
-    bounds, _ = accepted_offsets(program, solution)
+    bounds = judged_offsets(program, solution).value
     certificate = rj.Certificate.from_solution(program, bounds, solution)
     states = np.vstack([region.corners, region.sample(20_000, seed=0)])
     attained = (simulate(data, states, 1)[1] @ directions(3, extra=1).T).max(axis=0)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.programs.lmi import lagrangian
+from reachjax.programs.lmi import lagrangian_slopes
 from reachjax.programs.windows import step_program
 from reachjax.sets.geometry import bounding_box
-from reachjax.solvers import proved_offsets
+from reachjax.solvers import Facets, proved
 from tests.differences import along, error_in_all_parts, norm, relative_error
 from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import box_region, simplex_region
@@ -28,6 +28,11 @@ def planar(seed, polytope=False, hidden=(5, 3)):
     low, high = region.corners.min(axis=0), region.corners.max(axis=0)
     X0 = rj.Polytope(region.A, region.b) if polytope else rj.Box(low, high)
     return closed_loop(data), X0
+
+
+def proved_offsets(program, solver):
+    """The offsets of a program, and what the solver proposed."""
+    return proved(Facets(TEMPLATE.directions), program, solver)[1:]
 
 
 def value(loop, X0, horizon=1, **options):
@@ -95,9 +100,14 @@ def test_the_gradient_is_as_accurate_as_the_solver():
 def test_the_lagrangian_at_the_solution_is_the_offset():
     loop, X = planar(0)
     program = step_program(loop, X, bounding_box(X), TEMPLATE.directions, 0, rj.LocalBounds())
-    offsets, solution = proved_offsets(program, rj.Clarabel())
-    values = lagrangian(program, solution.multipliers, solution.moments)
-    np.testing.assert_allclose(values, offsets, atol=1e-6)
+    offsets, solution = jax.device_get(proved_offsets(program, rj.Clarabel()))
+    facts, objective = program.facts.mid, program.objective.mid
+    for facet in range(len(offsets)):
+        held = solution.multipliers, solution.moments, np.eye(len(offsets))[facet]
+        slopes = lagrangian_slopes(jax.device_get(program), *held)
+        # it is quadratic in the facts and linear in the objective
+        value = np.sum(slopes.facts * facts) / 2 + np.sum(slopes.objective * objective)
+        assert value == pytest.approx(offsets[facet], abs=1e-6)
 
 
 def agree(first, second):

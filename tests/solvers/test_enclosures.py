@@ -9,7 +9,7 @@ import reachjax as rj
 from reachjax.programs.windows import step_program
 from reachjax.proofs.proposal import Enclosure
 from reachjax.proofs.recheck import sound_level
-from reachjax.proofs.reported import accepted_enclosure
+from reachjax.proofs.reported import judged_form
 from reachjax.sets import NormalForm
 from tests.differences import error_in_all_parts
 from tests.loops import closed_loop, random_loop, recursion
@@ -65,7 +65,7 @@ def test_any_multipliers_prove_a_level_that_no_trajectory_exceeds(solved):
 
 def test_what_clarabel_proposes_is_proved_nearly_as_it_stands(solved):
     _, _, held, enclosure = solved
-    form, level, optimal = accepted_enclosure(held, enclosure)
+    form, level, optimal = judged_form(held, enclosure)
     assert optimal
     assert 1.0 <= level <= 1 + 1e-6
     np.testing.assert_array_equal(form.A, enclosure.form.A)
@@ -82,7 +82,7 @@ def test_whatever_form_is_proposed_the_ellipsoid_holds_the_successors(solved, br
         "tiny": enclosure._replace(form=NormalForm(1e-9 * A, 1e-9 * b)),
         "huge": enclosure._replace(form=NormalForm(1e9 * A, 1e9 * b)),
     }[broken]
-    form, level, optimal = accepted_enclosure(held, proposed)
+    form, level, optimal = judged_form(held, proposed)
     assert not optimal
     region = rj.Ellipsoid.enclosing(NormalForm(*map(jnp.asarray, form)), level)
     assert region.contains(successors(loop, X)).all()

@@ -13,11 +13,10 @@ from reachjax.programs.presolve import presolved
 from reachjax.programs.windows import step_program
 from reachjax.proofs.proposal import ANSWERS
 from reachjax.proofs.recheck import interval_offsets
-from reachjax.proofs.reported import accepted_enclosure, accepted_offsets, log_volume
+from reachjax.proofs.reported import judged_form, judged_offsets, log_volume
 from reachjax.sets import NormalForm
 from reachjax.solvers import barrier, centring
 from reachjax.solvers.barrier import EllipsoidBarrier
-from reachjax.solvers.differentiable import proved_offsets
 from tests.differences import dot, error_in_all_parts
 from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import (
@@ -30,7 +29,7 @@ from tests.networks import (
     simplex_region,
     simulate,
 )
-from tests.solvers.test_differentiable import ALL_PARTS, PROMISED, planar
+from tests.solvers.test_differentiable import ALL_PARTS, PROMISED, planar, proved_offsets
 from tests.solvers.test_differentiable import value as planar_value
 
 SOLVER = rj.InteriorPoint()
@@ -124,8 +123,8 @@ def test_it_agrees_with_clarabel(answer):
     # Clarabel itself moves by 1.5e-5 from a tolerance of 1e-8 to one of 1e-9
     np.testing.assert_allclose(apart, 0, atol=1e-5)
     # what the recheck proves is never looser
-    bounds, _ = accepted_offsets(given, solution)
-    others, _ = accepted_offsets(given, reference)
+    bounds = judged_offsets(given, solution).value
+    others = judged_offsets(given, reference).value
     assert np.all(bounds <= others + 1e-6 * size + 1e-12)
 
 
@@ -150,7 +149,7 @@ def test_facets_are_optimal_and_solved_or_inaccurate(answer):
     given, solution, _ = answer
     allowed = {rj.SolverStatus.SOLVED, rj.SolverStatus.INACCURATE}
     assert set(solution.statuses) <= allowed
-    assert accepted_offsets(given, solution)[1].all()
+    assert judged_offsets(given, solution).optimal.all()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -170,7 +169,7 @@ def test_a_run_that_is_stopped_early_says_so_and_is_sound():
         solution = rj.InteriorPoint(max_iterations=limit).solve(given)
         assert set(solution.statuses) == {rj.SolverStatus.LIMIT}
         assert np.isfinite(solution.multipliers).all()
-        bounds, optimal = accepted_offsets(given, solution)
+        bounds, optimal, *_ = judged_offsets(given, solution)
         assert np.all(bounds >= best - 1e-9)
         assert np.all(bounds <= interval_offsets(given))
         assert not optimal.any()
@@ -200,7 +199,7 @@ def test_garbage_ends_with_finite_multipliers_and_a_status(kind):
     assert np.isfinite(solution.multipliers).all()
     assert np.all(solution.multipliers[:, ~given.products.free] >= 0)
     assert {rj.SolverStatus(int(code)).advice for code in solution.statuses}
-    assert np.isfinite(accepted_offsets(given, solution)[0]).all()
+    assert np.isfinite(judged_offsets(given, solution).value).all()
 
 
 @pytest.mark.parametrize("traced", [False, True])
@@ -227,7 +226,7 @@ def test_traced_and_plain_programs_get_the_same_answer(kind):
     np.testing.assert_array_equal(traced_bounds, bounds)
     np.testing.assert_array_equal(traced.moments, plain.moments)
     np.testing.assert_array_equal(traced.statuses, plain.statuses)
-    assert accepted_offsets(given, jax.device_get(traced))[1].all()
+    assert judged_offsets(given, jax.device_get(traced)).optimal.all()
 
 
 value = partial(planar_value, solver=SOLVER)
@@ -329,7 +328,7 @@ def least_log_volume(given, enclosure):
 def test_an_ellipsoid_is_the_smallest_of_its_relaxation(enclosed):
     given, enclosure = enclosed
     assert int(enclosure.status) == rj.SolverStatus.SOLVED
-    form, level, optimal = accepted_enclosure(given, enclosure)
+    form, level, optimal = judged_form(given, enclosure)
     assert optimal
     assert level == pytest.approx(1.0, abs=1e-6)
     size = -np.linalg.slogdet(form.A)[1]
@@ -351,7 +350,7 @@ def test_a_given_shape_gets_the_size_that_clarabel_gives_it(enclosed):
     shape = NormalForm(enclosure.form.A @ np.diag(np.linspace(1, 2, q)), 0.7 * enclosure.form.b)
     ours, theirs = (solver.enclose(given, shape) for solver in (SOLVER, rj.Clarabel()))
     assert int(ours.status) == rj.SolverStatus.SOLVED
-    assert accepted_enclosure(given, ours, shape)[2]
+    assert judged_form(given, ours, shape)[2]
     factor = np.sum(ours.form.A * shape.A) / np.sum(shape.A**2)
     np.testing.assert_allclose(ours.form.A, factor * shape.A, rtol=1e-9)
     np.testing.assert_allclose(ours.form.b, factor * shape.b, rtol=1e-9, atol=1e-12)
@@ -388,7 +387,7 @@ def test_ellipsoids_from_garbage_are_sound_or_blank(kind):
     assert np.isfinite(found.multipliers).all()
     assert np.all(found.multipliers[~given.products.free] >= 0)
     assert np.isfinite(found.form.A).all() == (found.status in ANSWERS)
-    assert np.isfinite(log_volume(*accepted_enclosure(given, found)[:2]))
+    assert np.isfinite(log_volume(*judged_form(given, found)[:2]))
 
 
 UNKNOWN = {
@@ -413,7 +412,7 @@ def test_a_path_that_is_lost_still_gives_an_ellipsoid(network):
     given = program(X=round_of, network=network, rows=np.eye(3), relaxation=relaxation)
     found, reference = SOLVER.enclose(given), rj.Clarabel().enclose(given)
     assert found.status in ANSWERS
-    sizes = [log_volume(*accepted_enclosure(given, each)[:2]) for each in (found, reference)]
+    sizes = [log_volume(*judged_form(given, each)[:2]) for each in (found, reference)]
     assert sizes[0] <= sizes[1] + 0.2
 
 

@@ -1,0 +1,159 @@
+"""Goals: what is sought of a program, from what a solver proposes to a proof with a derivative.
+
+A goal is the offset of each facet, the ellipsoid of least volume, or the least size of a given
+shape. What it proves is a number or a shape of the program's rows, and its derivative in them is
+found on the host: ordinary automatic differentiation carries it on through rows, bounds and earlier
+steps.
+
+**With an optimum.** Offsets and sizes are optimal values, so the envelope theorem gives their
+derivative: hold multipliers and moments fixed and differentiate the Lagrangian (`programs.lmi`).
+The ellipsoid of least volume is an optimal *point*: what is reported is the point on the central
+path nearby, which moves as the implicit function theorem says (`centring`). What the recheck adds
+to an optimum is not differentiated.
+
+**Without an optimum.** The derivative is that of the bound that is reported, whatever the status:
+where multipliers and moments do not bear out an optimum, of what the multipliers prove, these being
+held, and where they prove nothing of use, of the interval bound (`proofs.slopes`). It is NaN where
+there is no bound at all. What a solver proposes (multipliers, moments, its own offsets) has no
+derivative: asking for one gives NaN.
+
+**Accuracy.** The derivative is as good as the solver: with the default solvers, which go on to
+1e-9, the tests hold it to 1e-3 of fourth-order differences, over one step and over five. At 1e-6
+it was off by up to 3e-3, at 1e-4 by up to 7e-2 (of its norm). Flat sets and points keep these
+digits; of sets, and input ranges, of a width below some 1e-8 of their size the derivative in the
+width loses them.
+
+**Kinks.** Where a facet only touches, a neuron becomes stable, or an optimal point is not unique,
+an offset has a kink: the derivative is then one of its generalised gradients, and central
+differences see another. Second derivatives and forward mode do not exist; JAX raises an error.
+"""
+
+from __future__ import annotations
+
+import abc
+from functools import partial
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from reachjax.numerics.checks import is_concrete
+from reachjax.numerics.host import on_host, shapes_of
+from reachjax.numerics.pytrees import Replaceable
+from reachjax.programs.lmi import Program, Slopes
+from reachjax.programs.relaxations import LocalBounds, Products
+from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.reported import Judged
+from reachjax.sets import AbstractSet
+from reachjax.solvers.base import AbstractSolver
+from reachjax.solvers.rounds import Rounds
+
+
+class AbstractGoal(Replaceable, abc.ABC):
+    """What is sought of a program. A pytree; what gets a program gets numpy arrays, on the host."""
+
+    @abc.abstractmethod
+    def rows(self, states: int) -> Float[Array, "f n_x"]:
+        """The rows of the successor that the program is to have for an objective."""
+
+    @abc.abstractmethod
+    def unknown(self, program: Program) -> Judged:
+        """Nothing is proved: NaN."""
+
+    @abc.abstractmethod
+    def judged(self, program: Program, solver: AbstractSolver) -> Judged:
+        """What the solver proposes, and what that proves."""
+
+    @abc.abstractmethod
+    def in_rounds(
+        self, program: Program, solver: AbstractSolver, rounds: Rounds
+    ) -> tuple[Products, Judged]:
+        """The same with products added round by round, and these."""
+
+    @abc.abstractmethod
+    def slopes(self, program: Program, held: Any, cotangent: Any) -> tuple[Slopes, Self]:
+        """The derivative of `<cotangent, value>` in the program's rows, and in the goal.
+
+        Args:
+            program: the program.
+            held: what it rests on, as `judged` returned it.
+            cotangent: weights of the value.
+        """
+
+    @abc.abstractmethod
+    def region(self, value: Any) -> AbstractSet:
+        """The set that is proved."""
+
+    @abc.abstractmethod
+    def certificate(self, program: Program, value: Any, proposal: Any) -> AbstractCertificate:
+        """Its proof."""
+
+
+def proved(
+    goal: AbstractGoal, program: Program, solver: AbstractSolver, rounds: Rounds | None = None
+) -> tuple[Program, Any, Any]:
+    """What is proved of a goal, differentiable in the program's rows and in the goal.
+
+    Args:
+        goal: what is sought.
+        program: with the goal's rows for an objective, and the products to begin with.
+        solver: what proposes multipliers.
+        rounds: by which products are added; traced numbers have those of `LocalBounds` instead.
+
+    Returns:
+        The program with all its products, the value that is proved, and what was proposed.
+    """
+    fixed = jax.lax.stop_gradient((goal, program))
+    if rounds is not None and is_concrete(fixed):
+        sought, given = jax.device_get(fixed)
+        products, judged = jax.device_put(sought.in_rounds(given, solver, rounds))
+        program = program.replace(products=products)
+    else:
+        if rounds is not None:
+            program = program.replace(products=LocalBounds().products(rounds.layout))
+            fixed = jax.lax.stop_gradient((goal, program))
+        shapes = shapes_of(goal.unknown(program))
+        judged: Any = on_host(partial(_judged, solver), shapes, fixed)
+    rows = program.facts.mid, program.objective.mid
+    return program, *_enveloped(goal, *rows, program, judged)
+
+
+def _judged(solver: AbstractSolver, fixed: tuple[AbstractGoal, Program]) -> Judged:
+    goal, program = fixed
+    return goal.judged(program, solver)
+
+
+@jax.custom_vjp
+def _enveloped(goal, facts, objective, program, judged):
+    """What was proved, with its derivative in the goal and in midpoints of rows."""
+    return judged.value, judged.proposal
+
+
+def _forward(goal, facts, objective, program, judged):
+    return _enveloped(goal, facts, objective, program, judged), (goal, program, judged.held)
+
+
+def _backward(residual, cotangents):
+    goal, program, _ = residual
+    value, proposal = cotangents
+    rows = Slopes(program.facts.mid, program.objective.mid)
+    shapes = shapes_of((rows, goal))
+    found: Any = on_host(_slopes, shapes, (*residual, value))
+    asked = _asked_for(proposal)
+    (facts, objective), sought = jax.tree.map(lambda x: jnp.where(asked, jnp.nan, x), found)
+    return sought, facts, objective, None, None
+
+
+def _slopes(argument: tuple[AbstractGoal, Program, Any, Any]) -> tuple[Slopes, AbstractGoal]:
+    goal, program, held, cotangent = argument
+    return goal.slopes(program, held, cotangent)
+
+
+def _asked_for(proposal: Any) -> Bool[Array, ""]:
+    """Whether a derivative of what a solver proposes is asked for; there is none."""
+    parts = [part for part in jax.tree.leaves(proposal) if part.dtype == float]
+    return jnp.array([jnp.any(part != 0) for part in parts]).any()
+
+
+_enveloped.defvjp(_forward, _backward)

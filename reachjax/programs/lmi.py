@@ -54,7 +54,7 @@ class Program(Replaceable):
         """Which entries of the scaled basis vary, and the constant."""
         return self.transform.diagonal() > 0
 
-    def seeking(self, rows: slice | np.ndarray) -> Program:
+    def with_objective(self, rows: slice | np.ndarray) -> Program:
         """The same program with some of the objective's rows."""
         return self.replace(objective=self.objective[rows])
 

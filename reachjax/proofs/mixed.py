@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -17,7 +16,15 @@ from reachjax.proofs.ellipsoids import EllipsoidCertificate
 from reachjax.proofs.facets import Certificate
 from reachjax.sets import NormalForm
 
-STACKED = [field.name for field in dataclasses.fields(AbstractCertificate)[1:]]
+STACKED = (
+    "multipliers",
+    "moments",
+    "codes",
+    "bounds",
+    "witnesses",
+    "witness_states",
+    "seconds",
+)
 """What both parts have, one row for each semidefinite program; they share the rest, the program."""
 
 
@@ -69,7 +76,7 @@ class MixedCertificate(AbstractCertificate):
         m = len(self.solver_offsets)
         first, second = (
             {
-                "program": self.program.seeking(rows),
+                "program": self.program.with_objective(rows),
                 **{name: getattr(self, name)[rows] for name in STACKED},
             }
             for rows in (slice(m), slice(m, None))

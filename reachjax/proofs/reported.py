@@ -78,7 +78,9 @@ def judged_offsets(program: Program, solution: Solution) -> Judged:
     optimal = np.isin(solution.statuses, ANSWERS) & borne_out
     slope, moments = clipped(program, multipliers), np.array(solution.moments)
     held, used = np.flatnonzero(~borne_out), by_multipliers < by_intervals
-    slope[held], moments[held] = held_offsets(program.seeking(held), multipliers[held], used[held])
+    slope[held], moments[held] = held_offsets(
+        program.with_objective(held), multipliers[held], used[held]
+    )
     value = np.where(optimal, np.fmax(offsets, claims), offsets)
     return Judged(value, optimal, Held(slope, moments), solution)
 

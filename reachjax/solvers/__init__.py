@@ -2,11 +2,11 @@
 
 from reachjax.solvers.auto import Auto
 from reachjax.solvers.base import AbstractSolver
+from reachjax.solvers.cvxpy_solvers import SCS, Clarabel, CvxpySolver
 from reachjax.solvers.ellipsoids import GivenShape, LeastVolume
 from reachjax.solvers.facets import Facets
 from reachjax.solvers.goals import AbstractGoal, proved
 from reachjax.solvers.interior_point import InteriorPoint
-from reachjax.solvers.named import SCS, Clarabel, CvxpySolver
 from reachjax.solvers.rounds import Rounds
 
 __all__ = [

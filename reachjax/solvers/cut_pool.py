@@ -45,7 +45,7 @@ class CutPool:
         self.layout = layout
 
     @cached_property
-    def promised(self) -> Bool[np.ndarray, "m m"]:
+    def of_local_bounds(self) -> Bool[np.ndarray, "m m"]:
         """What `LocalBounds` has beyond the products to begin with."""
         groups, _ = LocalBounds(repeated=False).groups(self.layout)
         pairs = np.array(list(itertools.chain(*groups)), dtype=int).reshape(-1, 2)
@@ -68,7 +68,7 @@ class CutPool:
 
     def missing(self, pairs: Int[np.ndarray, "p 2"]) -> Int[np.ndarray, "q 2"]:
         """What `LocalBounds` has beyond these and the products to begin with."""
-        return self.live[np.argwhere(self._besides(pairs, self.promised))]
+        return self.live[np.argwhere(self._besides(pairs, self.of_local_bounds))]
 
     def _besides(
         self, pairs: Int[np.ndarray, "p 2"], entries: Bool[np.ndarray, "m m"]
@@ -82,7 +82,7 @@ class CutPool:
         self, moment: Float[np.ndarray, "n n"], pairs: Int[np.ndarray, "p 2"], batch: int | None
     ) -> Int[np.ndarray, "q 2"]:
         """The most violated pairs that are not there yet; None for all that `LocalBounds` has."""
-        allowed = self._besides(pairs, self.promised if batch is None else self.open)
+        allowed = self._besides(pairs, self.of_local_bounds if batch is None else self.open)
         X = moment[np.ix_(self.columns, self.columns)]
         values = np.where(allowed, self.rows @ X @ self.rows.T, 0.0)
         count = int((values < -VIOLATED).sum())

@@ -51,8 +51,8 @@ class _Held(NamedTuple):
 
     value: Sized
     optimal: Bool[np.ndarray, ""]
-    multipliers: Float[Array | np.ndarray, " K"]
-    moments: Float[Array | np.ndarray, "n+q n+q"]
+    multipliers: Float[np.ndarray, " K"]
+    moments: Float[np.ndarray, "n+q n+q"]
     frame: NormalForm
 
 
@@ -181,7 +181,7 @@ class GivenShape(_AbstractEllipsoid):
         enclosure = enclosure._replace(form=proposed)
         form, level, optimal = judged_form(program, enclosure, given)
         optimal &= largest_factor(program, enclosure) <= 1 + SHORTFALL  # the moments bear it out
-        factor = np.where(form is proposed, factor, 1.0)
+        factor = np.where(np.array_equal(form.A, proposed.A), factor, 1.0)
         return _judged(Sized(given, level, factor), optimal, enclosure, frame)
 
     def slopes(self, program: Program, held: _Held, cotangent: Sized) -> tuple[Slopes, Self]:
@@ -208,7 +208,8 @@ def _identity(q: int) -> NormalForm:
 
 
 def _judged(value: Sized, optimal: np.ndarray, enclosure: Enclosure, frame: NormalForm) -> Judged:
-    held = _Held(value, optimal, enclosure.multipliers, enclosure.moments, frame)
+    proposed = np.asarray(enclosure.multipliers), np.asarray(enclosure.moments)
+    held = _Held(value, optimal, *proposed, frame)
     return Judged(value, optimal, held, enclosure)
 
 

@@ -60,9 +60,9 @@ class Facets(AbstractGoal):
     ) -> tuple[Products, Judged]:
         """Each facet has its own products, and begins with those that the one before used."""
         pool = CutPool(program, rounds.layout)
-        found, used = [], pool.addable(rounds.offered)
+        found, used = [], pool.addable(rounds.warm_start)
         for facet in range(len(program.objective.mid)):
-            one = program.seeking(slice(facet, facet + 1))
+            one = program.with_objective(slice(facet, facet + 1))
             attained = None if rounds.witness is None else partial(rounds.witness, facet)
             found.append(_facet(one, pool, solver, rounds.cuts, attained, used))
             used = found[-1].in_use

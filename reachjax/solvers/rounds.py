@@ -33,13 +33,13 @@ class Rounds(NamedTuple):
         layout: of the program's facts.
         cuts: how many rounds, and of how many products.
         witness: what simulations attain of a facet; rounds do not stop for them if it is None.
-        offered: products that the first facet begins with, those that may be added.
+        warm_start: products that the first facet begins with, those that may be added.
     """
 
     layout: FactLayout
     cuts: CuttingPlanes
     witness: Witness | None = None
-    offered: Int[np.ndarray, "p 2"] = NONE
+    warm_start: Int[np.ndarray, "p 2"] = NONE
 
 
 class Shown(NamedTuple):

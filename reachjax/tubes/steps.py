@@ -130,7 +130,7 @@ class Step:
         return first_inputs(rows, *row_ranges(self.X, rows.mid[:, :-1]), self.box)
 
     @property
-    def offered(self) -> Int[np.ndarray, "p 2"]:
+    def warm_start(self) -> Int[np.ndarray, "p 2"]:
         """Products that prove the set of states, where this window begins with the same facts."""
         grown = bool(self.before) and len(self.window) == len(self.before[-1].window) + 1
         return self.proof.products_in_use if grown and self.proof is not None else NONE

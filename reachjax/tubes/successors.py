@@ -53,7 +53,7 @@ def successors(step: Step, template: AbstractTemplate) -> tuple[AbstractSet, Abs
     goals = goals_of(template, step)
     rows = [goal.rows(step.setting.loop.states) for goal in goals]
     program = _finite(step, step.program(jnp.concatenate(rows)))
-    programs = (program.seeking(where) for where in _slices(rows))
+    programs = (program.with_objective(where) for where in _slices(rows))
     parts = [_proved(step, goal, each) for goal, each in zip(goals, programs, strict=True)]
     return _together(program, parts)
 
@@ -66,7 +66,7 @@ def _proved(
     if cuts is not None:
         if step.setting.simulations is not None:
             witness = partial(step.attained, goal.rows(step.setting.loop.states))
-        rounds = Rounds(step.window.layout, cuts, witness, step.offered)
+        rounds = Rounds(step.window.layout, cuts, witness, step.warm_start)
     program, value, proposal = proved(goal, program, step.setting.solver, rounds)
     region = goal.region(_finite(step, value))
     return region, goal.certificate(program, value, proposal)

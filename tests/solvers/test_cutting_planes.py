@@ -9,8 +9,8 @@ import pytest
 
 import reachjax as rj
 from reachjax.programs.windows import Window
+from reachjax.solvers import Facets, Rounds
 from reachjax.solvers.cut_pool import CutPool, joint
-from reachjax.solvers.rounds import solved_in_rounds
 from tests.loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, saturating_network, simplex_region, simulate
 
@@ -141,12 +141,13 @@ def test_products_found_once_are_not_sought_again():
     window = Window.beginning(loop, X0, X0, 0, CUTS).extended(loop, X0, X0)
     directions = rj.Template.octagonal(2).directions
     program, solver = jax.device_get(window.program(directions, CUTS)), Counting()
-    first = solved_in_rounds(program, window.layout, solver, CUTS)
+    goal = Facets(program.objective.mid)
+    products, first = goal.in_rounds(program, solver, Rounds(window.layout, CUTS))
     rounds = len(solver.solved)
-    offered = np.stack([first.products.left, first.products.right], axis=1)
-    again = solved_in_rounds(program, window.layout, solver, CUTS, offered=offered)
+    warm_start = np.stack([products.left, products.right], axis=1)
+    _, again = goal.in_rounds(program, solver, Rounds(window.layout, CUTS, warm_start=warm_start))
     assert len(solver.solved) - rounds < rounds
-    np.testing.assert_allclose(again.judged.offsets, first.judged.offsets, atol=1e-5)
+    np.testing.assert_allclose(again.value, first.value, atol=1e-5)
 
 
 def test_violated_products_are_those_of_negative_moments():

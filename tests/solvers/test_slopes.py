@@ -93,7 +93,7 @@ def test_where_the_ball_alone_bounds_a_direction_the_derivative_holds_too():
     facts[held.products.left[pair], 0] = facts[held.products.right[pair], 0] = 1.0  # eta_0^2
     objective = np.zeros((1, n))
     objective[0, [1, -1]] = 0.1, 1.0
-    bare = held.seeking(slice(1)).replace(
+    bare = held.with_objective(slice(1)).replace(
         facts=type(held.facts)(facts, 0 * facts),
         objective=type(held.facts)(objective, 0 * objective),
     )

@@ -45,7 +45,7 @@ class _Held(NamedTuple):
         value: what is proved.
         optimal: whether it is the relaxation's optimum.
         multipliers: `(K,)`.
-        moments: `(n + q, n + q)`.
+        moments: `(n + q, n + q)`, zero where it is not.
         frame: the coordinates of the successor in which it was centred.
     """
 
@@ -208,8 +208,8 @@ def _identity(q: int) -> NormalForm:
 
 
 def _judged(value: Sized, optimal: np.ndarray, enclosure: Enclosure, frame: NormalForm) -> Judged:
-    proposed = np.asarray(enclosure.multipliers), np.asarray(enclosure.moments)
-    held = _Held(value, optimal, *proposed, frame)
+    moments = np.where(optimal, enclosure.moments, 0.0)
+    held = _Held(value, optimal, np.asarray(enclosure.multipliers), moments, frame)
     return Judged(value, optimal, held, enclosure)
 
 
@@ -240,8 +240,6 @@ def _of_level(program: Program, held: _Held, cotangent: Sized) -> Slopes:
     centre of the box is held.
     """
     form, objective = held.value.form, program.objective.mid
-    if not all_finite((program, held.value, held.multipliers)):
-        return Slopes(np.full_like(program.facts.mid, np.nan), np.full_like(objective, np.nan))
     multipliers, moments = held_level(program, held.multipliers, form)
     rows, moved = schur_slopes(program, multipliers, form, moments)
     A, b = (own + cotangent.level * part for own, part in zip(cotangent.form, moved, strict=True))

@@ -36,10 +36,11 @@ from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.numerics.checks import is_concrete
-from reachjax.numerics.host import on_host, shapes_of
+from reachjax.numerics.host import all_finite, on_host, shapes_of
 from reachjax.numerics.pytrees import Replaceable
 from reachjax.programs.lmi import Program, Slopes
 from reachjax.programs.relaxations import LocalBounds, Products
@@ -147,6 +148,9 @@ def _backward(residual, cotangents):
 
 def _slopes(argument: tuple[AbstractGoal, Program, Any, Any]) -> tuple[Slopes, AbstractGoal]:
     goal, program, held, cotangent = argument
+    if not all_finite((goal, program, held)):
+        rows = Slopes(program.facts.mid, program.objective.mid)
+        return jax.tree.map(lambda leaf: np.full_like(leaf, np.nan), (rows, goal))
     return goal.slopes(program, held, cotangent)
 
 

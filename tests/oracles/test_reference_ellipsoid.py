@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import closed_loop, random_loop, recursion
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.networks import LoopData, plant, simulate
 from tests.oracles.reference_ellipsoid import paper_ellipsoid_step
 

@@ -11,7 +11,7 @@ import reachjax as rj
 from reachjax.programs.windows import Window
 from reachjax.solvers.cut_pool import CutPool, joint
 from reachjax.solvers.rounds import solved_in_rounds
-from tests.loops import closed_loop, random_loop
+from tests.closed_loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, saturating_network, simplex_region, simulate
 
 CUTS = rj.CuttingPlanes()

@@ -13,8 +13,8 @@ from reachjax.programs.lmi import lagrangian
 from reachjax.programs.windows import step_program
 from reachjax.sets.geometry import bounding_box
 from reachjax.solvers import proved_offsets
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.differences import along, error_in_all_parts, norm, relative_error
-from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import box_region, simplex_region
 
 TEMPLATE = rj.Template.octagonal(2)

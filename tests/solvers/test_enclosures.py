@@ -11,8 +11,8 @@ from reachjax.proofs.proposal import Enclosure
 from reachjax.proofs.recheck import sound_level
 from reachjax.proofs.reported import accepted_enclosure
 from reachjax.sets import NormalForm
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.differences import error_in_all_parts
-from tests.loops import closed_loop, random_loop, recursion
 
 
 def ellipsoid(n, seed, size=0.3):

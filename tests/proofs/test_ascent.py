@@ -8,7 +8,7 @@ import pytest
 import reachjax as rj
 from reachjax.proofs.ascent import ascended
 from reachjax.proofs.witnesses import Simulations
-from tests.loops import autonomous, closed_loop, initial_set, random_loop
+from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
 from tests.networks import plant, simulate
 
 HORIZON, STARTS = 2, 6

@@ -12,7 +12,7 @@ import pytest
 from flax import nnx
 
 import reachjax as rj
-from tests.loops import closed_loop, random_loop, recursion
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.networks import box_region
 
 TEMPLATE = rj.Template.octagonal(2)

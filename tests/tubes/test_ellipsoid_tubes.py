@@ -13,8 +13,8 @@ from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import ANSWERS, Enclosure
 from reachjax.sets import NormalForm
 from reachjax.solvers import enclosures
+from tests.closed_loops import closed_loop, one_step, random_loop, recursion
 from tests.differences import error_in_all_parts
-from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import box_region, simplex_region
 from tests.solvers.test_enclosures import case, ellipsoid, final
 

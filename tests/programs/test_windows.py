@@ -10,7 +10,7 @@ import pytest
 import reachjax as rj
 from reachjax.programs.windows import COLUMNS, Window
 from reachjax.sets.geometry import bounding_box
-from tests.loops import closed_loop, initial_set, random_loop
+from tests.closed_loops import closed_loop, initial_set, random_loop
 from tests.networks import box_region, simulate
 
 HORIZON = 3

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.closed_loops import one_step, recursion
 from tests.differences import error_in_all_parts
-from tests.loops import one_step, recursion
 from tests.networks import box_region, simplex_region
 from tests.sets.test_intersection import intersection
 from tests.solvers.test_enclosures import PROMISED, case
-from tests.test_ellipsoid_tubes import holds
+from tests.tubes.test_ellipsoid_tubes import holds
 
 FACETS = {1: rj.Template.box(1), 2: rj.Template.octagonal(2), 3: rj.Template.box(3)}
 

@@ -10,7 +10,7 @@ from reachjax.programs.bounds import loop_bounds, successor_box
 from reachjax.programs.preactivations import bounds_over, known_inputs, rounded
 from reachjax.programs.windows import Window
 from reachjax.tubes.steps import Setting, Step
-from tests.loops import closed_loop, random_loop
+from tests.closed_loops import closed_loop, random_loop
 from tests.networks import (
     affine_network,
     box_region,

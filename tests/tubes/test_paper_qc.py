@@ -13,7 +13,7 @@ import pytest
 
 import reachjax as rj
 from experiments.benchmark.reference import paper_E_in, paper_E_mid, paper_E_out, paper_step
-from tests.loops import recursion
+from tests.closed_loops import recursion
 from tests.networks import (
     LoopData,
     Region,

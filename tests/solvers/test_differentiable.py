@@ -332,7 +332,11 @@ def test_what_a_solver_proposes_has_no_derivative():
     assert all(np.isnan(leaf).any() for leaf in jax.tree.leaves(jax.grad(claimed)(loop).controller))
 
 
-@pytest.mark.parametrize("relaxation", [rj.LocalBounds(), rj.CuttingPlanes()], ids=str)
+@pytest.mark.parametrize(
+    "relaxation",
+    [rj.LocalBounds(), pytest.param(rj.CuttingPlanes(), marks=pytest.mark.long)],
+    ids=str,
+)
 def test_the_gradient_of_an_interval_bound_is_the_central_difference(monkeypatch, relaxation):
     import cvxpy as cp
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import closed_loop, random_loop, recursion
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.networks import LoopData, plant, simulate
 from tests.oracles.reference_ellipsoid import paper_ellipsoid_step
 
@@ -37,7 +37,12 @@ def ellipsoid(n):
 
 @pytest.mark.parametrize(
     ("n_x", "boxed", "repeated", "seed"),
-    [(1, True, True, 0), (2, False, True, 1), (2, True, False, 3), (3, True, True, 4)],
+    [
+        pytest.param(1, True, True, 0, marks=pytest.mark.long),
+        (2, False, True, 1),
+        (2, True, False, 3),
+        (3, True, True, 4),
+    ],
 )
 def test_volumes_of_three_steps_are_those_of_the_paper(n_x, boxed, repeated, seed):
     data = random_loop(n_x, (5, 3), seed=seed, boxed=boxed)

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 
 import reachjax as rj
 from reachjax.sets import fit
-from tests.loops import autonomous, closed_loop, random_loop
+from tests.closed_loops import autonomous, closed_loop, random_loop
 from tests.networks import box_region, simulate
 
 HORIZON = 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import closed_loop, random_loop, recursion
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.networks import box_region, directions, simulate
 
 pytestmark = pytest.mark.skipif(

@@ -11,7 +11,7 @@ from reachjax.programs.windows import step_program
 from reachjax.proofs.recheck import interval_offsets
 from reachjax.proofs.reported import judged_offsets
 from reachjax.solvers.conic import STATUSES
-from tests.loops import closed_loop, one_step, random_loop
+from tests.closed_loops import closed_loop, one_step, random_loop
 from tests.networks import box_region, directions, simulate
 
 SOLVERS = {

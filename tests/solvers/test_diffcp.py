@@ -16,7 +16,7 @@ import scipy.sparse as sp
 
 import reachjax as rj
 from experiments.benchmark.reference import paper_lmi
-from tests.loops import closed_loop, random_loop, recursion
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.networks import box_region
 
 H = 1e-4

@@ -13,8 +13,8 @@ from reachjax.programs.lmi import lagrangian_slopes
 from reachjax.programs.windows import step_program
 from reachjax.sets.geometry import bounding_box
 from reachjax.solvers import Facets, proved
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.differences import along, error_in_all_parts, norm, relative_error
-from tests.loops import closed_loop, random_loop, recursion
 from tests.networks import box_region, simplex_region
 
 TEMPLATE = rj.Template.octagonal(2)
@@ -342,7 +342,11 @@ def test_what_a_solver_proposes_has_no_derivative():
     assert all(np.isnan(leaf).any() for leaf in jax.tree.leaves(jax.grad(claimed)(loop).controller))
 
 
-@pytest.mark.parametrize("relaxation", [rj.LocalBounds(), rj.CuttingPlanes()], ids=str)
+@pytest.mark.parametrize(
+    "relaxation",
+    [rj.LocalBounds(), pytest.param(rj.CuttingPlanes(), marks=pytest.mark.long)],
+    ids=str,
+)
 def test_the_gradient_of_an_interval_bound_is_the_central_difference(monkeypatch, relaxation):
     import cvxpy as cp
 

@@ -11,8 +11,8 @@ from reachjax.proofs.proposal import Enclosure
 from reachjax.proofs.recheck import sound_level
 from reachjax.proofs.reported import judged_form
 from reachjax.sets import NormalForm
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.differences import error_in_all_parts
-from tests.loops import closed_loop, random_loop, recursion
 
 
 def ellipsoid(n, seed, size=0.3):
@@ -115,11 +115,12 @@ def final(template, horizon, solver=rj.Auto(), relaxation=rj.LocalBounds()):  # 
 # values.
 STEP, PROMISED = 1e-5, 1e-3
 TEMPLATES = ("minimum volume", "given shape")
-SHORT = [
-    *((n, 1, 0, template) for n in (1, 2, 3) for template in TEMPLATES),
-    (2, 3, 0, "minimum volume"),
+SHORT = [*((3, 1, 0, template) for template in TEMPLATES), (2, 3, 0, "minimum volume")]
+LONG = [
+    *((n, 1, 0, template) for n in (1, 2) for template in TEMPLATES),
+    (2, 3, 0, "given shape"),
+    *((2, 10, 1, template) for template in TEMPLATES),
 ]
-LONG = [(2, 3, 0, "given shape"), *((2, 10, 1, template) for template in TEMPLATES)]
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ from reachjax.proofs.reported import judged_form, judged_offsets, log_volume
 from reachjax.sets import NormalForm
 from reachjax.solvers import barrier, centring
 from reachjax.solvers.barrier import EllipsoidBarrier
+from tests.closed_loops import closed_loop, one_step, random_loop, recursion
 from tests.differences import dot, error_in_all_parts
-from tests.loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import (
     affine_network,
     box_region,

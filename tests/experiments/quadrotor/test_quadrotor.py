@@ -37,7 +37,7 @@ from experiments.quadrotor.model import (
 )
 from experiments.quadrotor.mpc import QuadrotorMPC
 from experiments.quadrotor.study import Settings, certify, closed_loop, learn, main
-from tests.loops import recursion
+from tests.closed_loops import recursion
 from tests.oracles.reference_local_bounds import local_bounds_ellipsoid_step
 
 G = 9.81

@@ -14,7 +14,7 @@ from scipy.optimize import OptimizeResult
 import reachjax as rj
 from experiments.tightness import exact
 from experiments.tightness.exact import SHARP, exact_maxima, exact_maximum
-from tests.loops import closed_loop, random_loop, recursion
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.networks import (
     LoopData,
     box_region,

@@ -7,7 +7,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.tubes.requirements import Compared, Requirement
-from tests.loops import recursion
+from tests.closed_loops import recursion
 
 
 def tube(rate=0.5, n=2):

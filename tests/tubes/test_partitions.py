@@ -10,7 +10,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.tubes.cells import grid, halves
-from tests.loops import autonomous, closed_loop, random_loop, recursion
+from tests.closed_loops import autonomous, closed_loop, random_loop, recursion
 
 RECURSION = {"relaxation": rj.LocalBounds(), "window": 1}
 DIAMOND = rj.Polytope([[1, 1], [1, -1], [-1, 1], [-1, -1]], [1, 1, 1, 1])

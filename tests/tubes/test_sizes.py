@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import recursion
+from tests.closed_loops import recursion
 from tests.networks import simplex_region
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import autonomous, recursion
+from tests.closed_loops import autonomous, recursion
 from tests.networks import he_network
 
 

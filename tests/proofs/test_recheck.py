@@ -9,7 +9,7 @@ from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import weighted_products
 from reachjax.programs.windows import step_program
 from reachjax.proofs.recheck import interval_offsets, sound_offsets
-from tests.loops import closed_loop, random_loop
+from tests.closed_loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, directions, he_network, simulate
 
 STATES = [1, 2, 3, 6]
@@ -155,7 +155,7 @@ def test_rounding_errors_of_the_rows_are_paid_for(case):
     assert np.all(sound_offsets(rough, solution.multipliers) >= plain + 1e-6)
 
 
-@pytest.mark.parametrize("n_x", [1, 2, 3])
+@pytest.mark.parametrize("n_x", [1, pytest.param(2, marks=pytest.mark.long), 3])
 def test_degenerate_sets_and_networks_stay_sound(n_x):
     """A single point, a set flat in one coordinate, dead neurons, a network that is zero."""
     point, wide = np.linspace(-0.2, 0.3, n_x), np.full(n_x, 0.5)

@@ -12,7 +12,7 @@ import pytest
 from flax import nnx
 
 import reachjax as rj
-from tests.loops import closed_loop, random_loop, recursion
+from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.networks import box_region
 
 TEMPLATE = rj.Template.octagonal(2)
@@ -232,15 +232,12 @@ def test_a_limit_that_is_none_is_named(limit, error):
         rj.skip_failures(optax.sgd(0.1), limit=limit)
 
 
-@pytest.mark.parametrize(
-    ("factor", "skipped"), [(np.nan, 1), (np.inf, 1), (1e200, 1), (1e12, 0), (1e4, 0)]
-)
-def test_weights_that_went_astray_are_skipped_where_they_have_no_bound(case, factor, skipped):
-    """Without an input box, sets that are not numbers have none; those that are large have."""
+@pytest.fixture(scope="module")
+def unboxed(case):
+    """A network, an optimiser that skips failures, and its compiled step, without an input box."""
     loop, X0 = case
     loop = loop.replace(input_box=None)
     optimizer = rj.skip_failures(optax.sgd(1e-2))
-    net = jax.tree.map(lambda w: factor * w, loop.controller)
 
     @jax.jit
     def advance(net, state):
@@ -252,6 +249,16 @@ def test_weights_that_went_astray_are_skipped_where_they_have_no_bound(case, fac
         updates, state = optimizer.update(gradient, state)
         return optax.apply_updates(net, updates), state
 
+    return loop.controller, optimizer, advance
+
+
+@pytest.mark.parametrize(
+    ("factor", "skipped"), [(np.nan, 1), (np.inf, 1), (1e200, 1), (1e12, 0), (1e4, 0)]
+)
+def test_weights_that_went_astray_are_skipped_where_they_have_no_bound(unboxed, factor, skipped):
+    """Without an input box, sets that are not numbers have none; those that are large have."""
+    controller, optimizer, advance = unboxed
+    net = jax.tree.map(lambda w: factor * w, controller)
     after, state = advance(net, optimizer.init(net))
     assert rj.failures(state) == skipped
     moved = [np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (after, net)), strict=True)]

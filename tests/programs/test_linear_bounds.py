@@ -10,7 +10,8 @@ from reachjax.programs.bounds import loop_bounds, successor_box
 from reachjax.programs.preactivations import bounds_over, known_inputs, rounded
 from reachjax.programs.windows import Window
 from reachjax.tubes.steps import Setting, Step
-from tests.loops import closed_loop, random_loop
+from tests.cases import some
+from tests.closed_loops import closed_loop, random_loop
 from tests.networks import (
     affine_network,
     box_region,
@@ -27,6 +28,14 @@ SETS = [
     *(("ellipsoid", n_x) for n_x in (1, 2, 6)),
     ("intersection", 3),
 ]
+QUICK = {"box": (1, 6), "polytope": (2, 3), "flat": (1, 3), "point": (2, 6), "ellipsoid": (2, 6)}
+
+
+def quick(kind, n_x):
+    """Whether the test command has it: every kind, and every dimension."""
+    return kind not in QUICK or n_x in QUICK[kind]
+
+
 THIN = ("flat", "point")
 ROUNDING = 1e-14
 """Of what is simulated with numpy, as a part of the largest number it is a sum of."""
@@ -87,7 +96,7 @@ def check_sound(data, X, t=0):
     assert np.all(inputs >= bounds.lower - size)
 
 
-@pytest.mark.parametrize(("kind", "n_x"), SETS)
+@pytest.mark.parametrize(("kind", "n_x"), some(SETS, quick))
 def test_no_sampled_input_of_a_unit_is_beyond_its_bounds(kind, n_x):
     for seed, network in enumerate(NETWORKS):
         check_sound(random_loop(n_x, seed=seed, network=network), initial(kind, n_x, seed))
@@ -105,7 +114,7 @@ def test_a_time_varying_loop_has_the_bounds_of_its_time(t):
     assert np.all(bounds[0].upper[-4:] != bounds[1].upper[-4:])
 
 
-@pytest.mark.parametrize(("kind", "n_x"), SETS)
+@pytest.mark.parametrize(("kind", "n_x"), some(SETS, quick))
 def test_no_bound_is_looser_than_that_by_intervals(kind, n_x):
     for seed in range(3):
         loop, X = closed_loop(random_loop(n_x, seed=seed)), initial(kind, n_x, seed)
@@ -117,7 +126,9 @@ def test_no_bound_is_looser_than_that_by_intervals(kind, n_x):
         assert np.all(bounds.lower >= plain.lower - size)
 
 
-@pytest.mark.parametrize(("kind", "n_x"), [case for case in SETS if case[0] not in THIN])
+@pytest.mark.parametrize(
+    ("kind", "n_x"), some((case for case in SETS if case[0] not in THIN), quick)
+)
 def test_some_bounds_are_much_tighter_than_those_by_intervals(kind, n_x):
     data, X = random_loop(n_x, seed=1), initial(kind, n_x, seed=1)
     bounds = linear_bounds(closed_loop(data), X)

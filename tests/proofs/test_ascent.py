@@ -1,5 +1,7 @@
 """Ascents stay in the set, never lose, and find the maximum where it is known."""
 
+from itertools import product
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,8 @@ import pytest
 import reachjax as rj
 from reachjax.proofs.ascent import ascended
 from reachjax.proofs.witnesses import Simulations
-from tests.loops import autonomous, closed_loop, initial_set, random_loop
+from tests.cases import some
+from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
 from tests.networks import plant, simulate
 
 HORIZON, STARTS = 2, 6
@@ -36,8 +39,13 @@ def climbed(loop, X, k=HORIZON, starts=None, horizon=HORIZON, start=0):
     return begin, np.asarray(end), values(begin), values(end)
 
 
-@pytest.mark.parametrize("kind", SETS)
-@pytest.mark.parametrize("n_x", DIMENSIONS)
+# every kind of set in two dimensions
+@pytest.mark.parametrize(
+    ("n_x", "kind"),
+    some(
+        product(DIMENSIONS, SETS), lambda n_x, kind: (n_x in (1, 3)) == bool(SETS.index(kind) % 2)
+    ),
+)
 def test_an_ascent_never_leaves_the_set_and_never_loses(n_x, kind):
     loop = closed_loop(random_loop(n_x, seed=1))
     for seed in range(2):

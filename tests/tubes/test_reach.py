@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import closed_loop, one_step, random_loop, recursion
+from tests.closed_loops import closed_loop, one_step, random_loop, recursion
 from tests.networks import box_region, he_network, simplex_region, simulate
 
 RELAXATIONS = [rj.PaperQC(repeated=False), rj.PaperQC(), rj.LocalBounds()]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.loops import recursion
+from tests.closed_loops import recursion
 from tests.networks import he_network
-from tests.test_checks import aligned
+from tests.numerics.test_checks import aligned
 
 NET = rj.MLP.from_layers(he_network((2, 3, 1), seed=0))
 LOOP = rj.ClosedLoop(rj.AffinePlant(0.5 * np.eye(2), 0.1 * np.ones((2, 1))), NET)

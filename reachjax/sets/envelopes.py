@@ -1,4 +1,4 @@
-"""Supports, separations and volumes of polytopes, with their derivatives.
+"""Supports, boxes, separations and volumes of polytopes `A x <= b`, with their derivatives.
 
 All are optimal values of linear programs, or volumes, found in numpy on the host together with
 their slopes: hold the multipliers `y` and the optimal point `x` fixed and differentiate the
@@ -23,90 +23,42 @@ from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import is_concrete, require_double_precision
 from reachjax.numerics.host import all_finite, on_host
-from reachjax.numerics.rounding import exponents, shifted
-from reachjax.numerics.rounding import lengths as row_lengths
-from reachjax.sets import (
-    AbstractSet,
-    Box,
-    Intersection,
-    PolyhedralSet,
-    Polytope,
-    hulls,
-    polyhedra,
-)
-from reachjax.sets.balance import balanced, lengths
+from reachjax.sets import hulls, polyhedra
+from reachjax.sets.balance import lengths
+from reachjax.sets.separation import separation_and_multipliers
 
 Slopes = tuple[np.ndarray, ...]
 Values = Callable[..., tuple[np.ndarray, Slopes]]
 """From arrays to values `(k,)` and, for each array, their derivatives `(k, *shape)`."""
 
-
-def bounding_box(X: AbstractSet) -> Box:
-    """The set's bounding box; differentiable, also inside `jax.jit`."""
-    if isinstance(X, Intersection):
-        return X.boxed(bounding_box(X.polytope))
-    if not isinstance(X, Polytope):
-        return X.bounding_box()
-    ends = _values(_box, 2 * X.dimension, X.A, X.b)
-    return Box(-ends[: X.dimension], ends[X.dimension :])
+Normals = Float[Array, "m n"]
+Offsets = Float[Array, " m"]
 
 
-def support(X: AbstractSet, directions: Float[Array, "m n"]) -> Float[Array, " m"]:
-    """The set's support function, rounded up; differentiable, also inside `jax.jit`."""
-    if isinstance(X, Intersection):
-        return jnp.minimum(*(support(part, directions) for part in X.parts))
-    if not isinstance(X, Polytope):
-        return X.support(directions)
-    return _values(_support, len(directions), X.A, X.b, directions)
+def bounding_box(A: Normals, b: Offsets) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Lower and upper bounds of each coordinate, rounded outwards."""
+    ends, n = _values(_box, 2 * A.shape[1], A, b), A.shape[1]
+    return -ends[:n], ends[n:]
 
 
-def row_ranges(
-    X: Polytope, rows: Float[Array, "m n"]
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Least and largest values of rows, rounded outward; differentiable, also inside `jax.jit`."""
-    ends = _values(_support, 2 * len(rows), X.A, X.b, jnp.concatenate([-rows, rows]))
-    return -ends[: len(rows)], jnp.maximum(-ends[: len(rows)], ends[len(rows) :])
+def support(A: Normals, b: Offsets, directions: Float[Array, "k n"]) -> Float[Array, " k"]:
+    """The largest value of each direction, rounded up."""
+    return _values(_support, len(directions), A, b, directions)
 
 
-def separation(X: AbstractSet, Y: PolyhedralSet) -> Float[Array, ""]:
-    """How far the facets of `Y` may move outward before it meets `X`; negative if they overlap.
-
-    A lower bound, rounding included; differentiable, also inside `jax.jit`. `X` is bounded. If it
-    is round, the bound is the best that one facet of `Y` gives, or the bounding box of `X`; of an
-    intersection, the better one of its two parts'.
-    """
-    if isinstance(X, Intersection):
-        return jnp.maximum(*(separation(part, Y) for part in X.parts))
-    if not isinstance(X, PolyhedralSet):
-        C, d, norms = facets_in_units(Y)
-        facet = jnp.max((-X.support(-C) - d) / norms)
-        return jnp.maximum(facet, separation(X.bounding_box(), Y))
-    return _values(_separation, 1, *X.facets, *Y.facets)[0]
+def separation(A: Normals, b: Offsets, C: Normals, d: Offsets) -> Float[Array, ""]:
+    """How far the facets of `C x <= d` may move outward before it meets `A x <= b`, or less."""
+    return _values(_separation, 1, A, b, C, d)[0]
 
 
-def facets_in_units(
-    Y: PolyhedralSet, inner: bool = False
-) -> tuple[Float[Array, "m n"], Float[Array, " m"], Float[Array, " m"]]:
-    """Facets `C x <= d` whose largest coefficients are in `[1, 2)`, and their norms.
-
-    Of numbers, the set is exactly the same, or where offsets cannot be, larger; or smaller, if
-    `inner`. Signs of what is computed from them then are right whatever underflows.
-    """
-    C, d = Y.facets
-    if is_concrete(C, d):
-        C, d = (jnp.asarray(part) for part in balanced(np.asarray(C), np.asarray(d), inner))
-    else:
-        by = exponents(C)
-        C, d = shifted(C, -by[:, None]), shifted(d, -by)
-    return C, d, row_lengths(C)
-
-
-def polytope_volume(X: Polytope) -> Float[Array, ""]:
-    """The volume; differentiable: moving facet `i` by `db_i` sweeps `area_i db_i / |a_i|`."""
-    return _values(_volume, 1, X.A, X.b)[0]
+def volume(A: Normals, b: Offsets) -> Float[Array, ""]:
+    """The volume: moving facet `i` by `db_i` sweeps `area_i db_i / |a_i|`."""
+    return _values(_volume, 1, A, b)[0]
 
 
 def _values(compute: Values, count: int, *arrays: Array) -> Array:
+    if is_concrete(arrays):  # nothing to differentiate, and errors are raised, in `jax.jit` too
+        return _forward(compute, count, *arrays)[0]
     values: Any = _linearised(compute, count, *arrays)
     return values
 
@@ -160,7 +112,7 @@ def _separation(
     A: np.ndarray, b: np.ndarray, C: np.ndarray, d: np.ndarray
 ) -> tuple[np.ndarray, Slopes]:
     """From the Lagrangian `s + y . (A x - b) + w . (C x - s |c| - d)`."""
-    value, swept, y, w, x = polyhedra.separation_and_multipliers(A, b, C, d)
+    value, swept, y, w, x = separation_and_multipliers(A, b, C, d)
     units = C / lengths(C)[:, None]
     slopes = (swept, -y, w[:, None] * (x - value * units), -w)
     return np.array([value]), tuple(slope[None] for slope in slopes)

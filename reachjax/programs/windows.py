@@ -87,8 +87,8 @@ class Window(Replaceable):
                 bounds.
             compact: whether their columns are left out as well, which needs concrete numbers.
         """
-        prune, linear = relaxation.remove_stable, relaxation.linear_bounds
-        state, cone, T = _first(X.cone_facts(), box, X.ellipsoidal_part)
+        (_, ball), prune, linear = X.parts, relaxation.remove_stable, relaxation.linear_bounds
+        state, cone, T = _first(X.cone_facts(), box, ball)
         return cls(
             facts=(),
             cone=cone,
@@ -123,7 +123,8 @@ class Window(Replaceable):
             known: bounds of the inputs of the first units, if there are any besides these.
         """
         t = self.start + len(self)
-        supports = self.prune and (self.linear or X.ellipsoidal_part is not None)
+        _, ball = X.parts
+        supports = self.prune and (self.linear or ball is not None)
         around = X.closed_form(box) if supports else None
         bounds = _bounds(loop, around, box, t, known_inputs(self.units, known))
         places, taken = self._places(bounds)

@@ -15,10 +15,12 @@ from jaxtyping import Array, Bool, Float, Int
 from reachjax.loops import ClosedLoop
 from reachjax.proofs.ascent import ascended
 from reachjax.sets import AbstractSet
-from reachjax.sets.base import PULL
 
 BLOCK = 1024
 """Trajectories are evaluated in multiples of so many, for which code is compiled once."""
+
+PULL = 1 - 1e-12
+"""How far a rounded point is brought towards the middle of the set."""
 
 
 def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, "c n_x"]:
@@ -27,7 +29,10 @@ def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, 
     Where the set has a curved surface, half of the points are on it, just inside.
     """
     key = jax.random.key(seed)
-    states = X0.sample_with_boundary(key, count)
+    states, surface = X0.sample(key, count), X0.sample_boundary(key, count)
+    if surface is not None:
+        middle = states.mean(axis=0)
+        states = states.at[::2].set((middle + PULL * (surface - middle))[::2])
     states = jnp.concatenate([X0.corners(), states])
     states, inside = jax.device_get(_brought_inside(X0, states))
     return states[inside] if inside.any() else states  # a flat set contains none exactly

@@ -25,15 +25,18 @@ if TYPE_CHECKING:
     from reachjax.sets.ellipsoid import Ellipsoid
     from reachjax.sets.polyhedral_set import PolyhedralSet
 
+Vector = Float[Array, " n"]
+Matrix = Float[Array, "n n"]
+
 INSIDE = 1 - 1e-9
 """What is projected onto a set that is no box ends this close to its edge, seen from inside."""
-
-PULL = 1 - 1e-12
-"""How far a rounded point is brought towards the middle of the set."""
 
 
 class AbstractSet(Replaceable, abc.ABC):
     """A closed convex set of states in `n` dimensions."""
+
+    needs_programs = False
+    """Whether `closed_form` is but a box, so that supports are worth their linear programs."""
 
     @property
     @abc.abstractmethod
@@ -46,19 +49,15 @@ class AbstractSet(Replaceable, abc.ABC):
         return None
 
     @property
-    def polyhedral_part(self) -> PolyhedralSet | None:
-        """The set that its facets bound; None if it has none."""
-        return None
-
-    @property
-    def ellipsoidal_part(self) -> Ellipsoid | None:
-        """The ellipsoid that bounds it; None if it is bounded by facets alone."""
-        return None
+    @abc.abstractmethod
+    def parts(self) -> tuple[PolyhedralSet | None, Ellipsoid | None]:
+        """What its facets bound, and the ellipsoid that bounds it; None of what it has not."""
 
     @property
     def facets(self) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-        """The pair `(A, b)`: `A x <= b` on the set; no rows by default."""
-        return jnp.zeros((0, self.dimension)), jnp.zeros(0)
+        """The pair `(A, b)`: `A x <= b` on the set; without rows where it has no such part."""
+        polytope, _ = self.parts
+        return polytope.facets if polytope else (jnp.zeros((0, self.dimension)), jnp.zeros(0))
 
     def facts(self) -> Float[Array, "m n+1"]:
         """The rows `[-a, b]`: a facet's slack `b - a . x` is never negative on the set."""
@@ -66,8 +65,9 @@ class AbstractSet(Replaceable, abc.ABC):
         return jnp.hstack([-A, b[:, None]])
 
     def cone_facts(self) -> Float[Array, "r n+1"]:
-        """Rows `[s; R]` with `|R [x, 1]| <= s [x, 1]` for every `x` of the set; none by default."""
-        return jnp.zeros((0, self.dimension + 1))
+        """Rows `[s; R]` with `|R [x, 1]| <= s [x, 1]` on the set; none where no ellipsoid is."""
+        _, ball = self.parts
+        return ball.cone_facts() if ball else jnp.zeros((0, self.dimension + 1))
 
     @abc.abstractmethod
     def bounded_values(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch m"]:
@@ -89,25 +89,19 @@ class AbstractSet(Replaceable, abc.ABC):
         """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
 
     def surely_empty(self) -> bool:
-        """Whether two parts surely have no point in common; a set of one part does not say."""
-        return False
+        """Whether its two parts surely have no point in common; a set of one part does not say."""
+        polytope, ball = self.parts
+        return bool(polytope and ball and ball.separation(polytope) > 0)
 
     @abc.abstractmethod
     def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
         """The largest value of each direction on the set, rounded up; differentiable."""
 
-    def row_ranges(
-        self, rows: Float[Array, "m n"]
-    ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    def row_ranges(self, rows: Float[Array, "m n"]) -> tuple[Vector, Vector]:
         """Least and largest values of rows on the set, rounded outwards; differentiable."""
         ends = self.support(jnp.concatenate([-rows, rows]))
         lower, upper = -ends[: len(rows)], ends[len(rows) :]
         return lower, jnp.maximum(lower, upper)
-
-    @property
-    def needs_programs(self) -> bool:
-        """Whether `closed_form` is but a box, so that supports are worth their linear programs."""
-        return False
 
     def closed_form(self, box: Box) -> AbstractSet:
         """A set around this one, from a box around it, whose support needs no linear program."""
@@ -139,21 +133,19 @@ class AbstractSet(Replaceable, abc.ABC):
     def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
         """Points drawn uniformly from the set."""
 
-    def sample_with_boundary(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
-        """Points drawn uniformly; where there is a curved surface, half of them just inside it."""
-        return self.sample(key, count)
+    def sample_boundary(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"] | None:
+        """Points of the curved surface, up to rounding; None where there are facets alone."""
+        return None
 
     def corners(self) -> Float[Array, "v n"]:
         """Corners of the facets that are in the set; none where there are too many to list."""
         return jnp.zeros((0, self.dimension))
 
     @abc.abstractmethod
-    def nearest(self, point: Float[Array, " n"], scale: Float[Array, "n n"]) -> Float[Array, " n"]:
+    def nearest(self, point: Vector, scale: Matrix) -> Vector:
         """About the closest point of the set where `scale` is the unit; it may lie outside."""
 
-    def brought_inside(
-        self, point: Float[Array, " n"], middle: Float[Array, " n"], scale: Float[Array, "n n"]
-    ) -> Float[Array, " n"]:
+    def brought_inside(self, point: Vector, middle: Vector, scale: Matrix) -> Vector:
         """A point of the set, about the closest one, on the way from one in its interior.
 
         What a set bounds is convex: on the way from the middle it grows at most linearly.
@@ -190,13 +182,6 @@ class AbstractSet(Replaceable, abc.ABC):
         arrived = rows.shape[-1] if rows.ndim else None
         same_size("the set's dimension is", "the dimension of points is", (self.dimension, arrived))
         return rows
-
-
-def on_boundary(
-    points: Float[Array, "count n"], surface: Float[Array, "count n"], middle: Float[Array, " n"]
-) -> Float[Array, "count n"]:
-    """Every other point replaced by one of the surface, a little towards the middle."""
-    return points.at[::2].set((middle + PULL * (surface - middle))[::2])
 
 
 @jax.jit

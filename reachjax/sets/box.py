@@ -16,6 +16,7 @@ from reachjax.numerics.checks import (
 from reachjax.numerics.pytrees import converted, pytree
 from reachjax.numerics.rounding import TINY, exponents, gamma, raised, shifted
 from reachjax.sets import outlines
+from reachjax.sets.base import Matrix, Vector
 from reachjax.sets.polyhedral_set import PolyhedralSet
 
 MOST_CORNERS = 2**16
@@ -128,15 +129,9 @@ class Box(PolyhedralSet):
         """The points that lie in another box as well."""
         return Box(jnp.maximum(self.lower, box.lower), jnp.minimum(self.upper, box.upper))
 
-    def nearest(self, point: Float[Array, " n"], scale: Float[Array, "n n"]) -> Float[Array, " n"]:
-        """The closest point in units along the axes, exactly."""
-        return jnp.clip(point, self.lower, self.upper)
-
-    def brought_inside(
-        self, point: Float[Array, " n"], middle: Float[Array, " n"], scale: Float[Array, "n n"]
-    ) -> Float[Array, " n"]:
+    def brought_inside(self, point: Vector, middle: Vector, scale: Matrix) -> Vector:
         """The closest point, which surely is in the box."""
-        return self.nearest(point, scale)
+        return jnp.clip(point, self.lower, self.upper)
 
     def outline(self, i: int, j: int) -> Float[np.ndarray, "p 2"]:
         """The corners of the shadow: the box may have too many of its own to list."""

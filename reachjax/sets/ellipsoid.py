@@ -25,7 +25,7 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.pytrees import converted, pytree
 from reachjax.sets import outlines, outward
-from reachjax.sets.base import AbstractSet, on_boundary
+from reachjax.sets.base import AbstractSet, Matrix, Vector
 from reachjax.sets.box import Box
 from reachjax.sets.normal_form import NormalForm
 
@@ -122,14 +122,12 @@ class Ellipsoid(AbstractSet):
         """
         return outward.ball_map(self.normal_form.A, self.center, self.shape)
 
-    def scale(self) -> Float[Array, "n n"]:
-        """Half-axes, in a factored form: in this unit the ellipsoid is a ball."""
-        return self.from_ball()
+    scale = from_ball  # in this unit the ellipsoid is a ball
 
     @property
-    def ellipsoidal_part(self) -> Ellipsoid:
-        """The ellipsoid itself."""
-        return self
+    def parts(self) -> tuple[None, Ellipsoid]:
+        """No facets, and the ellipsoid itself."""
+        return None, self
 
     def closed_form(self, box: Box) -> Ellipsoid:
         """The ellipsoid itself."""
@@ -176,12 +174,7 @@ class Ellipsoid(AbstractSet):
         count = whole_number("count", count, 1)
         return self._mapped(_directions(key, count, self.center))
 
-    def sample_with_boundary(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
-        """Points drawn uniformly, and every other one just inside the surface."""
-        surface = self.sample_boundary(key, count)
-        return on_boundary(self.sample(key, count), surface, self.center)
-
-    def nearest(self, point: Float[Array, " n"], scale: Float[Array, "n n"]) -> Float[Array, " n"]:
+    def nearest(self, point: Vector, scale: Matrix) -> Vector:
         """The closest point where the ellipsoid is a ball."""
         return self.center + (point - self.center) / jnp.maximum(self.bounded_values(point), 1.0)
 

@@ -94,12 +94,12 @@ _linearised.defvjp(_forward, _backward)
 
 
 def _box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, Slopes]:
-    lower, upper, Y, points = polyhedra.bounding_box_and_multipliers(A, b)
+    lower, upper, Y, points = polyhedra.bounding_box(A, b)
     return np.concatenate([-lower, upper]), (-Y[:, :, None] * points[:, None, :], Y)
 
 
 def _support(A: np.ndarray, b: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, Slopes]:
-    values, Y, points = polyhedra.support_and_multipliers(A, b, D)
+    values, Y, points = polyhedra.support(A, b, D)
     return values, (-Y[:, :, None] * points[:, None, :], Y, _own(points))
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from reachjax.numerics.checks import is_concrete, require_kind, same_size
 from reachjax.numerics.pytrees import pytree
 from reachjax.sets import outlines
-from reachjax.sets.base import AbstractSet, on_boundary
+from reachjax.sets.base import AbstractSet, Matrix, Vector
 from reachjax.sets.box import Box
 from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polyhedral_set import PolyhedralSet
@@ -70,25 +70,6 @@ class Intersection(AbstractSet):
         """The number of coordinates."""
         return self.ellipsoid.dimension
 
-    @property
-    def polyhedral_part(self) -> PolyhedralSet:
-        """The polytope."""
-        return self.polytope
-
-    @property
-    def ellipsoidal_part(self) -> Ellipsoid:
-        """The ellipsoid."""
-        return self.ellipsoid
-
-    @property
-    def facets(self) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-        """Those of the polytope."""
-        return self.polytope.facets
-
-    def cone_facts(self) -> Float[Array, "n+1 n+1"]:
-        """Those of the ellipsoid."""
-        return self.ellipsoid.cone_facts()
-
     def bounded_values(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch m+1"]:
         """`A x` of each facet, and then the ellipsoid's `|A x + b|`."""
         return jnp.concatenate([part.bounded_values(points) for part in self.parts], axis=-1)
@@ -101,10 +82,6 @@ class Intersection(AbstractSet):
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
         return all(part.surely_contains(point) for part in self.parts)
-
-    def surely_empty(self) -> bool:
-        """Whether the two parts surely have no point in common."""
-        return bool(self.ellipsoid.separation(self.polytope) > 0)
 
     def misses(self, box: Box) -> bool:
         """Whether one of the parts surely has no point in a box."""
@@ -179,21 +156,12 @@ class Intersection(AbstractSet):
         reach = jnp.fmin(to_facets, to_surface)  # of a single point, neither is a number
         return middle + jnp.fmax(reach, 1.0)[:, None] * along
 
-    def sample_with_boundary(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
-        """Points drawn uniformly, and every other one just inside the surface.
-
-        Raises:
-            RuntimeError: the set cannot be sampled.
-        """
-        points = self.sample(key, count)
-        return on_boundary(points, self.sample_boundary(key, count), points.mean(axis=0))
-
     def corners(self) -> Float[Array, "v n"]:
         """Those of the polytope that are in the ellipsoid."""
         corners = self.polytope.corners()
         return corners[self.ellipsoid.contains(corners)]
 
-    def nearest(self, point: Float[Array, " n"], scale: Float[Array, "n n"]) -> Float[Array, " n"]:
+    def nearest(self, point: Vector, scale: Matrix) -> Vector:
         """The point of the polytope that is closest to the closest one of the ellipsoid."""
         return self.polytope.nearest(self.ellipsoid.nearest(point, scale), scale)
 

@@ -62,13 +62,7 @@ def _is_empty(A: np.ndarray, b: np.ndarray) -> bool:
     return linprog(zero, A_ub=A, b_ub=b, bounds=(None, None), method="highs").status == 2
 
 
-def bounding_box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds of each coordinate, true for the exact polytope."""
-    lower, upper, _, _ = bounding_box_and_multipliers(A, b)
-    return lower, upper
-
-
-def bounding_box_and_multipliers(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, ...]:
+def bounding_box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, ...]:
     """Lower and upper bounds of each coordinate, true for the exact polytope.
 
     Returns:
@@ -160,14 +154,7 @@ def _proved(region: Balanced, Y: np.ndarray, D: np.ndarray) -> tuple[np.ndarray,
     return Y @ region.b + error * (Y @ abs(region.b)) + lost, residual
 
 
-def support(A: np.ndarray, b: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Upper bounds of `max a . x` for each direction, true for the exact polytope."""
-    return support_and_multipliers(A, b, directions)[0]
-
-
-def support_and_multipliers(
-    A: np.ndarray, b: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, ...]:
+def support(A: np.ndarray, b: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
     """Upper bounds of `max a . x` for each of `k` directions, true for the exact polytope.
 
     Returns:

@@ -14,7 +14,7 @@ from reachjax.numerics.checks import is_concrete, require_double_precision
 from reachjax.numerics.rounding import TINY, exponents, gamma, lengths, shifted
 from reachjax.sets import envelopes, outlines
 from reachjax.sets.balance import balanced
-from reachjax.sets.base import AbstractSet
+from reachjax.sets.base import AbstractSet, Matrix, Vector
 
 if TYPE_CHECKING:
     from reachjax.sets.box import Box
@@ -43,9 +43,9 @@ class PolyhedralSet(AbstractSet):
         """The points that lie in a box."""
 
     @property
-    def polyhedral_part(self) -> Self:
-        """The set itself."""
-        return self
+    def parts(self) -> tuple[Self, None]:
+        """The set itself, and no ellipsoid."""
+        return self, None
 
     def bounded_values(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch m"]:
         """`A x` of each facet."""
@@ -82,10 +82,7 @@ class PolyhedralSet(AbstractSet):
         return C, d, lengths(C)
 
     def separation(self, other: PolyhedralSet) -> Float[Array, ""]:
-        """How far the facets of another set may move outward before it meets this bounded one.
-
-        Negative if they overlap. A lower bound, rounding included; differentiable.
-        """
+        """How far the facets of another set may move outward before it meets this bounded one."""
         return envelopes.separation(*self.facets, *other.facets)
 
     def misses(self, box: Box) -> bool:
@@ -99,7 +96,7 @@ class PolyhedralSet(AbstractSet):
         except RuntimeError:
             return super().corners()
 
-    def nearest(self, point: Float[Array, " n"], scale: Float[Array, "n n"]) -> Float[Array, " n"]:
+    def nearest(self, point: Vector, scale: Matrix) -> Vector:
         """The closest point where `scale` is the unit, by ascent in one facet's multiplier a time.
 
         Source: Hildreth, A quadratic programming procedure (1957).
@@ -107,12 +104,11 @@ class PolyhedralSet(AbstractSet):
         A, b = self.facets
         along = A @ scale @ scale.T
         squares = jnp.sum(A * along, axis=1)
+        squares = jnp.where(squares > 0, squares, 1.0)
 
         def onto(carry, facet):
             point, weights = carry
-            over = (A[facet] @ point - b[facet]) / jnp.where(
-                squares[facet] > 0, squares[facet], 1.0
-            )
+            over = (A[facet] @ point - b[facet]) / squares[facet]
             weight = jnp.maximum(weights[facet] + over, 0.0)
             moved = point - (weight - weights[facet]) * along[facet]
             return (moved, weights.at[facet].set(weight)), None

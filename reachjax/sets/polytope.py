@@ -41,6 +41,7 @@ class Polytope(PolyhedralSet):
 
     A: Float[Array, "m n"] = converted(converter=Numbers("(m, n)"))
     b: Float[Array, " m"] = converted(converter=Numbers("(m,)"))
+    needs_programs = True
 
     def __post_init__(self):
         A, b = self.A, self.b
@@ -69,11 +70,6 @@ class Polytope(PolyhedralSet):
             ValueError: the polytope is empty or unbounded.
         """
         return envelopes.support(self.A, self.b, self._directions(directions))
-
-    @property
-    def needs_programs(self) -> bool:
-        """True."""
-        return True
 
     def bounding_box(self) -> Box:
         """The smallest box around the polytope.

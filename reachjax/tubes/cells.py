@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.numerics.checks import whole_number
-from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet, Polytope
+from reachjax.sets import AbstractSet, Box, Intersection, Polytope
 
 TOUCHING = 1e-6
 """A cell that a set barely touches is enlarged by this part of its box."""
@@ -98,25 +98,21 @@ def _within(X: AbstractSet, box: Box) -> AbstractSet:
         except (ValueError, RuntimeError):  # too thin to be told from an empty set
             continue
         return cell
-    return _behind_a_tangent(X, larger)
-
-
-def _behind_a_tangent(X: AbstractSet, box: Box) -> AbstractSet:
-    """What facets leave of a box from which a set's ellipsoidal part cuts little."""
-    polytope, ball = _parts(X, box)
-    if ball is None:
-        return box
-    direction = ball.normal_towards(box)[None]
-    (A, b), top = polytope.facets, ball.support(direction)
-    return Polytope(jnp.concatenate([A, direction]), jnp.concatenate([b, top]))
+    return _behind_a_tangent(_cut(X, larger), larger)
 
 
 def _cut(X: AbstractSet, box: Box) -> AbstractSet:
-    polytope, ball = _parts(X, box)
-    return polytope if ball is None else Intersection(polytope, ball)
+    """The points of a set that lie in a box."""
+    polytope, ball = X.parts
+    polytope = polytope.cut(box) if polytope else box
+    return Intersection(polytope, ball) if ball else polytope
 
 
-def _parts(X: AbstractSet, box: Box) -> tuple[PolyhedralSet, Ellipsoid | None]:
-    """What facets bound of a set in a box, and the ellipsoid."""
-    facets = X.polyhedral_part
-    return box if facets is None else facets.cut(box), X.ellipsoidal_part
+def _behind_a_tangent(cell: AbstractSet, box: Box) -> AbstractSet:
+    """What facets leave of a box from which an ellipsoid cuts little."""
+    (A, b), (_, ball) = cell.facets, cell.parts
+    if ball is None:
+        return box
+    direction = ball.normal_towards(box)[None]
+    top = ball.support(direction)
+    return Polytope(jnp.concatenate([A, direction]), jnp.concatenate([b, top]))

@@ -36,14 +36,16 @@ def test_dual_multipliers_are_nonnegative_and_prove_the_support(region):
 @pytest.mark.parametrize("size", [1e-200, 1e200])
 def test_supports_in_directions_whose_squares_are_no_numbers(region, size):
     D = np.random.default_rng(1).normal(size=(10, region.A.shape[1]))
-    values = polyhedra.support(region.A, region.b, size * D)
-    np.testing.assert_allclose(values / size, polyhedra.support(region.A, region.b, D), rtol=1e-9)
+    values = polyhedra.support(region.A, region.b, size * D)[0]
+    np.testing.assert_allclose(
+        values / size, polyhedra.support(region.A, region.b, D)[0], rtol=1e-9
+    )
 
 
 def test_bounds_hold_for_the_exact_corners_of_a_long_thin_triangle():
     # x <= 1, x + 1e6 y >= 0 and x - 1e6 y >= 0: corners (0, 0) and (1, -+1e-6), to rounding
     A, b = np.array([[1.0, 0.0], [-1.0, -1e6], [-1.0, 1e6]]), np.array([1.0, 0.0, 0.0])
-    lower, upper = (fractions(part) for part in polyhedra.bounding_box(A, b))
+    lower, upper = (fractions(part) for part in polyhedra.bounding_box(A, b)[:2])
     tip = 1 / Fraction(1e6)
     assert lower[0] <= 0
     assert lower[1] <= -tip
@@ -60,11 +62,11 @@ def test_bounds_pay_for_inexact_multipliers(monkeypatch):
         return 0.99 * y + 0.001, x
 
     monkeypatch.setattr(polyhedra, "maximiser", sloppy)
-    lower, upper = polyhedra.bounding_box(A, b)
+    lower, upper, *_ = polyhedra.bounding_box(A, b)
     assert (lower <= [-2, -1]).all()
     assert (upper >= [1, 3]).all()
     directions = np.array([[1.0, 1.0], [-1.0, 0.5]])
-    assert (polyhedra.support(A, b, directions) >= [4.0, 3.5]).all()
+    assert (polyhedra.support(A, b, directions)[0] >= [4.0, 3.5]).all()
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
@@ -159,5 +161,5 @@ def test_separations_and_supports_grow_with_their_sets(size):
     scaled = separation_and_multipliers(triangle.A, size * triangle.b, box[0], size * box[1])[0]
     assert scaled == pytest.approx(size * once, rel=1e-9)
     D = np.array([[1.0, 2.0], [-1.0, 0.5]])
-    values = polyhedra.support(triangle.A, size * triangle.b, D)
-    np.testing.assert_allclose(values, size * polyhedra.support(triangle.A, triangle.b, D), 1e-9)
+    values = polyhedra.support(triangle.A, size * triangle.b, D)[0]
+    np.testing.assert_allclose(values, size * polyhedra.support(triangle.A, triangle.b, D)[0], 1e-9)

@@ -1,4 +1,4 @@
-"""Pre-activation bounds that know how neurons depend on each other, and the shape of a round set.
+"""Pre-activation bounds that know how neurons depend on each other, and the shape of an ellipsoid.
 
 Interval arithmetic forgets that the neurons of a layer come from one state, and a box around an
 ellipsoid of six dimensions has corners at 2.4 times its radius: neurons would count as switching
@@ -22,17 +22,7 @@ from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.rounding import Ball, gamma
 from reachjax.programs.basis import Rows, columns, loop_rows, picking
 from reachjax.programs.bounds import LoopBounds, loop_bounds
-from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection
-
-
-def rounded(X: AbstractSet, box: Box) -> Box | Ellipsoid | Intersection:
-    """A set around `X` whose supports can be compiled.
-
-    Supports of polytopes are linear programs on the host: here a box around it stands for one.
-    """
-    if isinstance(X, Intersection):
-        return X.replace(polytope=box)
-    return X if isinstance(X, Ellipsoid) else box
+from reachjax.sets import AbstractSet, Box
 
 
 @partial(jax.jit, static_argnames="units")
@@ -52,7 +42,7 @@ def known_inputs(units: int, known: Ball | None) -> Ball:
 
 def bounds_over(
     loop: ClosedLoop,
-    X: Box | Ellipsoid | Intersection,
+    X: AbstractSet,
     box: Box,
     t: int | jax.Array,
     known: Ball,
@@ -61,7 +51,7 @@ def bounds_over(
 
     Args:
         loop: the closed loop.
-        X: the set of states at time `t`, as `rounded` gives it.
+        X: the set of states at time `t`, in closed form: a polytope needs linear programs.
         box: a box around it.
         t: the time.
         known: `(k,)`, other bounds of the units' inputs, from `known_inputs`.

@@ -27,10 +27,10 @@ from reachjax.programs.basis import Rows, columns, loop_rows
 from reachjax.programs.bounds import LoopBounds, loop_bounds
 from reachjax.programs.facts import FactLayout, Kind, StepFacts
 from reachjax.programs.lmi import Program
-from reachjax.programs.preactivations import bounds_over, known_inputs, rounded
+from reachjax.programs.preactivations import bounds_over, known_inputs
 from reachjax.programs.relaxations import AbstractRelaxation
 from reachjax.programs.scaling import scaled_states, scaled_units
-from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection
+from reachjax.sets import AbstractSet, Box, Ellipsoid
 
 COLUMNS = 16
 """The columns of a compact basis come in multiples of this many."""
@@ -87,8 +87,8 @@ class Window(Replaceable):
                 bounds.
             compact: whether their columns are left out as well, which needs concrete numbers.
         """
-        prune, linear = relaxation.remove_stable, relaxation.linear_bounds
-        state, cone, T = _first(X.cone_facts(), box, _ball(rounded(X, box)))
+        (_, ball), prune, linear = X.parts, relaxation.remove_stable, relaxation.linear_bounds
+        state, cone, T = _first(X.cone_facts(), box, ball)
         return cls(
             facts=(),
             cone=cone,
@@ -122,9 +122,11 @@ class Window(Replaceable):
             box: a box around it.
             known: bounds of the inputs of the first units, if there are any besides these.
         """
-        t, around = self.start + len(self), rounded(X, box)
-        sharp = self.prune and (self.linear or not isinstance(around, Box))
-        bounds = _bounds(loop, around if sharp else None, box, t, known_inputs(self.units, known))
+        t = self.start + len(self)
+        _, ball = X.parts
+        supports = self.prune and (self.linear or ball is not None)
+        around = X.closed_form(box) if supports else None
+        bounds = _bounds(loop, around, box, t, known_inputs(self.units, known))
         places, taken = self._places(bounds)
         grown = self._padded(taken + 1)
         units, state, T = _extended(
@@ -185,12 +187,6 @@ def step_program(
     return window.extended(loop, X, box).program(directions, relaxation)
 
 
-def _ball(around: Box | Ellipsoid | Intersection) -> Ellipsoid | None:
-    if isinstance(around, Box):
-        return None
-    return around.ellipsoid if isinstance(around, Intersection) else around
-
-
 @jax.jit
 def _first(
     cone_facts: Float[Array, "r n_x+1"], box: Box, ball: Ellipsoid | None
@@ -203,7 +199,7 @@ def _first(
 @jax.jit
 def _bounds(
     loop: ClosedLoop,
-    around: Box | Ellipsoid | Intersection | None,
+    around: AbstractSet | None,
     box: Box,
     t: int,
     known: Ball,

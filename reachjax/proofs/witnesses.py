@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.loops import ClosedLoop
 from reachjax.proofs.ascent import ascended
-from reachjax.sets import AbstractSet, Ellipsoid, Intersection, PolyhedralSet
-from reachjax.sets.base import MOST_DIMENSIONS
+from reachjax.sets import AbstractSet
 
 BLOCK = 1024
 """Trajectories are evaluated in multiples of so many, for which code is compiled once."""
@@ -27,15 +26,14 @@ PULL = 1 - 1e-12
 def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, "c n_x"]:
     """Corners of the set, in few dimensions, and `count` points drawn from it.
 
-    Where the set has a round part, half of the points are on the surface, just inside.
+    Where the set has a curved surface, half of the points are on it, just inside.
     """
     key = jax.random.key(seed)
-    states = X0.sample(key, count)
-    if isinstance(X0, Ellipsoid | Intersection):
-        middle = X0.center if isinstance(X0, Ellipsoid) else states.mean(axis=0)
-        surface = middle + PULL * (X0.sample_boundary(key, count) - middle)
-        states = states.at[::2].set(surface[::2])
-    states = jnp.concatenate([_corners(X0), states])
+    states, surface = X0.sample(key, count), X0.sample_boundary(key, count)
+    if surface is not None:
+        middle = states.mean(axis=0)
+        states = states.at[::2].set((middle + PULL * (surface - middle))[::2])
+    states = jnp.concatenate([X0.corners(), states])
     states, inside = jax.device_get(_brought_inside(X0, states))
     return states[inside] if inside.any() else states  # a flat set contains none exactly
 
@@ -51,19 +49,6 @@ def _brought_inside(
     center = states.mean(axis=0)
     states = jnp.where(X0.contains(states)[:, None], states, center + PULL * (states - center))
     return states, X0.contains(states)
-
-
-def _corners(X0: AbstractSet) -> Float[Array, "v n_x"]:
-    """Corners of the set's facets; none of an ellipsoid, or where there are too many to list."""
-    none = jnp.zeros((0, X0.dimension))
-    polytope = X0.polytope if isinstance(X0, Intersection) else X0
-    if not isinstance(polytope, PolyhedralSet) or X0.dimension > MOST_DIMENSIONS:
-        return none
-    try:
-        corners = polytope.vertices()
-    except RuntimeError:  # too thin to have corners: do without
-        return none
-    return corners[X0.ellipsoid.contains(corners)] if isinstance(X0, Intersection) else corners
 
 
 class Simulations:
@@ -84,7 +69,7 @@ class Simulations:
         self, loop: ClosedLoop, X0: AbstractSet, horizon: int, start: int, samples: int, seed: int
     ):
         self._loop, self._X0, self._start, self._horizon = loop, X0, start, horizon
-        self._box = X0.bounding_box()
+        self._scale = X0.scale()
         states = initial_states(X0, samples, seed)
         self._states, self._middle = states, states.mean(axis=0)
         self._trajectories = np.asarray(loop.simulate(states, horizon, start))
@@ -106,7 +91,7 @@ class Simulations:
         """
         known = np.isfinite(states).all(axis=1, keepdims=True)
         begin = np.where(known, states, self._middle)
-        fixed = self._loop, self._X0, self._box, self._middle
+        fixed = self._loop, self._X0, self._scale, self._middle
         found = ascended(*fixed, begin, region, which, k, self._horizon, self._start)
         trajectories = self._loop.simulate(found, self._horizon, self._start)
         inside = np.asarray(self._X0.contains(found)) & np.isfinite(trajectories).all(axis=(1, 2))

@@ -15,7 +15,9 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.pytrees import converted, pytree
 from reachjax.numerics.rounding import TINY, exponents, gamma, raised, shifted
-from reachjax.sets.base import PolyhedralSet
+from reachjax.sets import outlines
+from reachjax.sets.base import Matrix, Vector
+from reachjax.sets.polyhedral_set import PolyhedralSet
 
 MOST_CORNERS = 2**16
 
@@ -70,7 +72,7 @@ class Box(PolyhedralSet):
 
     @property
     def steps(self) -> int | None:
-        """The number of times a time-varying box is given for; `None` for a constant one."""
+        """The number of times that a time-varying box is given for; None for a constant one."""
         return self.lower.shape[0] if self.lower.ndim == 2 else None
 
     def at(self, t) -> Box:
@@ -118,6 +120,24 @@ class Box(PolyhedralSet):
         require_double_precision(set=self)
         x = np.asarray(self._points(point))  # numpy knows subnormal numbers, XLA does not
         return bool(np.all((np.asarray(self.lower) <= x) & (x <= np.asarray(self.upper))))
+
+    def misses(self, box: Box) -> bool:
+        """Whether another box has no point in common."""
+        return bool(jnp.any((self.lower > box.upper) | (box.lower > self.upper)))
+
+    def cut(self, box: Box) -> Box:
+        """The points that lie in another box as well."""
+        return Box(jnp.maximum(self.lower, box.lower), jnp.minimum(self.upper, box.upper))
+
+    def brought_inside(self, point: Vector, middle: Vector, scale: Matrix) -> Vector:
+        """The closest point, which surely is in the box."""
+        return jnp.clip(point, self.lower, self.upper)
+
+    def outline(self, i: int, j: int) -> Float[np.ndarray, "p 2"]:
+        """The corners of the shadow: the box may have too many of its own to list."""
+        self._single()
+        here = np.array([i, j])
+        return outlines.hull(np.asarray(Box(self.lower[here], self.upper[here]).vertices()))
 
     def vertices(self) -> Float[Array, "2**n n"]:
         """All corners, flat coordinates included.

@@ -8,13 +8,13 @@ orthogonal multiple describes the same set).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from scipy.optimize import lsq_linear
 
 from reachjax.numerics.checks import (
     Numbers,
@@ -24,35 +24,13 @@ from reachjax.numerics.checks import (
     whole_number,
 )
 from reachjax.numerics.pytrees import converted, pytree
-from reachjax.numerics.rounding import TINY, exponents, gamma, raised, shifted
-from reachjax.sets import outward
-from reachjax.sets.base import AbstractSet
+from reachjax.sets import outlines, outward
+from reachjax.sets.base import AbstractSet, Matrix, Vector
 from reachjax.sets.box import Box
+from reachjax.sets.normal_form import NormalForm
 
 SINGULAR = 1e-14
 """A shape matrix counts as singular if scaling its diagonal to 1 leaves no larger eigenvalue."""
-
-
-class NormalForm(NamedTuple):
-    """The ellipsoid `|A x + b| <= 1`, the paper's (there `A` is symmetric).
-
-    Attributes:
-        A: `(n, n)`.
-        b: `(n,)`.
-    """
-
-    A: Float[Array | np.ndarray, "n n"]
-    b: Float[Array | np.ndarray, " n"]
-
-    def of(self, inner: NormalForm) -> NormalForm:
-        """This form in `x`, given in `y = inner.A x + inner.b`."""
-        return NormalForm(self.A @ inner.A, self.A @ inner.b + self.b)
-
-    @property
-    def inverse(self) -> NormalForm:
-        """`x = A^-1 y - A^-1 b`."""
-        inverse = np.linalg.inv(self.A)
-        return NormalForm(inverse, -inverse @ self.b)
 
 
 @pytree
@@ -144,9 +122,16 @@ class Ellipsoid(AbstractSet):
         """
         return outward.ball_map(self.normal_form.A, self.center, self.shape)
 
-    def facts(self) -> Float[Array, "0 n+1"]:
-        """None: an ellipsoid has a cone fact instead."""
-        return jnp.zeros((0, self.dimension + 1))
+    scale = from_ball  # in this unit the ellipsoid is a ball
+
+    @property
+    def parts(self) -> tuple[None, Ellipsoid]:
+        """No facets, and the ellipsoid itself."""
+        return None, self
+
+    def closed_form(self, box: Box) -> Ellipsoid:
+        """The ellipsoid itself."""
+        return self
 
     def cone_facts(self) -> Float[Array, "n+1 n+1"]:
         """The rows `[s; A, b]` with `|A x + b| <= s` on the set, `s` being 1 up to rounding."""
@@ -157,18 +142,17 @@ class Ellipsoid(AbstractSet):
 
     def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
         """`a . q + sqrt(a' Q a)`, rounded up."""
-        return _support(self.center, self.shape, self._directions(directions))
+        return outward.support(self.center, self.shape, self._directions(directions))
 
     def bounded_values(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch 1"]:
         """`|A x + b|`, at most 1 on the set."""
         A, _ = self.normal_form
         return jnp.linalg.norm((self._points(points) - self.center) @ A.T, axis=-1, keepdims=True)
 
-    def contains(
-        self, points: Float[ArrayLike, "*batch n"], tolerance: float = 0.0
-    ) -> Bool[Array, "*batch"]:
-        """Whether `|A x + b| <= 1 + tolerance` for each point."""
-        return self.bounded_values(points)[..., 0] <= 1 + tolerance
+    @property
+    def limits(self) -> Float[Array, " 1"]:
+        """1."""
+        return jnp.ones(1)
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
@@ -189,6 +173,26 @@ class Ellipsoid(AbstractSet):
         """Points of the surface, up to rounding."""
         count = whole_number("count", count, 1)
         return self._mapped(_directions(key, count, self.center))
+
+    def nearest(self, point: Vector, scale: Matrix) -> Vector:
+        """The closest point where the ellipsoid is a ball."""
+        return self.center + (point - self.center) / jnp.maximum(self.bounded_values(point), 1.0)
+
+    def normal_towards(self, box: Box) -> Float[Array, " n"]:
+        """The normal, in the ellipsoid's metric, at the point of a box closest to its centre."""
+        A, b = (np.asarray(part) for part in self.normal_form)
+        nearest = lsq_linear(A, -b, bounds=(box.lower, np.nextafter(box.upper, np.inf))).x
+        return jnp.asarray(A.T @ (A @ nearest + b))
+
+    def misses(self, box: Box) -> bool:
+        """Whether the set surely has no point in a box: a separating direction proves it."""
+        direction = self.normal_towards(box)[None]
+        return bool(-box.support(-direction) > self.support(direction))
+
+    def outline(self, i: int, j: int) -> Float[np.ndarray, "p 2"]:
+        """Points of the shadow's ellipse."""
+        shadow = self.projection(i, j)
+        return np.asarray(shadow.center) + outlines.circle() @ np.linalg.cholesky(shadow.shape).T
 
     def _mapped(self, points: Float[Array, "count n"]) -> Float[Array, "count n"]:
         """From the unit ball to the set."""
@@ -224,30 +228,6 @@ class Ellipsoid(AbstractSet):
             )
         index = np.array(coordinates)
         return Ellipsoid(self.center[index], self.shape[np.ix_(index, index)])
-
-
-@jax.jit
-def _support(
-    q: Float[Array, " n"], Q: Float[Array, "n n"], directions: Float[Array, "m n"]
-) -> Float[Array, " m"]:
-    n, some = len(q), jnp.any(directions != 0, axis=1)
-    by = exponents(directions)
-    D = shifted(directions, -by[:, None])
-    lost = jnp.where(some, n * TINY * (1 + jnp.max(abs(q))), 0.0)  # by underflow
-    middle = raised(D @ q + gamma(n + 4) * (abs(D) @ abs(q)) + lost, by)
-    # half-axes as units: whatever underflows is little beside the largest of a direction
-    units = exponents(jnp.diag(Q)[:, None]) // 2
-    S = shifted(Q, -(units[:, None] + units))
-    logs = jnp.where(directions != 0, jnp.frexp(directions)[1] - 1 + units, -(2**20))
-    by = jnp.where(some, jnp.max(logs, axis=1), 0)
-    D = shifted(directions, units - by[:, None])
-    squares = jnp.einsum("mi,ij,mj->m", D, S, D)
-    sizes = jnp.einsum("mi,ij,mj->m", abs(D), abs(S), abs(D))
-    above = squares + gamma(2 * n) * sizes + 64 * n**2 * TINY
-    # the root has no derivative at zero
-    root = jnp.where(some, jnp.sqrt(jnp.where(some, above, 1.0)), 0.0)
-    reach = raised(root * (1 + gamma(n + 4)), by)
-    return middle + reach + gamma(4) * (abs(middle) + reach)
 
 
 def _require_positive_definite(matrix: np.ndarray) -> None:

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from reachjax.numerics.checks import is_concrete, require_kind, same_size
 from reachjax.numerics.pytrees import pytree
-from reachjax.sets.base import AbstractSet, PolyhedralSet
+from reachjax.sets import outlines
+from reachjax.sets.base import AbstractSet, Matrix, Vector
 from reachjax.sets.box import Box
 from reachjax.sets.ellipsoid import Ellipsoid
+from reachjax.sets.polyhedral_set import PolyhedralSet
 
 DRAWS = (1, 9, 81)
 """So many times the points wanted are drawn, in turn, until enough of them lie in both parts."""
@@ -48,7 +50,7 @@ class Intersection(AbstractSet):
     def __post_init__(self):
         require_kind("Intersection.polytope", self.polytope, PolyhedralSet, "a Box or a Polytope")
         require_kind("Intersection.ellipsoid", self.ellipsoid, Ellipsoid, "an Ellipsoid")
-        if isinstance(self.polytope, Box) and self.polytope.steps is not None:
+        if self.polytope.steps is not None:
             raise ValueError(
                 "Intersection.polytope must be one box, but a time-varying one arrived"
             )
@@ -68,28 +70,30 @@ class Intersection(AbstractSet):
         """The number of coordinates."""
         return self.ellipsoid.dimension
 
-    def facts(self) -> Float[Array, "m n+1"]:
-        """Those of the polytope."""
-        return self.polytope.facts()
-
-    def cone_facts(self) -> Float[Array, "n+1 n+1"]:
-        """Those of the ellipsoid."""
-        return self.ellipsoid.cone_facts()
-
     def bounded_values(self, points: Float[ArrayLike, "*batch n"]) -> Float[Array, "*batch m+1"]:
         """`A x` of each facet, and then the ellipsoid's `|A x + b|`."""
         return jnp.concatenate([part.bounded_values(points) for part in self.parts], axis=-1)
 
-    def contains(
-        self, points: Float[ArrayLike, "*batch n"], tolerance: float = 0.0
-    ) -> Bool[Array, "*batch"]:
-        """Whether each point lies in both parts, each enlarged by `tolerance` in its own scale."""
-        first, second = (part.contains(points, tolerance) for part in self.parts)
-        return first & second
+    @property
+    def limits(self) -> Float[Array, " m+1"]:
+        """`b` of the polytope, and then 1."""
+        return jnp.concatenate([part.limits for part in self.parts])
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the set in exact arithmetic; False where rounding may decide."""
         return all(part.surely_contains(point) for part in self.parts)
+
+    def misses(self, box: Box) -> bool:
+        """Whether one of the parts surely has no point in a box."""
+        return any(part.misses(box) for part in self.parts)
+
+    def separation(self, other: PolyhedralSet) -> Float[Array, ""]:
+        """The better one of the two parts'."""
+        return jnp.maximum(*(part.separation(other) for part in self.parts))
+
+    def closed_form(self, box: Box) -> Intersection:
+        """The part of the ellipsoid that is in the box."""
+        return self.replace(polytope=box)
 
     def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
         """An upper bound of `max a . x`: the smaller of the two parts'.
@@ -107,15 +111,7 @@ class Intersection(AbstractSet):
         Raises:
             ValueError: the polytope is empty or unbounded, or these boxes have no point in common.
         """
-        return self.boxed(self.polytope.bounding_box())
-
-    def boxed(self, box: Box) -> Box:
-        """The bounding box, from one of the polytope.
-
-        Raises:
-            ValueError: the boxes around the parts have no point in common.
-        """
-        other = self.ellipsoid.bounding_box()
+        box, other = (part.bounding_box() for part in self.parts)
         lower, upper = jnp.maximum(box.lower, other.lower), jnp.minimum(box.upper, other.upper)
         if is_concrete(lower, upper) and bool(jnp.any(lower > upper)):
             raise ValueError("the polytope and the ellipsoid have no point in common")
@@ -159,6 +155,25 @@ class Intersection(AbstractSet):
         to_surface = (jnp.sqrt(mixed**2 + size * (1 - y @ y)) - mixed) / size
         reach = jnp.fmin(to_facets, to_surface)  # of a single point, neither is a number
         return middle + jnp.fmax(reach, 1.0)[:, None] * along
+
+    def corners(self) -> Float[Array, "v n"]:
+        """Those of the polytope that are in the ellipsoid."""
+        corners = self.polytope.corners()
+        return corners[self.ellipsoid.contains(corners)]
+
+    def nearest(self, point: Vector, scale: Matrix) -> Vector:
+        """The point of the polytope that is closest to the closest one of the ellipsoid."""
+        return self.polytope.nearest(self.ellipsoid.nearest(point, scale), scale)
+
+    def outline(self, i: int, j: int) -> Float[np.ndarray, "p 2"]:
+        """What the shadows of the two parts have in common."""
+        return outlines.cut(
+            self.polytope.outline(i, j), self.ellipsoid.projection(i, j).normal_form
+        )
+
+    def size(self) -> Float[Array, ""]:
+        """An upper bound of the volume, the smaller size of the two parts."""
+        return jnp.minimum(*(part.size() for part in self.parts))
 
     def volume(self) -> Float[Array, ""]:
         """An upper bound of the volume: that of the smaller part.

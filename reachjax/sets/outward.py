@@ -2,7 +2,7 @@
 
 Everything rests on `A Q A'`, with `A` nearly the inverse of a factor of `Q`, which is nearly the
 identity: its eigenvalues lie within its diagonal plus or minus the row sums of the rest, rounding
-included (Gershgorin). All results are held constant by derivatives.
+included (Gershgorin). What follows from it is held constant by derivatives; the support is not.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from reachjax.numerics.rounding import gamma, lengths
+from reachjax.numerics.rounding import TINY, exponents, gamma, lengths, raised, shifted
 
 Matrix = Float[Array | np.ndarray, "n n"]
 Vector = Float[Array | np.ndarray, " n"]
@@ -73,3 +73,26 @@ def surely_inside(A: Matrix, q: Vector, Q: Matrix, x: Vector) -> Bool[Array, ""]
     n = len(q)
     distance = abs(A @ (x - q)) + gamma(n + 2) * (abs(A) @ (abs(x) + abs(q)))
     return jnp.sum(distance**2) * (1 + gamma(n)) <= 1 - _off_identity(A, Q)
+
+
+@jax.jit
+def support(q: Vector, Q: Matrix, directions: Float[Array, "m n"]) -> Float[Array, " m"]:
+    """Upper bounds of `a . q + sqrt(a' Q a)`, whatever the size of the numbers."""
+    n, some = len(q), jnp.any(directions != 0, axis=1)
+    by = exponents(directions)
+    D = shifted(directions, -by[:, None])
+    lost = jnp.where(some, n * TINY * (1 + jnp.max(abs(q))), 0.0)  # by underflow
+    middle = raised(D @ q + gamma(n + 4) * (abs(D) @ abs(q)) + lost, by)
+    # half-axes as units: whatever underflows is little beside the largest of a direction
+    units = exponents(jnp.diag(Q)[:, None]) // 2
+    S = shifted(Q, -(units[:, None] + units))
+    logs = jnp.where(directions != 0, jnp.frexp(directions)[1] - 1 + units, -(2**20))
+    by = jnp.where(some, jnp.max(logs, axis=1), 0)
+    D = shifted(directions, units - by[:, None])
+    squares = jnp.einsum("mi,ij,mj->m", D, S, D)
+    sizes = jnp.einsum("mi,ij,mj->m", abs(D), abs(S), abs(D))
+    above = squares + gamma(2 * n) * sizes + 64 * n**2 * TINY
+    # the root has no derivative at zero
+    root = jnp.where(some, jnp.sqrt(jnp.where(some, above, 1.0)), 0.0)
+    reach = raised(root * (1 + gamma(n + 4)), by)
+    return middle + reach + gamma(4) * (abs(middle) + reach)

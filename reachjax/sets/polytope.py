@@ -9,9 +9,12 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from reachjax.numerics.checks import Numbers, is_concrete, require_double_precision, same_size
 from reachjax.numerics.pytrees import converted, pytree
-from reachjax.sets import hulls, polyhedra
-from reachjax.sets.base import PolyhedralSet
+from reachjax.sets import envelopes, hulls
 from reachjax.sets.box import Box
+from reachjax.sets.polyhedral_set import PolyhedralSet
+
+EXACT_DIMENSIONS = 4
+"""Beyond so many, corners multiply too fast for a volume that is computed at every step."""
 
 
 @pytree
@@ -19,8 +22,9 @@ class Polytope(PolyhedralSet):
     """The polytope `A x <= b` (the paper's proposition 1).
 
     It may be unbounded, such as a half-space to be avoided; what needs corners, a volume or a
-    support function then says so. Supports, bounding boxes and corners come from linear programs
-    on the host, so they are not for use inside `jax.jit`.
+    support function then says so. Supports and bounding boxes come from linear programs on the
+    host, also inside `jax.jit`, where they are NaN of a set that has none; corners, samples and the
+    volume are not for use there.
 
     Args:
         A: `(m, n)`, one facet normal a row, none of them zero.
@@ -37,6 +41,7 @@ class Polytope(PolyhedralSet):
 
     A: Float[Array, "m n"] = converted(converter=Numbers("(m, n)"))
     b: Float[Array, " m"] = converted(converter=Numbers("(m,)"))
+    needs_programs = True
 
     def __post_init__(self):
         A, b = self.A, self.b
@@ -64,8 +69,7 @@ class Polytope(PolyhedralSet):
         Raises:
             ValueError: the polytope is empty or unbounded.
         """
-        rows = np.asarray(self._directions(directions))
-        return jnp.asarray(polyhedra.support(*self._host(), rows))
+        return envelopes.support(self.A, self.b, self._directions(directions))
 
     def bounding_box(self) -> Box:
         """The smallest box around the polytope.
@@ -74,8 +78,12 @@ class Polytope(PolyhedralSet):
             ValueError: the polytope is empty or unbounded.
         """
         require_double_precision(set=self)
-        lower, upper = polyhedra.bounding_box(*self._host())
-        return Box(lower, upper)
+        return Box(*envelopes.bounding_box(self.A, self.b))
+
+    def cut(self, box: Box) -> Polytope:
+        """The points that lie in a box as well."""
+        (A, b), (C, d) = self.facets, box.facets
+        return Polytope(jnp.concatenate([A, C]), jnp.concatenate([b, d]))
 
     def vertices(self) -> Float[Array, "v n"]:
         """The corners, in any dimension, flat polytopes included (Qhull).
@@ -94,3 +102,9 @@ class Polytope(PolyhedralSet):
     def volume(self) -> float:
         """The `n`-dimensional volume; zero for a flat polytope (Qhull)."""
         return hulls.volume(*self._host())
+
+    def size(self) -> Float[Array, ""]:
+        """The volume; beyond four dimensions, that of the bounding box. Differentiable."""
+        if self.dimension <= EXACT_DIMENSIONS:
+            return envelopes.volume(self.A, self.b)
+        return jnp.prod(self.bounding_box().widths)

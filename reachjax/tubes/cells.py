@@ -12,12 +12,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-from scipy.optimize import lsq_linear
+from jaxtyping import Float
 
-from reachjax.numerics.checks import described, whole_number
-from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet, Polytope
-from reachjax.sets.geometry import bounding_box, separation
+from reachjax.numerics.checks import whole_number
+from reachjax.sets import AbstractSet, Box, Intersection, Polytope
 
 TOUCHING = 1e-6
 """A cell that a set barely touches is enlarged by this part of its box."""
@@ -41,7 +39,7 @@ def grid(X: AbstractSet, counts: Sequence[int]) -> list[Cell]:
         counts: how many parts each coordinate is cut into.
 
     Raises:
-        TypeError: a count is no whole number, or the set is of an unknown kind.
+        TypeError: a count is no whole number.
         ValueError: there is not a positive number for each coordinate.
 
     Example:
@@ -52,7 +50,7 @@ def grid(X: AbstractSet, counts: Sequence[int]) -> list[Cell]:
         raise ValueError(
             f"cells must be a number for each of {X.dimension} coordinates, but {counts} arrived"
         )
-    box, ends = bounding_box(X), []
+    box, ends = X.bounding_box(), []
     for i, count in enumerate(counts):
         parts = whole_number(f"cells[{i}]", count, 1) + 1
         ends.append(np.linspace(box.lower[i], box.upper[i], parts))
@@ -86,34 +84,11 @@ def halves(X: AbstractSet, box: Box, scale: Float[np.ndarray, " n"]) -> list[Cel
 
 def _reached(X: AbstractSet, boxes: Iterable[Box]) -> list[Cell]:
     """What a set has in common with boxes, but for those that it surely does not reach."""
-    return [Cell(box, _within(X, box)) for box in boxes if not _apart(X, box)]
-
-
-def _apart(X: AbstractSet, box: Box) -> bool:
-    """Whether a set surely has no point in a box; a separating direction proves it."""
-    if isinstance(X, Box):
-        return False
-    if isinstance(X, Intersection):
-        return any(_apart(part, box) for part in X.parts)
-    if isinstance(X, Ellipsoid):
-        direction = _towards(X, box)[None]
-        return bool(-box.support(-direction) > X.support(direction))
-    if isinstance(X, PolyhedralSet):
-        return bool(separation(X, box) > 0)
-    raise TypeError(f"X0 must be a set that can be cut, but {described(X)} arrived")
-
-
-def _towards(X: Ellipsoid, box: Box) -> Float[Array, " n"]:
-    """The normal, in the ellipsoid's metric, at the point of a box closest to its centre."""
-    A, b = (np.asarray(part) for part in X.normal_form)
-    nearest = lsq_linear(A, -b, bounds=(box.lower, np.nextafter(box.upper, np.inf))).x
-    return jnp.asarray(A.T @ (A @ nearest + b))
+    return [Cell(box, _within(X, box)) for box in boxes if not X.misses(box)]
 
 
 def _within(X: AbstractSet, box: Box) -> AbstractSet:
     """The points of a set that lie in a box, and few others."""
-    if isinstance(X, Box):
-        return box
     room = TOUCHING * jnp.max(box.widths)
     larger = Box(box.lower - room, box.upper + room)
     for around in (box, larger):
@@ -123,32 +98,21 @@ def _within(X: AbstractSet, box: Box) -> AbstractSet:
         except (ValueError, RuntimeError):  # too thin to be told from an empty set
             continue
         return cell
-    return _behind_a_tangent(X, larger)
-
-
-def _behind_a_tangent(X: AbstractSet, box: Box) -> AbstractSet:
-    """What facets leave of a box from which a set's round part cuts little."""
-    if isinstance(X, Intersection):
-        polytope, ball = _cut(X.polytope, box), X.ellipsoid
-    elif isinstance(X, Ellipsoid):
-        polytope, ball = box, X
-    else:
-        return box
-    direction = _towards(ball, box)[None]
-    assert isinstance(polytope, PolyhedralSet)
-    (A, b), top = polytope.facets, ball.support(direction)
-    return Polytope(jnp.concatenate([A, direction]), jnp.concatenate([b, top]))
+    return _behind_a_tangent(_cut(X, larger), larger)
 
 
 def _cut(X: AbstractSet, box: Box) -> AbstractSet:
-    if isinstance(X, Ellipsoid):
-        return Intersection(box, X)
-    if isinstance(X, Intersection):
-        polytope = _cut(X.polytope, box)
-        assert isinstance(polytope, PolyhedralSet)
-        return X.replace(polytope=polytope)
-    assert isinstance(X, PolyhedralSet)
-    if isinstance(X, Box):
-        return Box(jnp.maximum(X.lower, box.lower), jnp.minimum(X.upper, box.upper))
-    (A, b), (C, d) = X.facets, box.facets
-    return Polytope(jnp.concatenate([A, C]), jnp.concatenate([b, d]))
+    """The points of a set that lie in a box."""
+    polytope, ball = X.parts
+    polytope = polytope.cut(box) if polytope else box
+    return Intersection(polytope, ball) if ball else polytope
+
+
+def _behind_a_tangent(cell: AbstractSet, box: Box) -> AbstractSet:
+    """What facets leave of a box from which an ellipsoid cuts little."""
+    (A, b), (_, ball) = cell.facets, cell.parts
+    if ball is None:
+        return box
+    direction = ball.normal_towards(box)[None]
+    top = ball.support(direction)
+    return Polytope(jnp.concatenate([A, direction]), jnp.concatenate([b, top]))

@@ -28,8 +28,7 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
-from reachjax.sets import AbstractSet, Polytope, Template
-from reachjax.sets.geometry import bounding_box, support
+from reachjax.sets import AbstractSet, Template
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.cells import grid, halves
 from reachjax.tubes.reach import SAMPLES, ReachTube, reach
@@ -250,7 +249,7 @@ def _tube(loop: ClosedLoop, cell: AbstractSet, template: Template, options: dict
 
 def _guided(run: _Run, X0: AbstractSet, count: int) -> list[ReachTube]:
     """Halve the cells at which the union's gap is widest, along their longest side."""
-    boxes, tubes = [bounding_box(X0)], run.tubes([X0])
+    boxes, tubes = [X0.bounding_box()], run.tubes([X0])
     sides = np.asarray(boxes[0].widths)
     sides = np.where(sides > 0, sides, np.inf)  # a side without length is not halved
     widths = _widths(tubes[0])
@@ -275,8 +274,8 @@ def _attained(X0: AbstractSet, tube: ReachTube, t: int) -> Float[np.ndarray, " m
 
 def _widths(tube: ReachTube) -> Float[np.ndarray, "h m"]:
     """The width of each set in the direction of each facet."""
-    sets = tube.sets[1:]
-    return np.array([X.b + support(X, -X.A) for X in sets if isinstance(X, Polytope)])
+    facets = ((X, *X.facets) for X in tube.sets[1:])
+    return np.array([b + X.support(-A) for X, A, b in facets])
 
 
 def _worst(X0: AbstractSet, tubes: list[ReachTube], widths: Float[np.ndarray, "h m"]) -> list[int]:

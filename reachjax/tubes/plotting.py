@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
-from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet
-from reachjax.sets.balance import exponents
+from reachjax.sets import AbstractSet
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
 
@@ -17,9 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SET = {"facecolor": "none", "edgecolor": "tab:red", "linewidth": 1.4}
-OUTLINE = 200
-"""Points of an ellipse's outline."""
-
 SAMPLES = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
 
 
@@ -59,7 +54,7 @@ def plot_set(
     from matplotlib.patches import Polygon
 
     ax = _axes(ax)
-    ax.add_patch(Polygon(_outline(region, i, j), closed=True, **{**SET, **style}))
+    ax.add_patch(Polygon(region.outline(i, j), closed=True, **{**SET, **style}))
     ax.autoscale_view()
     return ax
 
@@ -76,44 +71,6 @@ def _two_of(dimension: int, coordinates: Any) -> tuple[int, int]:
             f"but {coordinates!r} arrived"
         )
     return int(chosen[0]), int(chosen[1])
-
-
-def _outline(region: AbstractSet, i: int, j: int) -> np.ndarray:
-    """Points around a set's shadow on two coordinates, in order."""
-    if isinstance(region, Intersection):
-        return _cut(_outline(region.polytope, i, j), region.ellipsoid.projection(i, j))
-    if isinstance(region, Ellipsoid):
-        shadow = region.projection(i, j)
-        return np.asarray(shadow.center) + _circle() @ np.linalg.cholesky(shadow.shape).T
-    if isinstance(region, Box):
-        box = region.bounding_box()  # a box of many dimensions has too many corners to list
-        region = Box(box.lower[np.array([i, j])], box.upper[np.array([i, j])])
-        i, j = 0, 1
-    assert isinstance(region, PolyhedralSet)
-    corners = np.asarray(region.vertices())[:, [i, j]]
-    try:  # in units of their own: Qhull takes small differences for none
-        return corners[ConvexHull(np.ldexp(corners, -exponents(corners.T))).vertices]
-    except QhullError:  # on a line: its two ends
-        return corners[np.lexsort(corners.T)[[0, -1]]]
-
-
-def _circle() -> np.ndarray:
-    angles = np.linspace(0, 2 * np.pi, OUTLINE, endpoint=False)
-    return np.column_stack([np.cos(angles), np.sin(angles)])
-
-
-def _cut(corners: np.ndarray, ellipse: Ellipsoid) -> np.ndarray:
-    """What the tangents of an ellipse leave of a convex polygon, corners in order."""
-    A, b = (np.asarray(part) for part in ellipse.normal_form)
-    for tangent in _circle():
-        room = 1 - corners @ (tangent @ A) - tangent @ b
-        after, left = np.roll(corners, -1, axis=0), np.roll(room, -1)
-        crossing = room * left < 0
-        share = np.where(crossing, room / np.where(crossing, room - left, 1.0), 0.0)
-        between = corners + share[:, None] * (after - corners)
-        either = np.stack([corners, between], axis=1).reshape(-1, 2)
-        corners = either[np.stack([room >= 0, crossing], axis=1).ravel()]
-    return corners
 
 
 def plot_tube(

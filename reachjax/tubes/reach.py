@@ -28,8 +28,7 @@ from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
 from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.witnesses import Simulations, initial_states
-from reachjax.sets import AbstractSet, AbstractTemplate, Intersection
-from reachjax.sets.geometry import separation
+from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
 from reachjax.tubes.steps import Setting, Step, boxed
@@ -267,7 +266,7 @@ def _simulations(
     except ValueError as error:
         raise ValueError(f"X0 cannot be used: {error}") from None
     except RuntimeError:
-        if isinstance(X0, Intersection) and separation(X0.ellipsoid, X0.polytope) > 0:
+        if X0.surely_empty():
             raise ValueError(
                 "X0 is empty: its polytope and its ellipsoid have no point in common"
             ) from None

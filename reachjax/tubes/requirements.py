@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import described, is_concrete, real_number, require_kind
-from reachjax.sets import Box, PolyhedralSet
-from reachjax.sets.geometry import facets_in_units, separation, support
+from reachjax.sets import PolyhedralSet
 from reachjax.tubes.reach import ReachTube
 
 AvoidSets = Sequence[PolyhedralSet] | Mapping[int, Sequence[PolyhedralSet]]
@@ -65,13 +64,13 @@ class Requirement:
         """What every state surely does not exceed, and should not: of each facet, or of the set."""
         reached = tube.sets[self.time]
         if self.inside:
-            C, d, norms = facets_in_units(self.region, inner=True)
-            return Compared(support(reached, C), d, norms)
-        return Compared(-separation(reached, self.region)[None], jnp.zeros(1), jnp.ones(1))
+            C, d, norms = self.region.facets_in_units(inner=True)
+            return Compared(reached.support(C), d, norms)
+        return Compared(-reached.separation(self.region)[None], jnp.zeros(1), jnp.ones(1))
 
     def simulated(self, trajectories: np.ndarray) -> np.ndarray:
         """How far each trajectory `(c,)` is on the right side; negative on the wrong one."""
-        C, d, norms = (np.asarray(part) for part in facets_in_units(self.region))
+        C, d, norms = (np.asarray(part) for part in self.region.facets_in_units())
         with np.errstate(over="ignore", invalid="ignore"):
             room = (d - trajectories[:, self.time] @ C.T) / norms
         depth = room.min(axis=1)
@@ -136,7 +135,7 @@ def requirements(
         raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")
     for item in found:
         require_kind(item.name, item.region, PolyhedralSet, "a Box or a Polytope")
-        if isinstance(item.region, Box) and item.region.steps is not None:
+        if item.region.steps is not None:
             raise ValueError(f"{item.name} must be one box, but a time-varying one arrived")
         if item.region.dimension != states:
             raise ValueError(

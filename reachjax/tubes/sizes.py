@@ -13,11 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import described
-from reachjax.sets import AbstractSet, Intersection, Polytope
-from reachjax.sets.geometry import bounding_box, polytope_volume
+from reachjax.sets import AbstractSet
 from reachjax.tubes.reach import ReachTube
-
-EXACT_DIMENSIONS = 4
 
 
 def volume(X: AbstractSet) -> Float[Array, ""]:
@@ -40,13 +37,7 @@ def volume(X: AbstractSet) -> Float[Array, ""]:
         Array([3., 3., 2., 2.], dtype=float64)
     """
     _require_set(X)
-    if isinstance(X, Intersection):
-        return jnp.minimum(*(volume(part) for part in X.parts))
-    if not isinstance(X, Polytope):
-        return jnp.asarray(X.volume())
-    if X.dimension <= EXACT_DIMENSIONS:
-        return polytope_volume(X)
-    return jnp.prod(bounding_box(X).widths)
+    return X.size()
 
 
 def log_widths(X: AbstractSet) -> Float[Array, " n"]:
@@ -62,7 +53,7 @@ def log_widths(X: AbstractSet) -> Float[Array, " n"]:
         [0.0, 0.693147]
     """
     _require_set(X)
-    return jnp.log(bounding_box(X).widths)
+    return jnp.log(X.bounding_box().widths)
 
 
 def log_volume(X: AbstractSet | ReachTube) -> Float[Array, ""]:

@@ -19,7 +19,6 @@ from reachjax.programs.windows import Window
 from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, Box, Polytope
-from reachjax.sets.geometry import bounding_box, row_ranges
 from reachjax.solvers import AbstractSolver
 from reachjax.solvers.cut_pool import NONE
 
@@ -31,7 +30,7 @@ def boxed(X: AbstractSet, name: str) -> Box:
         ValueError: the set, which the error calls by this name, is empty or unbounded.
     """
     try:
-        return bounding_box(X)
+        return X.bounding_box()
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"{name} cannot be used: {error}") from None
 
@@ -122,12 +121,12 @@ class Step:
     @cached_property
     def first_inputs(self) -> Ball | None:
         """The ranges of the first layer's inputs over the set; None where its box says as much."""
-        if not (self.setting.relaxation.linear_bounds and isinstance(self.X, Polytope)):
+        if not (self.setting.relaxation.linear_bounds and self.X.needs_programs):
             return None
         rows = first_rows(self.setting.loop)
         if rows is None:
             return None
-        return first_inputs(rows, *row_ranges(self.X, rows.mid[:, :-1]), self.box)
+        return first_inputs(rows, *self.X.row_ranges(rows.mid[:, :-1]), self.box)
 
     @property
     def warm_start(self) -> Int[np.ndarray, "p 2"]:

@@ -7,7 +7,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.programs.bounds import loop_bounds, successor_box
-from reachjax.programs.preactivations import bounds_over, known_inputs, rounded
+from reachjax.programs.preactivations import bounds_over, known_inputs
 from reachjax.programs.windows import Window
 from reachjax.tubes.steps import Setting, Step
 from tests.cases import some
@@ -71,7 +71,7 @@ def linear_bounds(loop, X, t=0):
     """What a window of one step has for bounds, where a relaxation asks for linear ones."""
     setting = Setting(loop, t, rj.AllProducts(), rj.Auto(), None, False, None)
     known, box = known_inputs(loop.units, Step(setting, X, 0, ()).first_inputs), X.bounding_box()
-    return bounds_over(loop, rounded(X, box), box, t, known).preactivation
+    return bounds_over(loop, X.closed_form(box), box, t, known).preactivation
 
 
 def preactivations(data, x, t=0):

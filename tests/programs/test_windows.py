@@ -10,7 +10,6 @@ import pytest
 
 import reachjax as rj
 from reachjax.programs.windows import COLUMNS, Window
-from reachjax.sets.geometry import bounding_box
 from tests.cases import some
 from tests.closed_loops import closed_loop, initial_set, random_loop
 from tests.networks import box_region, simulate
@@ -154,11 +153,11 @@ def test_facts_hold_of_every_trajectory(n_x, kind, relaxation):
     loop, X0 = closed_loop(random_loop(n_x, hidden=(5, 4), seed=3)), initial_set(kind, n_x)
     sets = [X0, *around(loop, X0)]
     windows = [
-        Window.beginning(loop, X0, bounding_box(X0), 0, relaxation, compact)
+        Window.beginning(loop, X0, X0.bounding_box(), 0, relaxation, compact)
         for compact in (False, True)
     ]
     for X in sets:
-        windows = [window.extended(loop, X, bounding_box(X)) for window in windows]
+        windows = [window.extended(loop, X, X.bounding_box()) for window in windows]
     programs = [window.program(jnp.eye(n_x), relaxation) for window in windows]
     xi, last = map(np.asarray, unrolled(loop, X0.sample(jax.random.key(2), 2000)))
     stays = np.asarray(programs[0].used)

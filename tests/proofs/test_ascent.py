@@ -28,9 +28,7 @@ def climbed(loop, X, k=HORIZON, starts=None, horizon=HORIZON, start=0):
     begin = states if starts is None else starts
     region = rj.Template.box(n_x).polytope(jnp.zeros(2 * n_x))
     which = np.arange(len(begin)) % (2 * n_x)
-    end = ascended(
-        loop, X, X.bounding_box(), states.mean(axis=0), begin, region, which, k, horizon, start
-    )
+    end = ascended(loop, X, X.scale(), states.mean(axis=0), begin, region, which, k, horizon, start)
 
     def values(points):
         after = loop.simulate(jnp.asarray(points), horizon, start)[:, k]

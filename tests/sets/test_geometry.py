@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.sets.geometry import bounding_box, row_ranges, separation, support
 from tests.networks import simplex_region
 
 
@@ -16,20 +15,20 @@ def simplex(n, seed):
 
 
 def box_ends(A, b):
-    box = bounding_box(rj.Polytope(A, b))
+    box = rj.Polytope(A, b).bounding_box()
     return jnp.concatenate([box.lower, box.upper])
 
 
 def supports(A, b, D):
-    return support(rj.Polytope(A, b), D)
+    return rj.Polytope(A, b).support(D)
 
 
 def ranges(A, b, D):
-    return jnp.concatenate(row_ranges(rj.Polytope(A, b), D))
+    return jnp.concatenate(rj.Polytope(A, b).row_ranges(D))
 
 
 def separations(A, b, C, d):
-    return separation(rj.Polytope(A, b), rj.Polytope(C, d))[None]
+    return rj.Polytope(A, b).separation(rj.Polytope(C, d))[None]
 
 
 def arguments(name, n):
@@ -77,16 +76,16 @@ def test_supports_of_a_box_and_of_the_same_polytope_agree():
     box = rj.Box([-1.0, 2.0], [0.5, 3.0])
     D = jnp.array([[1.0, 2.0], [-3.0, 0.5], [0.0, -1.0]])
     polytope = rj.Polytope(*box.facets)
-    np.testing.assert_allclose(support(box, D), support(polytope, D), rtol=1e-12)
-    gradient = jax.grad(lambda u: support(rj.Box(box.lower, u), D)[0])(box.upper)
+    np.testing.assert_allclose(box.support(D), polytope.support(D), rtol=1e-12)
+    gradient = jax.grad(lambda u: rj.Box(box.lower, u).support(D)[0])(box.upper)
     np.testing.assert_allclose(gradient, [1.0, 2.0])
 
 
 def test_where_a_whole_face_attains_a_range_its_derivative_is_that_at_a_corner():
     box, rows = rj.Box([-1.0, 2.0], [0.5, 3.0]), jnp.eye(2)
     A, b = box.facets
-    np.testing.assert_allclose(row_ranges(rj.Polytope(A, b), rows), [box.lower, box.upper])
-    upper = lambda A, b: row_ranges(rj.Polytope(A, b), rows)[1][0]  # noqa: E731
+    np.testing.assert_allclose(rj.Polytope(A, b).row_ranges(rows), [box.lower, box.upper])
+    upper = lambda A, b: rj.Polytope(A, b).row_ranges(rows)[1][0]  # noqa: E731
     normals, offsets = jax.grad(upper, argnums=(0, 1))(A, b)
     # x_1 <= 1/2 turned about a corner: by -x_2 for that corner's x_2
     assert float(normals[2, 0]) == pytest.approx(-0.5)

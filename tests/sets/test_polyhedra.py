@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from reachjax.sets import polyhedra
+from reachjax.sets.separation import separation_and_multipliers
 from tests.networks import box_region, simplex_region
 
 fractions = np.vectorize(Fraction, otypes=[object])
@@ -35,14 +36,16 @@ def test_dual_multipliers_are_nonnegative_and_prove_the_support(region):
 @pytest.mark.parametrize("size", [1e-200, 1e200])
 def test_supports_in_directions_whose_squares_are_no_numbers(region, size):
     D = np.random.default_rng(1).normal(size=(10, region.A.shape[1]))
-    values = polyhedra.support(region.A, region.b, size * D)
-    np.testing.assert_allclose(values / size, polyhedra.support(region.A, region.b, D), rtol=1e-9)
+    values = polyhedra.support(region.A, region.b, size * D)[0]
+    np.testing.assert_allclose(
+        values / size, polyhedra.support(region.A, region.b, D)[0], rtol=1e-9
+    )
 
 
 def test_bounds_hold_for_the_exact_corners_of_a_long_thin_triangle():
     # x <= 1, x + 1e6 y >= 0 and x - 1e6 y >= 0: corners (0, 0) and (1, -+1e-6), to rounding
     A, b = np.array([[1.0, 0.0], [-1.0, -1e6], [-1.0, 1e6]]), np.array([1.0, 0.0, 0.0])
-    lower, upper = (fractions(part) for part in polyhedra.bounding_box(A, b))
+    lower, upper = (fractions(part) for part in polyhedra.bounding_box(A, b)[:2])
     tip = 1 / Fraction(1e6)
     assert lower[0] <= 0
     assert lower[1] <= -tip
@@ -59,11 +62,11 @@ def test_bounds_pay_for_inexact_multipliers(monkeypatch):
         return 0.99 * y + 0.001, x
 
     monkeypatch.setattr(polyhedra, "maximiser", sloppy)
-    lower, upper = polyhedra.bounding_box(A, b)
+    lower, upper, *_ = polyhedra.bounding_box(A, b)
     assert (lower <= [-2, -1]).all()
     assert (upper >= [1, 3]).all()
     directions = np.array([[1.0, 1.0], [-1.0, 0.5]])
-    assert (polyhedra.support(A, b, directions) >= [4.0, 3.5]).all()
+    assert (polyhedra.support(A, b, directions)[0] >= [4.0, 3.5]).all()
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
@@ -88,16 +91,16 @@ def test_the_largest_ball_of_an_unbounded_or_empty_polytope_is_refused():
 def test_the_margin_of_two_boxes_is_the_gap_between_their_facets(n, gap):
     A, b = cube([-1.0] * n, [1.0] * n)
     C, d = cube([1.0 + gap, *[-3.0] * (n - 1)], [5.0 + gap, *[3.0] * (n - 1)])
-    margin = polyhedra.separation_and_multipliers(A, b, C, d)[0]
+    margin = separation_and_multipliers(A, b, C, d)[0]
     assert Fraction(margin) <= Fraction(gap)
     assert margin == pytest.approx(gap, abs=1e-12)
 
 
 def test_the_margin_is_a_distance_along_normals_not_between_corners():
-    margin = polyhedra.separation_and_multipliers(*cube([0, 0], [1, 1]), *cube([2, 2], [3, 3]))[0]
+    margin = separation_and_multipliers(*cube([0, 0], [1, 1]), *cube([2, 2], [3, 3]))[0]
     assert margin == pytest.approx(1.0, abs=1e-12)
     diagonal, offset = np.array([[-1.0, -1.0]]), np.array([-4.0])  # x + y >= 4
-    margin = polyhedra.separation_and_multipliers(*cube([0, 0], [1, 1]), diagonal, offset)[0]
+    margin = separation_and_multipliers(*cube([0, 0], [1, 1]), diagonal, offset)[0]
     assert margin == pytest.approx(np.sqrt(2), abs=1e-12)
 
 
@@ -119,7 +122,7 @@ def test_the_margin_is_that_of_a_convex_program(n, seed, distance):
     x = cp.Variable(n)
     excess = cp.max(cp.multiply(1 / np.linalg.norm(C, axis=1), C @ x - d))
     expected = cp.Problem(cp.Minimize(excess), [first.A @ x <= first.b]).solve(solver="CLARABEL")
-    margin = polyhedra.separation_and_multipliers(first.A, first.b, C, d)[0]
+    margin = separation_and_multipliers(first.A, first.b, C, d)[0]
     assert margin == pytest.approx(expected, abs=1e-6)
     assert distance not in (0.0, 4.0) or (expected > 0) == (distance == 4.0)
 
@@ -147,18 +150,16 @@ def test_boxes_of_any_scale_are_found_with_facets_of_any_length(lower, upper, ro
 
 def test_a_small_facet_tells_two_sets_apart():
     small = np.array([[1e-170, 0.0]]), np.array([-1e-165])  # x <= -1e5
-    margin = polyhedra.separation_and_multipliers(*cube([-1, -1], [1, 1]), *small)[0]
+    margin = separation_and_multipliers(*cube([-1, -1], [1, 1]), *small)[0]
     assert margin == pytest.approx(1e5 - 1)
 
 
 @pytest.mark.parametrize("size", [1e-160, 1e-60, 1e60, 1e150])
 def test_separations_and_supports_grow_with_their_sets(size):
     triangle, box = simplex_region(2, 3), cube([3.0, 3.0], [4.0, 5.0])
-    once = polyhedra.separation_and_multipliers(triangle.A, triangle.b, *box)[0]
-    scaled = polyhedra.separation_and_multipliers(
-        triangle.A, size * triangle.b, box[0], size * box[1]
-    )[0]
+    once = separation_and_multipliers(triangle.A, triangle.b, *box)[0]
+    scaled = separation_and_multipliers(triangle.A, size * triangle.b, box[0], size * box[1])[0]
     assert scaled == pytest.approx(size * once, rel=1e-9)
     D = np.array([[1.0, 2.0], [-1.0, 0.5]])
-    values = polyhedra.support(triangle.A, size * triangle.b, D)
-    np.testing.assert_allclose(values, size * polyhedra.support(triangle.A, triangle.b, D), 1e-9)
+    values = polyhedra.support(triangle.A, size * triangle.b, D)[0]
+    np.testing.assert_allclose(values, size * polyhedra.support(triangle.A, triangle.b, D)[0], 1e-9)

@@ -11,7 +11,6 @@ import pytest
 import reachjax as rj
 from reachjax.programs.lmi import lagrangian_slopes
 from reachjax.programs.windows import step_program
-from reachjax.sets.geometry import bounding_box
 from reachjax.solvers import Facets, proved
 from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.differences import along, error_in_all_parts, norm, relative_error
@@ -99,7 +98,7 @@ def test_the_gradient_is_as_accurate_as_the_solver():
 
 def test_the_lagrangian_at_the_solution_is_the_offset():
     loop, X = planar(0)
-    program = step_program(loop, X, bounding_box(X), TEMPLATE.directions, 0, rj.LocalBounds())
+    program = step_program(loop, X, X.bounding_box(), TEMPLATE.directions, 0, rj.LocalBounds())
     offsets, solution = jax.device_get(proved_offsets(program, rj.Clarabel()))
     facts, objective = program.facts.mid, program.objective.mid
     for facet in range(len(offsets)):

@@ -1,5 +1,8 @@
 """The library's loops from the arrays of `tests.networks`."""
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import numpy as np
 
 import reachjax as rj
@@ -22,14 +25,21 @@ def closed_loop(data: LoopData) -> rj.ClosedLoop:
     )
 
 
-def autonomous(A, input_box=None):
+def autonomous(A: Any, input_box: rj.Box | None = None) -> rj.ClosedLoop:
     """`x+ = A x`, whatever the controller does: its sets are known exactly."""
     n_x = len(A)
-    net = rj.MLP.from_layers([(np.zeros((1, n_x)), [0.0])])
+    net = rj.MLP.from_layers([(np.zeros((1, n_x)), np.zeros(1))])
     return rj.ClosedLoop(rj.AffinePlant(A, np.zeros((n_x, 1))), net, input_box)
 
 
-def random_loop(n_x, hidden=(6, 4), seed=0, boxed=True, steps=None, network=he_network):
+def random_loop(
+    n_x: int,
+    hidden: Sequence[int] = (6, 4),
+    seed: int = 0,
+    boxed: bool = True,
+    steps: int | None = None,
+    network: Callable = he_network,
+) -> LoopData:
     """Arrays of a loop with `n_x` states; with `steps` it is time-varying."""
     n_u = min(n_x, 2)
     box = input_box(n_u, seed, steps) if boxed else (None, None)
@@ -37,7 +47,7 @@ def random_loop(n_x, hidden=(6, 4), seed=0, boxed=True, steps=None, network=he_n
     return LoopData(layers, *plant(n_x, n_u, seed, steps), *box)
 
 
-def initial_set(kind, n_x, seed=0):
+def initial_set(kind: str, n_x: int, seed: int = 0) -> Any:
     """A set of this kind; boxes and ellipsoids are skewed but for the kind `box`."""
     rng, straight = np.random.default_rng(seed), box_region(n_x, seed).corners
     rotated, simplex = box_region(n_x, seed, rotated=True), simplex_region(n_x, seed)
@@ -58,11 +68,24 @@ def initial_set(kind, n_x, seed=0):
     }[kind]
 
 
-def recursion(loop, X0, horizon, template, relaxation=rj.LocalBounds(), **options):  # noqa: B008
+def recursion(
+    loop: rj.ClosedLoop,
+    X0: rj.AbstractSet,
+    horizon: int,
+    template: rj.AbstractTemplate,
+    relaxation: rj.AbstractRelaxation = rj.LocalBounds(),  # noqa: B008  (immutable)
+    **options: Any,
+) -> rj.ReachTube:
     """The paper's recursion with local bounds: one small program a facet, also inside `jax.jit`."""
     return rj.reach(loop, X0, horizon, template, relaxation, 1, **options)
 
 
-def one_step(loop, X, template, relaxation=rj.LocalBounds(), **options):  # noqa: B008
+def one_step(
+    loop: rj.ClosedLoop,
+    X: rj.AbstractSet,
+    template: rj.AbstractTemplate,
+    relaxation: rj.AbstractRelaxation = rj.LocalBounds(),  # noqa: B008  (immutable)
+    **options: Any,
+) -> tuple[Any, Any]:
     """A step of `recursion`."""
     return rj.reach_step(loop, X, template, relaxation=relaxation, **options)

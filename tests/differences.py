@@ -66,7 +66,8 @@ def error_in_all_parts(f, args, gradient, h, seed=0):
         h: by how much parts move; those of a small gradient up to ten times as far.
         seed: of the direction.
     """
-    moves = [along(part, *args, seed) for part in PARTS]
+    loop, X0 = args
+    moves = [along(part, loop, X0, seed) for part in PARTS]
     sizes = [norm(jax.tree.map(lambda g, d: g * (d != 0), gradient, move)) for move in moves]
     size = float(np.median(sizes))
     weights = [

@@ -9,6 +9,7 @@ Layers are [(W, b), ...] with W (out, in); ReLU between them, the last one affin
 
 from dataclasses import dataclass
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 
@@ -24,11 +25,12 @@ class LoopData:
     u_lower: np.ndarray | None = None  # ([steps,] n_u)
     u_upper: np.ndarray | None = None
 
-    def at(self, t):
+    def at(self, t) -> tuple[Any, Any, Any, Any, Any]:
         """(A_t, B_t, c_t, u_lower_t, u_upper_t)."""
         A, B, c = (v[t] if v.ndim > n else v for v, n in ((self.A, 2), (self.B, 2), (self.c, 1)))
-        box = (v if v is None or v.ndim == 1 else v[t] for v in (self.u_lower, self.u_upper))
-        return A, B, c, *box
+        ends = (self.u_lower, self.u_upper)
+        lower, upper = (v if v is None or v.ndim == 1 else v[t] for v in ends)
+        return A, B, c, lower, upper
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ def saturating_network(sizes, seed):
     return [*hidden, (4.0 * W, 4.0 * b)]
 
 
-def plant(n_x, n_u, seed, steps=None):
+def plant(n_x, n_u, seed, steps=None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(A, B, c) with spectral radius 0.95; with `steps`, each varies in time around it (LTV)."""
     rng = np.random.default_rng(seed)
     lead = () if steps is None else (steps,)
@@ -109,10 +111,11 @@ def plant(n_x, n_u, seed, steps=None):
     B, c = 0.5 * rng.normal(size=(n_x, n_u)), 0.1 * rng.normal(size=n_x)
     if steps is None:
         return A, B, c
-    return tuple(v + 0.1 * rng.normal(size=lead + v.shape) for v in (A, B, c))
+    A, B, c = (v + 0.1 * rng.normal(size=lead + v.shape) for v in (A, B, c))
+    return A, B, c
 
 
-def input_box(n_u, seed, steps=None):
+def input_box(n_u, seed, steps=None) -> tuple[np.ndarray, np.ndarray]:
     """(u_lower, u_upper) around zero, half-widths from 0.3 to 1, not symmetric."""
     rng = np.random.default_rng(seed)
     shape = (n_u,) if steps is None else (steps, n_u)

@@ -111,7 +111,8 @@ def _projected(
     # what a set bounds is convex: on the way from the middle it grows at most linearly
     limit = jnp.concatenate(limits)
     here, there = X0.bounded_values(middle), X0.bounded_values(state)
-    share = jnp.where(there > limit, jnp.maximum(limit - here, 0.0) / (there - here), 1.0)
+    grown = jnp.where(there > here, there - here, 1.0)  # not where the middle is outside as well
+    share = jnp.where(there > limit, jnp.maximum(limit - here, 0.0) / grown, 1.0)
     return middle + INSIDE * jnp.min(share) * (state - middle)
 
 

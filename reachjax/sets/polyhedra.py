@@ -19,6 +19,9 @@ from reachjax.sets.balance import Balanced, balanced, exponents, lengths, upward
 UNEVEN = 10
 """Coordinates whose sizes are further from 1, as powers of two, are scaled anew."""
 
+NOTHING = 1e-290
+"""Coordinates that are no larger, where facets are about 1 away, are zero but for underflow."""
+
 FAR = 1e12
 """Beside facets that many times its size away a polytope is a point: one of them says it all."""
 
@@ -127,7 +130,7 @@ def boxed(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, Maxima]:
         except (ValueError, RuntimeError):
             raise error from None
     size = box.size
-    by = np.where(size > 0, np.frexp(size)[1], 0)
+    by = np.where(size > NOTHING, np.frexp(size)[1], 0)
     if abs(by).max() > UNEVEN:
         mended = Balanced.of(A, b, region.columns + by)
         try:

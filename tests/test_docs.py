@@ -7,7 +7,10 @@ import matplotlib
 import pytest
 
 import reachjax as rj
+from docs.tools import campaign
 from docs.tools.rooms import picture
+from tests.campaign.outcomes import Failure, Outcome
+from tests.campaign.tables import report
 
 DOCS = Path(__file__).parent.parent / "docs"
 QUICKSTART = DOCS / "how-to" / "quickstart.md"
@@ -48,3 +51,19 @@ def test_a_public_name_stands_on_one_page_of_the_reference():
 
 def test_the_picture_of_the_rooms_is_the_one_that_is_drawn():
     assert (DOCS / "reference" / "rooms.svg").read_text() == picture()
+
+
+def test_the_page_of_the_campaign_takes_the_tables_of_a_report():
+    outcome = Outcome(3, {"set": "Box, flat", "fault": "None"})
+    outcome.statuses["SOLVED"] += 4
+    outcome.failures.append(Failure("a state outside", "at t = 1", ["print(1)"]))
+    page = campaign.filled(campaign.PAGE.read_text(), report([outcome], 0))
+    assert "1 cases of seed 0 gave 0 tubes" in page
+    assert "### Tried: set\n\n| set | cases |" in page
+    assert "\n| Box, flat | 1 | 0 | 0 | 1 |\n" in page
+    assert "\n| SOLVED | 4 |\n" in page
+    assert "\n| a state outside | 1 | 3 |\n" in page  # said, but without its reproduction
+    assert "print(1)" not in page
+    again = campaign.filled(page, report([Outcome(5, {"set": "Ellipsoid, thin"})], 0))
+    assert "Box, flat" not in again
+    assert again.startswith(page.split(campaign.BEGIN)[0])

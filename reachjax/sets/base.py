@@ -152,7 +152,10 @@ class AbstractSet(Replaceable, abc.ABC):
         """
         near, limits = self.nearest(point, scale), self.limits
         here, there = self.bounded_values(middle), self.bounded_values(near)
-        share = jnp.where(there > limits, jnp.maximum(limits - here, 0.0) / (there - here), 1.0)
+        grown = jnp.where(
+            there > here, there - here, 1.0
+        )  # not where the middle is outside as well
+        share = jnp.where(there > limits, jnp.maximum(limits - here, 0.0) / grown, 1.0)
         return middle + INSIDE * jnp.min(share) * (near - middle)
 
     @abc.abstractmethod

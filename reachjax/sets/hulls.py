@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, HalfspaceIntersection, QhullError
 
 from reachjax.sets.balance import Balanced, balanced, lengths
-from reachjax.sets.polyhedra import boxed, chebyshev, maximiser
+from reachjax.sets.polyhedra import NOTHING, boxed, chebyshev, maximiser
 
 TOO_THIN = "the polytope is too thin for its corners to be told apart"
 
@@ -17,6 +17,9 @@ PARALLEL = 1e-9
 
 FLAT = 1e-9
 """Scaled to a unit box, a polytope whose largest inscribed ball is smaller than this is flat."""
+
+ROUNDED = 1e-13
+"""A polytope that varies by no more of its coordinates' sizes is a point: facets are rounded."""
 
 
 def vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -39,6 +42,8 @@ def _corners(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, np.ndarray]:
         return region, np.unique([[min(ends)], [max(ends)]], axis=0)  # they may cross by rounding
     lower, upper = -box.values[:n], box.values[n:]
     middle, radii = (lower + upper) / 2, (upper - lower) / 2
+    if np.all(radii <= np.maximum(ROUNDED * box.size, NOTHING)):
+        return region, middle[None]
     radii = np.where(radii > FLAT * radii.max(), radii, radii.max() or 1.0)
     try:
         return region, middle + radii * _unit_vertices(*balanced(A * radii, b - A @ middle))
@@ -164,6 +169,7 @@ def _drawn(corners: np.ndarray, rng: np.random.Generator, count: int) -> np.ndar
     center = corners.mean(axis=0)
     _, values, rows = np.linalg.svd(corners - center, full_matrices=False)
     spanned = rows[values > FLAT * max(values.max(initial=0.0), np.finfo(float).tiny)]
+    spanned = spanned[: len(corners) - 1]  # the others are rounding
     flat = (corners - center) @ spanned.T
     if flat.shape[1] == 0:
         return np.repeat(center[None], count, axis=0)

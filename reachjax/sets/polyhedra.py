@@ -19,6 +19,9 @@ from reachjax.sets.balance import Balanced, balanced, lengths, upwards
 UNEVEN = 10
 """Coordinates whose sizes are further from 1, as powers of two, are scaled anew."""
 
+NOTHING = 1e-290
+"""Coordinates that are no larger, where facets are about 1 away, are zero but for underflow."""
+
 
 def maximiser(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Multipliers `y >= 0` of the facets, `A'y ~ direction`, that bound `max direction . x`, and x.
@@ -118,7 +121,7 @@ def boxed(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, Maxima]:
         except (ValueError, RuntimeError):
             raise error from None
     size = box.size
-    by = np.where(size > 0, np.frexp(size)[1], 0)
+    by = np.where(size > NOTHING, np.frexp(size)[1], 0)
     if abs(by).max() > UNEVEN:
         mended = Balanced.of(A, b, region.columns + by)
         try:

@@ -5,7 +5,6 @@ import traceback
 from pathlib import Path
 
 import reachjax as rj
-from tests.campaign.faults import LicenceError
 
 PACKAGE = str(Path(rj.__file__).parent)
 
@@ -21,24 +20,33 @@ NUMBER = re.compile(r"[-+]?(\d+\.?\d*(e[-+]?\d+)?|\binf\b|\bnan\b)", re.IGNORECA
 def unclear(error: BaseException) -> str | None:
     """What is wrong with an error as a message to a user; None if it is a clear one.
 
-    A clear one is raised by a statement of the library, is of a plain kind and names an argument.
+    A clear one is raised by a statement of the library, is of a plain kind, names an argument and
+    repeats nothing that another library said. Those of solvers are none: they have to be caught.
 
     Example:
         >>> unclear(IndexError("tuple index out of range"))
         'IndexError from elsewhere'
     """
-    if isinstance(error, LicenceError):  # the solver's own, passed on
-        return None
-    last = traceback.extract_tb(error.__traceback__)[-1:]
-    inside = bool(last) and last[0].filename.startswith(PACKAGE)
-    raised = inside and str(last[0].line).startswith("raise ")
+    inside, line = _origin(error)
+    raised = inside and line.startswith("raise ")
     if type(error) not in (ValueError, TypeError, RuntimeError, NotImplementedError) or not raised:
         return f"{type(error).__name__} from {'within' if inside else 'elsewhere'}"
     if "please report" in str(error):
         return "a proved specification is broken"
     if not NAMES.search(str(error)):
         return "no argument named"
+    heard = error.__context__
+    while heard is not None:
+        if str(heard) and str(heard) in str(error) and not _origin(heard)[0]:
+            return f"words of a {type(heard).__name__} from elsewhere"
+        heard = heard.__context__
     return None
+
+
+def _origin(error: BaseException) -> tuple[bool, str]:
+    """Whether an error is of the package's own code, and the line that it comes from."""
+    last = traceback.extract_tb(error.__traceback__)[-1:]
+    return bool(last) and last[0].filename.startswith(PACKAGE), str(last[0].line if last else "")
 
 
 def message_kind(error: BaseException) -> str:

@@ -115,8 +115,15 @@ USELESS = (
     "status NaN",
     "None",
     "an array",
+    "a tuple",
+    "a list",
+    "complex multipliers",
+    "raises",
 )
 """Faults after which a facet's program counts as failed."""
+
+OF_NUMBERS = ("NaN multipliers", "too few multipliers", "too many multipliers")
+"""Of these, the faults that spoil nothing where a program has no multipliers."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,10 +6,12 @@ from fractions import Fraction
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.campaign import gradients
 from tests.campaign.architectures import ARCHITECTURES, BLOCK
 from tests.campaign.cases import drawn
 from tests.campaign.claims import tried
@@ -173,6 +175,62 @@ def test_errors_are_told_apart():
     with pytest.raises(np.linalg.LinAlgError) as foreign:
         np.linalg.cholesky(-np.eye(2))
     assert unclear(foreign.value) == "LinAlgError from elsewhere"
+
+
+@pytest.mark.parametrize(
+    ("errors", "word"),
+    [
+        ((0.0, 0.5), "agrees"),
+        ((0.006, 0.0), "agrees, solved more exactly"),
+        ((0.006, 0.006), "wrong"),
+        ((0.05, 0.0), "wrong"),
+    ],
+)
+def test_wrong_derivatives_are_seen(monkeypatch, errors, word):
+    def pretended(template, relaxation, solver, horizon):
+        def value(given, weights):
+            def weighed(given):
+                b = jnp.concatenate([given[1].upper, -given[1].lower])
+                return weights @ b, (b, jnp.zeros(2))
+
+            found, slopes = jax.value_and_grad(weighed, has_aux=True)(given)
+            wrong = 1 + errors[gradients.SOLVERS.index(solver)]
+            return found, jax.tree.map(lambda slope: wrong * slope, slopes)
+
+        return value
+
+    monkeypatch.setattr(gradients, "_compiled", pretended)
+    case = SimpleNamespace(
+        parts={"template": "", "relaxation": ""}, shapes=SimpleNamespace(states=1, horizon=1)
+    )
+    far = rj.Box([1000.0], [1001.0])
+    assert gradients.compared(case, library_loop(), far, np.random.default_rng(1))[0] == word
+
+
+def test_words_of_other_libraries_are_unclear(monkeypatch):
+    def broken(*arguments):
+        raise ValueError("points must not contain NaN")
+
+    monkeypatch.setattr("reachjax.sets.hulls.ConvexHull", broken)
+    X0 = rj.Polytope([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], [1.0, 1.0, 1.0])
+    loop = rj.ClosedLoop(
+        rj.AffinePlant(np.eye(2), [[1.0], [0.0]]), rj.MLP.from_layers([([[0.1, 0.2]], [0.0])])
+    )
+    with pytest.raises(ValueError, match="X0 cannot be used: points") as repeated:
+        rj.reach(loop, X0, 1, rj.Template.box(2))
+    assert unclear(repeated.value) == "words of a ValueError from elsewhere"
+
+
+def test_an_exception_of_a_solver_is_a_failed_program():
+    solver = Faulty(rj.Clarabel(), "raises")
+    with pytest.warns(RuntimeWarning, match="LicenceError was raised"):
+        _, proof = rj.reach_step(
+            library_loop(), rj.Box([1.0], [2.0]), rj.Template.box(1), solver=solver
+        )
+    assert set(proof.statuses) == {rj.SolverStatus.FAILED}
+    with pytest.raises(RuntimeError, match="licence") as passed_on:
+        solver.solve(jax.device_get(proof.program))
+    assert unclear(passed_on.value) == "LicenceError from elsewhere"
 
 
 def test_a_case_fails_where_the_library_breaks(monkeypatch):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.proofs.ascent import ascended
+from reachjax.proofs.ascent import _projected, ascended
 from reachjax.proofs.witnesses import Simulations
 from tests.cases import some
 from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
@@ -141,3 +141,29 @@ def test_simulations_keep_what_ascents_find_and_tolerate_what_is_no_number(kind)
     )
     best = simulations.best(HORIZON, region, 0, 3)
     np.testing.assert_array_equal(best[0], found[0])
+
+
+# a segment whose points are no floats, and one of whose facets' squares underflow
+ROUNDED = (
+    [[-0.44658797, 0.89473973], [0.89473973, 0.44658797], [0.44658797, -0.89473973],
+     [-0.89473973, -0.44658797], [1.43458478, 0.53879141]],
+    [-21995.332933, 113.035396, 21996.894733, -113.035396, 3660.71452],
+)  # fmt: skip
+SHORT = (
+    1e-170 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]),
+    1e-170 * np.array([-0.918, -2.051, 0.918, 2.923]),
+)
+
+
+@pytest.mark.parametrize("facets", [ROUNDED, SHORT])
+def test_projections_onto_a_set_without_interior_are_points_of_it(facets):
+    X = rj.Polytope(*facets)
+    states = np.asarray(X.sample(jax.random.key(0), 400))
+    middle, box = states.mean(axis=0), X.bounding_box()
+    scale = np.diag(np.asarray(box.upper - box.lower) / 2)
+    moved = states + np.random.default_rng(1).normal(size=states.shape) @ scale
+    project = jax.jit(jax.vmap(_projected, in_axes=(None, None, None, None, 0)))
+    # where both ends of the way are outside, equally far, a share of it would be 0 / 0
+    found = np.asarray(project(X, box, middle, scale, moved))
+    away = (found @ np.asarray(X.A).T - X.b) / np.linalg.norm(X.A / abs(X.A).max(), axis=1)
+    assert np.all(away <= 1e-8 * abs(X.A).max() * abs(middle).max())

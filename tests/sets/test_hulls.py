@@ -47,3 +47,26 @@ def test_an_interval_without_points_is_refused():
         hulls.volume(np.array([[1.0], [-1.0]]), np.array([0.0, -1.0]))
     with pytest.raises(ValueError, match="unbounded"):
         hulls.vertices(np.array([[1.0]]), np.array([0.0]))
+
+
+ROWS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, -0.0], [-0.0, -1.0], [1.9e-6, -3.0]])
+
+
+@pytest.mark.parametrize(
+    "point", [[0.0, 0.0], [0.1, -1 / 3], [5e3, 0.0], [1e7 / 3, -1e-7 / 3], [1e-300, 0.0]]
+)
+def test_a_polytope_of_one_point_has_one_corner(point):
+    b = np.r_[point, np.negative(point), ROWS[-1] @ point + 0.1 + abs(ROWS[-1]) @ np.abs(point)]
+    for size in (1.0, 0.3, np.r_[0.1, 7.0, 0.3, 1.1, 300.0]):  # which round both ends apart
+        A, d = ROWS * np.reshape(size * np.ones(5), (5, 1)), b * size
+        np.testing.assert_allclose(hulls.vertices(A, d), [point], rtol=1e-14, atol=1e-280)
+        assert hulls.volume(A, d) == 0.0
+        assert hulls.uniform(A, d, np.random.default_rng(0), 3).shape == (3, 2)
+
+
+def test_points_are_drawn_from_a_segment_far_away():
+    A = np.array([[0.8, 0.6], [-0.6, 0.8], [-0.8, -0.6], [0.6, -0.8]])
+    b = np.array([1e8, 0.1, -1e8 + 1, -0.1])
+    x = hulls.uniform(A, b, np.random.default_rng(0), 5)
+    assert np.all(x @ A.T <= b + 1e-6)
+    assert np.ptp(x @ A[0]) > 0.1

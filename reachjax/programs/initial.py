@@ -1,0 +1,141 @@
+"""The columns that stand for the initial state: `x_0 = q + M w`, `w` in a unit ball.
+
+The ball is that of the largest entry around a box, and the round one around an ellipsoid, so every
+entry of `w` lies in `[-1, 1]`, and what a row over `w` attains is its 1-norm or its 2-norm. Where the
+set is smaller than `q + M w`, a part `S` of it cuts off more: for any row `a`,
+
+    r . w  <=  sup_S a - a . q + |r - a M|,
+
+since `x_0` is in `S`; `a = r M^+` leaves nothing over but rounding.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.numerics.pytrees import pytree, static
+from reachjax.numerics.rounding import Ball, gamma, namespace
+from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet, Polytope
+from reachjax.sets.polyhedra import support
+
+Ends = tuple[Any, Any]
+"""Lower and upper bounds `(k,)`."""
+
+
+@pytree
+class InitialColumns:
+    """The columns `w` of an initial set, `x_0 = center + spread w`.
+
+    Attributes:
+        center: `(n,)`.
+        spread: `(n, n)`.
+        back: `(n, n)`, nearly the pseudoinverse of `spread`.
+        cut: a set that also holds `x_0`, where there is one: a box, or on the host a polytope.
+        round: whether `|w| <= 1` in the 2-norm; in that of the largest entry if not.
+    """
+
+    center: Float[Array | np.ndarray, " n"]
+    spread: Float[Array | np.ndarray, "n n"]
+    back: Float[Array | np.ndarray, "n n"]
+    cut: PolyhedralSet | None
+    round: bool = static()
+
+    @classmethod
+    def of(cls, X: AbstractSet, box: Box) -> InitialColumns:
+        """Those of a set, numpy arrays if the set has numpy arrays.
+
+        Args:
+            X: the set. A polytope is itself the cut on the host, and is held by its box in JAX.
+            box: around it.
+        """
+        cut = X.polytope if isinstance(X, Intersection) else X
+        if isinstance(cut, Polytope) and namespace(cut.A) is not np:
+            cut = box
+        if isinstance(X, Intersection):
+            return _of_ball(X.ellipsoid, cut)
+        if isinstance(X, Ellipsoid):
+            return _of_ball(X, None)
+        return _of_box(box, cut if isinstance(cut, Polytope) else None)
+
+    def norms(self, rows: Float[Array, "k n"]) -> Float[Array, " k"]:
+        """What `r . w` does not exceed for each row, whatever the cut."""
+        if not self.round:
+            return abs(rows).sum(axis=1) * (1 + gamma(rows.shape[1]))
+        xp, fixed = namespace(rows), jax.lax.stop_gradient
+        largest = abs(rows).max(axis=1, initial=0.0)
+        some = largest > 0
+        unit = xp.where(some, largest if xp is np else fixed(largest), 1.0)
+        squares = xp.where(some, ((rows / unit[:, None]) ** 2).sum(axis=1), 1.0)
+        return xp.where(some, unit * xp.sqrt(squares) * (1 + gamma(rows.shape[1] + 8)), 0.0)
+
+    def farthest(self, rows: Float[Array, "k n"]) -> Float[Array, "k n"]:
+        """Initial states at which `r . w` is largest for each row, whatever the cut; rounded."""
+        xp = namespace(rows)
+        if not self.round:
+            return self.center + xp.sign(rows) @ self.spread.T
+        length = xp.sqrt((rows**2).sum(axis=1, keepdims=True))
+        return self.center + rows / xp.where(length > 0, length, 1.0) @ self.spread.T
+
+    def ends(self, rows: Float[Array, "k n"]) -> Ends:
+        """Bounds of `r . w` for each row, by the norm."""
+        norms = self.norms(rows)
+        return -norms, norms
+
+    def cut_ends(self, rows: Float[Array, "k n"]) -> Ends:
+        """Bounds of `r . w` for each row, by the cut as well."""
+        if self.cut is None:
+            return self.ends(rows)
+        xp, n = namespace(rows), rows.shape[1]
+        norms, a = self.norms(rows), rows @ self.back
+        least, most = _ends(self.cut, a)
+        left = abs(rows - a @ self.spread) + gamma(n + 2) * (abs(a) @ abs(self.spread) + abs(rows))
+        at, size = a @ self.center, abs(a) @ abs(self.center)
+        error = left.sum(axis=1) + gamma(n + 8) * (size + abs(rows).sum(axis=1))
+        lower = least - at - (error + gamma(4) * abs(least)) * (1 + gamma(n))
+        upper = most - at + (error + gamma(4) * abs(most)) * (1 + gamma(n))
+        return xp.fmax(-norms, lower), xp.fmin(norms, upper)
+
+
+def _of_box(box: Box, cut: PolyhedralSet | None) -> InitialColumns:
+    around = Ball.between(box.lower, box.upper)
+    xp = namespace(around.mid)
+    center, rad = _settled(around.mid, around.rad)
+    back = xp.where(rad > 0, 1.0 / xp.where(rad > 0, rad, 1.0), 0.0)
+    return InitialColumns(center, xp.diag(rad), xp.diag(back), cut, round=False)
+
+
+def _of_ball(ball: Ellipsoid, cut: PolyhedralSet | None) -> InitialColumns:
+    center, spread, back = _ball_map(ball)
+    if namespace(ball.center) is np:
+        center, spread, back = jax.device_get((center, spread, back))
+    return InitialColumns(center, spread, back, cut, round=True)
+
+
+@jax.jit
+def _ball_map(ball: Ellipsoid) -> tuple[Array, Array, Array]:
+    spread = ball.from_ball()
+    back = jax.numpy.linalg.inv(jax.lax.stop_gradient(spread))
+    return _settled(ball.center, spread, back)
+
+
+def _settled(*parts: Any) -> Any:
+    """One rounding of numbers for all that is made of them, whatever a compiler fuses."""
+    return parts if namespace(*parts) is np else jax.lax.optimization_barrier(parts)
+
+
+def _ends(cut: PolyhedralSet, directions: Float[Array, "k n"]) -> Ends:
+    """Least and largest values of directions on the cut, rounded outwards."""
+    if isinstance(cut, Box):
+        values = directions @ Ball.between(cut.lower, cut.upper)
+        return values.lower, values.upper
+    A, b = (np.asarray(part) for part in cut.facets)
+    count = len(directions)
+    try:
+        found = support(A, b, np.concatenate([-directions, directions]))
+    except RuntimeError:  # linear programs too hard for the solver: the norms do
+        return np.full(count, -np.inf), np.full(count, np.inf)
+    return -found[:count], found[count:]

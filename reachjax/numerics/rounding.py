@@ -36,6 +36,19 @@ def namespace(*numbers: Any) -> Any:
     return jnp if any(isinstance(each, jax.Array) for each in numbers) else np
 
 
+def larger(one: Any, other: Any) -> Any:
+    """The larger of two numbers each: NaN if the first one is, the first one if the second is NaN.
+
+    `jnp.maximum` halves its derivative where both are equal, which takes long to compile.
+    """
+    return namespace(one, other).where(one < other, other, one)
+
+
+def smaller(one: Any, other: Any) -> Any:
+    """The smaller of two numbers each, as `larger`."""
+    return namespace(one, other).where(one > other, other, one)
+
+
 def gamma(operations: int) -> float:
     """Relative error bound of `operations` rounded operations, with some to spare."""
     count = (operations + 8) * UNIT
@@ -112,7 +125,7 @@ class Ball:
         so the radius holds for every rounding of the midpoint.
         """
         xp, mid = namespace(lower, upper), lower + (upper - lower) / 2
-        rad = xp.maximum(upper - mid, mid - lower) * (1 + gamma(4)) + gamma(4) * abs(mid)
+        rad = (upper - lower) / 2 * (1 + gamma(4)) + gamma(4) * abs(mid)
         return cls(mid, xp.where(lower == upper, 0.0, rad))
 
     def lift(self, other) -> Ball:

@@ -1,20 +1,20 @@
 """Affine forms: every number of the unrolled loop as a row over columns that go back to `X_0`.
 
-A number is `center + columns . eta` up to `radius`, where `eta = [w, v, r]` and `|eta_i| <= 1`: `w`
-stands for the initial state (`initial`), `v` has one entry for each unit that switches, and `r`
-those for rounding errors. A unit with inputs in `[l, u]` is
+A number is `c + G eta` up to a radius, where `eta = [w, v, r]` and `|eta_i| <= 1`: `w` stands for the
+initial state (`initial`), `v` has one entry for each unit that switches, and `r` those for rounding
+errors of states. A unit with inputs in `[l, u]` is
 
     f(y) = s y + m + e v,    |v| <= 1,    m - e <= f(y) - s y <= m + e  on [l, u],
 
 whatever its slope `s`; here it is that of the unit's line above, which makes a ReLU's `e` least. If
 the unit is affine on `[l, u]`, then `e = 0` and there is no column. No column is ever dropped, so what
-later states have in common stays known (no wrapping). The forms are those of Girard's zonotopes
-(HSCC 2005) and of affine arithmetic (de Figueiredo, Stolfi, Numerical Algorithms 2004); the slopes are
-those of Singh, Gehr, Mirman, Puschel, Vechev (NeurIPS 2018).
+later states have in common stays known (no wrapping). Such forms are Girard's zonotopes (HSCC 2005)
+and affine arithmetic (de Figueiredo, Stolfi, Numerical Algorithms 2004); the slopes are those of
+Singh, Gehr, Mirman, Puschel, Vechev (NeurIPS 2018).
 
-Radii bound rounding errors alone. Of a number with many units behind it they grow like the product of
-`|W|` over its layers, so what a unit's input has goes into that unit's column, and what a state has
-into columns of its own.
+Radii bound rounding errors alone: by how much a number is off the exact affine function of `eta` that
+it stands for. Behind many layers they grow like the product of their `|W|`, and over many steps beyond
+all bounds; so those of a state become columns of their own before the next step.
 
 All of it is written over numpy and `jax.numpy` alike (`rounding.namespace`). In numpy, columns are
 appended as they are needed. In compiled code every unit and state has its place, so shapes are fixed.
@@ -31,33 +31,30 @@ from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit
-from reachjax.numerics.pytrees import Replaceable, pytree
-from reachjax.numerics.rounding import Ball, gamma, namespace
-from reachjax.programs.initial import Ends, InitialColumns
+from reachjax.numerics.pytrees import pytree
+from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
+from reachjax.programs.initial import Ends, InitialColumns, settled
 
-SPILL = 1e-12
-"""A state's radius gets a column of its own where it is more than this part of its range. Looser,
-and it is multiplied by `|W|` of all layers before the next chance; tighter adds columns for nothing."""
+SPILL = 1e-13
+"""On the host a state's radius gets a column where it is more than this part of its range. It is
+multiplied by `|W|` of all layers of a step before it gets its next chance."""
 
 Place = int | Array | None
 """Where new columns begin; None to append those that are needed (numpy)."""
 
 
 @pytree
-class AffineForms(Replaceable):
-    """`k` numbers over `n` columns, each known by intervals as well.
+class AffineForms:
+    """`k` numbers, each as a form over `n` columns and, beside it, as an interval.
 
     Attributes:
-        center: `(k,)`.
-        columns: `(k, n)`, coefficients of numbers in `[-1, 1]`.
-        radius: `(k,)`, how far off they may be.
-        interval: `(k,)`, by interval arithmetic from what the latest units gave.
+        rows: `(k, 2 + n)`, centre of the form, middle of the interval, coefficients of the columns.
+        radii: `(k, 2)`, by how much the form may be off, and of the interval. Derivatives take the
+            first for a constant.
     """
 
-    center: Float[Array | np.ndarray, " k"]
-    columns: Float[Array | np.ndarray, "k n"]
-    radius: Float[Array | np.ndarray, " k"]
-    interval: Ball
+    rows: Float[Array | np.ndarray, "k n+2"]
+    radii: Float[Array | np.ndarray, "k 2"]
 
     # numpy arrays on the left leave `array @ forms` and `array - forms` to this class
     __array_ufunc__ = None
@@ -71,39 +68,47 @@ class AffineForms(Replaceable):
             size: how many columns there will be; None for these alone.
         """
         xp, (n, w) = namespace(start.center), start.spread.shape
+        middle, zero = start.center[:, None], xp.zeros((n, 1))
         empty = xp.zeros((n, (size or w) - w))
-        columns, zero = xp.concatenate([start.spread, empty], axis=1), xp.zeros(n)
-        forms = cls(start.center, columns, zero, Ball(start.center, zero + xp.inf))
-        return forms.replace(interval=Ball.between(*forms.range(start, cut=True)))
+        rows = xp.concatenate([middle, middle, start.spread, empty], axis=1)
+        forms = cls(rows, xp.concatenate([zero, zero + xp.inf], axis=1))
+        return forms.within(Ball.between(*forms.ends(start, cut=True)))
 
     @property
-    def size(self) -> Any:
-        """What the numbers do not exceed, but for their radius and rounding `(k,)`."""
-        return abs(self.center) + abs(self.columns).sum(axis=1)
+    def columns(self) -> Float[Array | np.ndarray, "k n"]:
+        """Coefficients of the columns."""
+        return self.rows[:, 2:]
+
+    def within(self, interval: Ball) -> AffineForms:
+        """The same forms with other intervals."""
+        xp = namespace(self.rows)
+        parts = self.rows[:, :1], interval.mid[:, None], self.rows[:, 2:]
+        radii = xp.stack([self.radii[:, 0], interval.rad], axis=1)
+        return AffineForms(xp.concatenate(parts, axis=1), radii)
 
     def __rmatmul__(self, matrix) -> AffineForms:
         """`matrix @ self` for an exact matrix."""
-        matrix = namespace(self.center).asarray(matrix)
-        radius = abs(matrix) @ (self.radius + gamma(matrix.shape[1]) * self.size)
-        radius = radius * (1 + gamma(matrix.shape[1] + self.columns.shape[1]))
-        interval = matrix @ self.interval
-        return AffineForms(matrix @ self.center, matrix @ self.columns, radius, interval)
+        matrix, count = namespace(self.rows).asarray(matrix), matrix.shape[1]
+        error = gamma(count) * abs(_constant(self.rows)).sum(axis=1)
+        radii = abs(matrix) @ (self.radii + error[:, None])
+        return AffineForms(matrix @ self.rows, radii * (1 + gamma(count + self.rows.shape[1])))
 
     def __add__(self, other) -> AffineForms:
-        if not isinstance(other, AffineForms):  # exact constants
-            interval = self.interval + namespace(self.center).asarray(other)
-            center = self.center + other
-            radius = (self.radius + gamma(1) * abs(center)) * (1 + gamma(4))
-            return AffineForms(center, self.columns, radius, interval)
-        center, columns = self.center + other.center, _sum(self.columns, other.columns)
-        forms = AffineForms(center, columns, self.radius, self.interval + other.interval)
-        radius = self.radius + other.radius + gamma(1) * forms.size
-        return forms.replace(radius=radius * (1 + gamma(columns.shape[1] + 4)))
+        xp = namespace(self.rows)
+        if isinstance(other, AffineForms):
+            rows = _sum(self.rows, other.rows)
+            radii, changed = self.radii + other.radii, rows
+        else:  # exact constants, one for each or one for all
+            changed = self.rows[:, :2] + xp.asarray(other)[..., None]
+            rows = xp.concatenate([changed, self.rows[:, 2:]], axis=1)
+            radii = self.radii
+        error = gamma(1) * abs(_constant(changed)).sum(axis=1)
+        return AffineForms(rows, (radii + error[:, None]) * (1 + gamma(rows.shape[1] + 4)))
 
     __radd__ = __add__
 
     def __neg__(self) -> AffineForms:
-        return AffineForms(-self.center, -self.columns, self.radius, -self.interval)
+        return AffineForms(-self.rows, self.radii)
 
     def __sub__(self, other) -> AffineForms:
         return self + (-other)
@@ -111,37 +116,41 @@ class AffineForms(Replaceable):
     def __rsub__(self, other) -> AffineForms:
         return (-self) + other
 
-    def range(self, start: InitialColumns, cut: bool = False) -> Ends:
-        """Lower and upper bounds `(k,)` of the numbers, by these forms alone.
+    def __getitem__(self, index) -> AffineForms:
+        return AffineForms(self.rows[index], self.radii[index])
+
+    def ends(self, start: InitialColumns, cut: bool = False) -> Ends:
+        """Lower and upper bounds `(k,)` by forms or by intervals, whichever is better.
 
         Args:
             start: what the first columns are.
             cut: whether what cuts the initial set is looked at as well (on the host, a linear
                 program for each end).
         """
-        w = len(start.spread)
-        lower, upper = start.cut_ends(self.columns[:, :w]) if cut else start.ends(self.columns[:, :w])
-        rest = abs(self.columns[:, w:]).sum(axis=1) + self.radius
-        largest = abs(self.center) + namespace(rest).maximum(-lower, upper)
-        slack = rest * (1 + gamma(self.columns.shape[1] + 8)) + gamma(8) * largest
-        return self.center + lower - slack, self.center + upper + slack
-
-    def ends(self, start: InitialColumns, cut: bool = False) -> Ends:
-        """Lower and upper bounds `(k,)` by forms or by intervals, whichever is better."""
-        return met(self.range(start, cut), (self.interval.lower, self.interval.upper))
+        w, n = len(start.spread), self.rows.shape[1]
+        center, middle = self.rows[:, 0], self.rows[:, 1]
+        first = self.rows[:, 2 : 2 + w]
+        lower, upper = start.cut_ends(first) if cut else start.ends(first)
+        largest = abs(_constant(center)) + _constant(larger(-lower, upper))
+        rest = abs(self.rows[:, 2 + w :]).sum(axis=1) * (1 + gamma(n))
+        slack = rest + (self.radii[:, 0] + gamma(8) * largest) * (1 + gamma(n))
+        by_forms = center + lower - slack, center + upper + slack
+        reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(_constant(middle))
+        return met(by_forms, (middle - reach, middle + reach))
 
     def with_own(self, by: Float[Array, " k"], place: Place) -> tuple[AffineForms, Any]:
         """Each number with so much of a column of its own, and where that is, -1 where none is."""
-        k, n = self.columns.shape
+        k, n = self.rows.shape
         if place is not None:
-            own = jax.lax.dynamic_update_slice(self.columns, jnp.diag(by), (0, place))
-            return self.replace(columns=own), place + jnp.arange(k)
+            rows = jax.lax.dynamic_update_slice(self.rows, jnp.diag(by), (0, 2 + place))
+            return AffineForms(rows, self.radii), place + jnp.arange(k)
         needed = by != 0
         where, count = np.flatnonzero(needed), int(needed.sum())
-        own = np.zeros((k, count))
-        own[where, np.arange(count)] = by[where]
-        places = np.where(needed, n + np.cumsum(needed) - 1, -1)
-        return self.replace(columns=np.concatenate([self.columns, own], axis=1)), places
+        rows = np.zeros((k, n + count))
+        rows[:, :n] = self.rows
+        rows[where, n + np.arange(count)] = by[where]
+        places = np.where(needed, n - 3 + np.cumsum(needed), -1)
+        return AffineForms(rows, self.radii), places
 
 
 class UnitForms(NamedTuple):
@@ -194,72 +203,75 @@ def step_forms(
 
     def unit(unit: AbstractUnit, y: AffineForms) -> AffineForms:
         nonlocal done
-        here, done = slice(done, done + len(y.center)), done + len(y.center)
+        here, done = slice(done, done + len(y.rows)), done + len(y.rows)
         slope = None if slopes is None else slopes[here]
         z, forms = _unit(unit, y, start, None if place is None else place + here.start, slope)
         found.append(forms)
         return z
 
-    state = state.replace(interval=Ball.between(*state.ends(start)))
-    successor = _settled(loop.step(state, t, unit))
-    return _spilled(successor, None if place is None else place + done), tuple(found)
+    successor = loop.step(state, t, unit)
+    successor = _spilled(successor, None if place is None else place + done)
+    return successor.within(Ball.between(*successor.ends(start))), tuple(found)
 
 
 def _unit(
     unit: AbstractUnit, y: AffineForms, start: InitialColumns, place: Place, slope: Any
 ) -> tuple[AffineForms, UnitForms]:
     """What a layer of units makes of its inputs."""
-    xp, (lower, upper) = namespace(y.center), y.ends(start)
+    xp, (lower, upper) = namespace(y.rows), y.ends(start)
     if start.cut is not None:
         lower, upper = _cut(unit, y, start, lower, upper)
     if slope is None:
         slope = unit.lines(lower, upper).above.slope
-    rest = Ball.between(*unit.remainder(slope, lower, upper))
-    slope, offset, gap = _settled((slope, rest.mid, rest.rad))
-    exact = ((slope == 0) | (abs(slope) == 1)) & (offset == 0)
-    values = Ball.between(*unit.interval(lower, upper))
-    center, columns = slope * y.center + offset, slope[:, None] * y.columns
-    rounding = gamma(4) * (abs(slope) * y.size + abs(offset)) * (1 + gamma(columns.shape[1]))
-    radius = (abs(slope) * y.radius + xp.where(exact, 0.0, rounding)) * (1 + gamma(4))
-    # a unit with a column takes the rounding errors into it
-    own = gap > 0 if place is None else xp.ones(len(gap), bool)
-    by = xp.where(own, (gap + radius) * (1 + gamma(4)), 0.0)
-    z = AffineForms(center, columns, xp.where(own, 0.0, radius), values)
-    z, places = z.with_own(by, place)
-    return _settled(z), UnitForms(unit, y, lower, upper, slope, offset, gap, places)
+    rest, values = (
+        Ball.between(*ends)
+        for ends in (unit.remainder(slope, lower, upper), unit.interval(lower, upper))
+    )
+    slope, offset, gap = settled((slope, rest.mid, rest.rad))
+    rows = slope[:, None] * y.rows
+    constants = xp.stack([rows[:, 0] + offset, values.mid], axis=1)
+    # products with 0 and 1 are exact
+    size = abs(_constant(rows)).sum(axis=1) + abs(_constant(offset))
+    rounded = (slope != 0) & (abs(slope) != 1) | (offset != 0)
+    radius = abs(slope) * y.radii[:, 0] + xp.where(rounded, gamma(4) * size, 0.0)
+    radius = _constant(radius) * (1 + gamma(rows.shape[1]))
+    z = AffineForms(
+        xp.concatenate([constants, rows[:, 2:]], axis=1), xp.stack([radius, values.rad], axis=1)
+    )
+    z, places = z.with_own(gap, place)
+    return z, UnitForms(unit, y, lower, upper, slope, offset, gap, places)
 
 
 def _cut(
     unit: AbstractUnit, y: AffineForms, start: InitialColumns, lower: Any, upper: Any
 ) -> Ends:
     """Bounds of inputs by what cuts the initial set: on the host, only of units that switch."""
-    if namespace(y.center) is not np:
-        return met((lower, upper), y.range(start, cut=True))
+    if namespace(y.rows) is not np:
+        return y.ends(start, cut=True)
     switching = np.flatnonzero(~unit.lines(lower, upper).affine)
     if len(switching):
-        some = AffineForms(*(part[switching] for part in (y.center, y.columns, y.radius, y.interval)))
-        ends = met((lower[switching], upper[switching]), some.range(start, cut=True))
         lower, upper = lower.copy(), upper.copy()
-        lower[switching], upper[switching] = ends
+        lower[switching], upper[switching] = y[switching].ends(start, cut=True)
     return lower, upper
 
 
 def _spilled(forms: AffineForms, place: Place) -> AffineForms:
-    """The same with radii as columns of their own; on the host, those that are not negligible."""
-    xp, radius = namespace(forms.center), forms.radius
+    """The same with radii as columns of their own; on the host, those that are not negligible.
+
+    Such a column is what a number is off by: what it is beside must be the same everywhere.
+    """
+    forms, xp = settled(forms), namespace(forms.rows)
+    radius, own = forms.radii[:, 0], xp.ones(len(forms.rows), bool)
     if place is None:
         own = radius > SPILL * abs(forms.columns).sum(axis=1)
-    else:
-        own = xp.ones(len(radius), bool)
-    left = forms.replace(radius=xp.where(own, 0.0, radius))
-    return left.with_own(xp.where(own, radius, 0.0), place)[0]
+    left = xp.stack([xp.where(own, 0.0, radius), forms.radii[:, 1]], axis=1)
+    return AffineForms(forms.rows, left).with_own(xp.where(own, radius, 0.0), place)[0]
 
 
 def met(one: Ends, other: Ends) -> Ends:
-    """What both bounds hold; never empty."""
-    xp = namespace(*one, *other)
-    lower = xp.maximum(one[0], other[0])
-    return lower, xp.maximum(lower, xp.minimum(one[1], other[1]))
+    """What both bounds hold; never empty. What is no number stays so in the first alone."""
+    lower = larger(one[0], other[0])
+    return lower, larger(smaller(one[1], other[1]), lower)
 
 
 def _sum(one: Any, other: Any) -> Any:
@@ -267,14 +279,11 @@ def _sum(one: Any, other: Any) -> Any:
     if one.shape[1] == other.shape[1]:
         return one + other
     few, many = sorted((one, other), key=lambda rows: rows.shape[1])
-    columns = many.copy()
-    columns[:, : few.shape[1]] += few
-    return columns
+    rows = many.copy()
+    rows[:, : few.shape[1]] += few
+    return rows
 
 
-def _settled(parts: Any) -> Any:
-    """One rounding of numbers for all that is made of them, whatever a compiler fuses.
-
-    A column is defined by them: it must be the same wherever it stands.
-    """
-    return jax.lax.optimization_barrier(parts) if namespace(*jax.tree.leaves(parts)) is jnp else parts
+def _constant(numbers: Any) -> Any:
+    """What derivatives take for a constant: what rounding may add does not depend on anything."""
+    return jax.lax.stop_gradient(numbers) if isinstance(numbers, jax.Array) else numbers

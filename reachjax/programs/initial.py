@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.pytrees import pytree, static
-from reachjax.numerics.rounding import Ball, gamma, namespace
+from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
 from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet, Polytope
 from reachjax.sets.polyhedra import support
 
@@ -89,21 +89,20 @@ class InitialColumns:
         """Bounds of `r . w` for each row, by the cut as well."""
         if self.cut is None:
             return self.ends(rows)
-        xp, n = namespace(rows), rows.shape[1]
-        norms, a = self.norms(rows), rows @ self.back
+        n, norms, a = rows.shape[1], self.norms(rows), rows @ self.back
         least, most = _ends(self.cut, a)
         left = abs(rows - a @ self.spread) + gamma(n + 2) * (abs(a) @ abs(self.spread) + abs(rows))
         at, size = a @ self.center, abs(a) @ abs(self.center)
         error = left.sum(axis=1) + gamma(n + 8) * (size + abs(rows).sum(axis=1))
         lower = least - at - (error + gamma(4) * abs(least)) * (1 + gamma(n))
         upper = most - at + (error + gamma(4) * abs(most)) * (1 + gamma(n))
-        return xp.fmax(-norms, lower), xp.fmin(norms, upper)
+        return larger(-norms, lower), smaller(norms, upper)
 
 
 def _of_box(box: Box, cut: PolyhedralSet | None) -> InitialColumns:
     around = Ball.between(box.lower, box.upper)
     xp = namespace(around.mid)
-    center, rad = _settled(around.mid, around.rad)
+    center, rad = settled((around.mid, around.rad))
     back = xp.where(rad > 0, 1.0 / xp.where(rad > 0, rad, 1.0), 0.0)
     return InitialColumns(center, xp.diag(rad), xp.diag(back), cut, round=False)
 
@@ -119,12 +118,16 @@ def _of_ball(ball: Ellipsoid, cut: PolyhedralSet | None) -> InitialColumns:
 def _ball_map(ball: Ellipsoid) -> tuple[Array, Array, Array]:
     spread = ball.from_ball()
     back = jax.numpy.linalg.inv(jax.lax.stop_gradient(spread))
-    return _settled(ball.center, spread, back)
+    return settled((ball.center, spread, back))
 
 
-def _settled(*parts: Any) -> Any:
-    """One rounding of numbers for all that is made of them, whatever a compiler fuses."""
-    return parts if namespace(*parts) is np else jax.lax.optimization_barrier(parts)
+def settled(parts: Any) -> Any:
+    """One rounding of numbers for all that is made of them, whatever a compiler fuses.
+
+    They define what a column stands for, which must be the same wherever it is.
+    """
+    on_host = namespace(*jax.tree.leaves(parts)) is np
+    return parts if on_host else jax.lax.optimization_barrier(parts)
 
 
 def _ends(cut: PolyhedralSet, directions: Float[Array, "k n"]) -> Ends:

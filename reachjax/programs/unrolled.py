@@ -88,6 +88,8 @@ def unrolled_at_once(
     n, steps = loop.states, len(directions)
     more = loop.units + n  # columns of one step
 
+    # a derivative computes a step again: to store what it needs of it is most of the code to compile
+    @partial(jax.checkpoint, prevent_cse=False)
     def advance(state: AffineForms, step: tuple[Array, Array]) -> tuple[AffineForms, ByForms]:
         k, rows = step
         state, units = step_forms(loop, state, t + k, start, place=n + k * more)
@@ -98,7 +100,7 @@ def unrolled_at_once(
 
 
 def _bounds(rows: AffineForms, units: tuple[UnitForms, ...], start: InitialColumns) -> ByForms:
-    xp = jnp if isinstance(rows.center, jax.Array) else np
+    xp = jnp if isinstance(rows.rows, jax.Array) else np
     slopes = xp.concatenate([layer.slope for layer in units] or [xp.zeros(0)])
     corners = start.farthest(rows.columns[:, : len(start.spread)])
     return ByForms(rows.ends(start, cut=True)[1], slopes, corners)

@@ -9,13 +9,14 @@ of slopes between two of them.
 from __future__ import annotations
 
 import dataclasses
+from functools import reduce
 from typing import Any
 
 import jax
 from jaxtyping import Array, Float
 
 from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark, Product
-from reachjax.numerics.rounding import gamma, namespace
+from reachjax.numerics.rounding import gamma, larger, namespace, smaller
 
 ZERO = (("output", "slack"),)
 PRODUCTS = (
@@ -33,12 +34,10 @@ def bent(
 
     The function is bent at 0 alone, where it is 0, and zero all along where `slope` is its own.
     """
-    xp = namespace(slope, lower, upper)
     right, left = 1.0 - slope, leak - slope
-    ends = [right * xp.maximum(end, 0.0) for end in (lower, upper)]
-    ends += [left * xp.minimum(end, 0.0) for end in (lower, upper)]
-    low = xp.minimum(xp.minimum(ends[0], ends[1]), xp.minimum(ends[2], ends[3]))
-    high = xp.maximum(xp.maximum(ends[0], ends[1]), xp.maximum(ends[2], ends[3]))
+    ends = [right * larger(end, 0.0) for end in (lower, upper)]
+    ends += [left * smaller(end, 0.0) for end in (lower, upper)]
+    low, high = reduce(smaller, ends), reduce(larger, ends)
     return low - gamma(4) * abs(low), high + gamma(4) * abs(high)
 
 

@@ -33,7 +33,10 @@ def namespace(*numbers: Any) -> Any:
         >>> namespace(np.zeros(2), 1.0).__name__, namespace(jnp.zeros(2)).__name__
         ('numpy', 'jax.numpy')
     """
-    return jnp if any(isinstance(each, jax.Array) for each in numbers) else np
+    for each in numbers:
+        if type(each) is not np.ndarray and isinstance(each, jax.Array):
+            return jnp
+    return np
 
 
 def larger(one: Any, other: Any) -> Any:

@@ -26,11 +26,13 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
-from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
+from reachjax.proofs.linear import LinearCertificate
 from reachjax.proofs.witnesses import Simulations, initial_states
 from reachjax.sets import AbstractSet, AbstractTemplate, Intersection
 from reachjax.sets.geometry import separation
 from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.by_forms import sets_by_forms
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
 from reachjax.tubes.steps import Setting, Step, boxed
 from reachjax.tubes.successors import successors
@@ -71,7 +73,7 @@ class ReachTube(Replaceable):
     loop: ClosedLoop
     template: AbstractTemplate
     sets: tuple[AbstractSet, ...]
-    certificates: tuple[AbstractCertificate | None, ...]
+    certificates: tuple[AbstractProof | None, ...]
     start: int = static(default=0)
     seal: Seal | None = None
 
@@ -98,7 +100,7 @@ class ReachTube(Replaceable):
         """The number of steps."""
         return len(self.sets) - 1
 
-    def proof(self, t: int) -> AbstractCertificate:
+    def proof(self, t: int) -> AbstractProof:
         """The certificate of `sets[t]`.
 
         Raises:
@@ -125,7 +127,7 @@ def reach_step(
     solver: AbstractSolver = Auto(),  # noqa: B008
     samples: int = SAMPLES,
     seed: int = 0,
-) -> tuple[AbstractSet, AbstractCertificate]:
+) -> tuple[AbstractSet, AbstractProof]:
     """A set that surely contains every successor of a set, and its certificate.
 
     Args:
@@ -237,16 +239,22 @@ def reach(
     )
     sets, certificates, steps = [X0], [], []
     numbers = range(horizon)
+    found = sets_by_forms(loop, X0, boxed(X0, "X0"), template, horizon, start)
     for _, k in zip(wrapped(progress, numbers), numbers, strict=False):
+        if relaxation.by_forms:
+            following, certificate = next(found)
+            sets.append(following)
+            certificates.append(certificate)
+            continue
         before = steps if window is None else steps[max(0, k + 1 - window) :]
         proof = certificates[-1] if certificates else None
         steps.append(Step(setting, sets[-1], k, tuple(before), proof))
         following, certificate = successors(steps[-1], template.at(k + 1))
         sets.append(following)
         certificates.append(certificate)
-    if len(steps) < horizon:
+    if len(certificates) < horizon:
         raise ValueError(
-            f"progress must pass on each of the {horizon} steps, but {len(steps)} arrived"
+            f"progress must pass on each of the {horizon} steps, but {len(certificates)} arrived"
         )
     if simulations is not None and is_concrete(certificates):
         certificates = _with_witnesses(certificates, sets, simulations, steps)
@@ -275,14 +283,17 @@ def _simulations(
 
 
 def _with_witnesses(
-    certificates: list[AbstractCertificate],
+    certificates: list[AbstractProof],
     sets: list[AbstractSet],
     simulations: Simulations,
     steps: list[Step],
-) -> list[AbstractCertificate]:
+) -> list[AbstractProof]:
     """Simulate what the certificates bound, from the initial set."""
+    corners = [np.asarray(c.corners) for c in certificates if isinstance(c, LinearCertificate)]
+    if corners:
+        simulations.include(np.concatenate(corners))
     for k, certificate in enumerate(certificates, start=1):
-        if len(steps[k - 1].window) == k:
+        if isinstance(certificate, AbstractCertificate) and len(steps[k - 1].window) == k:
             states = np.asarray(certificate.moments)[:, : sets[0].dimension, -1]
             simulations.climb(k, sets[k], np.arange(len(states)), states)
     found = [simulations.attained(k, sets[k]) for k in range(1, len(sets))]
@@ -320,7 +331,7 @@ def _check(
     whole_number("seed", seed, 0)
     if window is not None:
         whole_number("window", window, 1)
-    elif not is_concrete(jax.lax.stop_gradient((loop, X0, template))):
+    elif not (relaxation.by_forms or is_concrete(jax.lax.stop_gradient((loop, X0, template)))):
         raise ValueError(
             "window=None is chosen from numbers: inside jax.jit, vmap or scan give a number, such "
             "as window=1"

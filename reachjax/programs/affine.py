@@ -34,6 +34,7 @@ from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.pytrees import pytree
 from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
 from reachjax.programs.initial import Ends, InitialColumns, settled
+from reachjax.sets import Box
 
 SPILL = 1e-13
 """On the host a state's radius gets a column where it is more than this part of its range. It is
@@ -245,8 +246,8 @@ def _unit(
 def _cut(
     unit: AbstractUnit, y: AffineForms, start: InitialColumns, lower: Any, upper: Any
 ) -> Ends:
-    """Bounds of inputs by what cuts the initial set: on the host, only of units that switch."""
-    if namespace(y.rows) is not np:
+    """Bounds of inputs by what cuts the initial set; where that takes programs, if they switch."""
+    if isinstance(start.cut, Box):
         return y.ends(start, cut=True)
     switching = np.flatnonzero(~unit.lines(lower, upper).affine)
     if len(switching):

@@ -35,8 +35,8 @@ def bent(
     The function is bent at 0 alone, where it is 0, and zero all along where `slope` is its own.
     """
     right, left = 1.0 - slope, leak - slope
-    ends = [right * larger(end, 0.0) for end in (lower, upper)]
-    ends += [left * smaller(end, 0.0) for end in (lower, upper)]
+    ends = [right * larger(end, 0.0) + left * smaller(end, 0.0) for end in (lower, upper)]
+    ends.append(namespace(lower).where((lower < 0) & (upper > 0), 0.0, ends[0]))
     low, high = reduce(smaller, ends), reduce(larger, ends)
     return low - gamma(4) * abs(low), high + gamma(4) * abs(high)
 

@@ -1,23 +1,24 @@
 """Affine forms: every number of the unrolled loop as a row over columns that go back to `X_0`.
 
-A number is `c + G eta` up to a radius, where `eta = [w, v, r]` and `|eta_i| <= 1`: `w` stands for the
-initial state (`initial`), `v` has one entry for each unit that switches, and `r` those for rounding
-errors of states. A unit with inputs in `[l, u]` is
+A number is `c + G eta` up to a radius, where `eta = [w, v, r]` and `|eta_i| <= 1`: `w` stands for
+the initial state (`initial`), `v` has one entry for each unit that switches, and `r` those for
+rounding errors of states. A unit with inputs in `[l, u]` is
 
     f(y) = s y + m + e v,    |v| <= 1,    m - e <= f(y) - s y <= m + e  on [l, u],
 
 whatever its slope `s`; here it is that of the unit's line above, which makes a ReLU's `e` least. If
-the unit is affine on `[l, u]`, then `e = 0` and there is no column. No column is ever dropped, so what
-later states have in common stays known (no wrapping). Such forms are Girard's zonotopes (HSCC 2005)
-and affine arithmetic (de Figueiredo, Stolfi, Numerical Algorithms 2004); the slopes are those of
-Singh, Gehr, Mirman, Puschel, Vechev (NeurIPS 2018).
+the unit is affine on `[l, u]`, then `e = 0` and there is no column. No column is ever dropped, so
+what later states have in common stays known (no wrapping). Such forms are Girard's zonotopes (HSCC
+2005) and affine arithmetic (de Figueiredo, Stolfi, Numerical Algorithms 2004); the slopes are those
+of Singh, Gehr, Mirman, Puschel, Vechev (NeurIPS 2018).
 
-Radii bound rounding errors alone: by how much a number is off the exact affine function of `eta` that
-it stands for. Behind many layers they grow like the product of their `|W|`, and over many steps beyond
-all bounds; so those of a state become columns of their own before the next step.
+Radii bound rounding errors alone: by how much a number is off the exact affine function of `eta`
+that it stands for. Behind many layers they grow like the product of their `|W|`, and over many
+steps beyond all bounds; so those of a state become columns of their own before the next step.
 
 All of it is written over numpy and `jax.numpy` alike (`rounding.namespace`). In numpy, columns are
-appended as they are needed. In compiled code every unit and state has its place, so shapes are fixed.
+appended as they are needed. In compiled code every unit and state has its place, so shapes are
+fixed.
 """
 
 from __future__ import annotations
@@ -185,6 +186,7 @@ def step_forms(
     start: InitialColumns,
     place: Place = None,
     slopes: Float[Array | np.ndarray, " units"] | None = None,
+    known: Box | None = None,
 ) -> tuple[AffineForms, tuple[UnitForms, ...]]:
     """One step of the loop, whose own forward pass is run over affine forms.
 
@@ -195,6 +197,7 @@ def step_forms(
         start: what the first columns are.
         place: where the columns of this step begin, `units + n_x` of them; None to append.
         slopes: of the units; None for those of their lines. What is found holds for any.
+        known: a box that surely holds the successor, where one is known.
 
     Returns:
         Forms of the successor, and those of each layer of units.
@@ -212,7 +215,10 @@ def step_forms(
 
     successor = loop.step(state, t, unit)
     successor = _spilled(successor, None if place is None else place + done)
-    return successor.within(Ball.between(*successor.ends(start))), tuple(found)
+    ends = successor.ends(start)
+    if known is not None:
+        ends = met(ends, (known.lower, known.upper))
+    return successor.within(Ball.between(*ends)), tuple(found)
 
 
 def _unit(
@@ -243,9 +249,7 @@ def _unit(
     return z, UnitForms(unit, y, lower, upper, slope, offset, gap, places)
 
 
-def _cut(
-    unit: AbstractUnit, y: AffineForms, start: InitialColumns, lower: Any, upper: Any
-) -> Ends:
+def _cut(unit: AbstractUnit, y: AffineForms, start: InitialColumns, lower: Any, upper: Any) -> Ends:
     """Bounds of inputs by what cuts the initial set; where that takes programs, if they switch."""
     if isinstance(start.cut, Box):
         return y.ends(start, cut=True)

@@ -1,8 +1,8 @@
 """The columns that stand for the initial state: `x_0 = q + M w`, `w` in a unit ball.
 
 The ball is that of the largest entry around a box, and the round one around an ellipsoid, so every
-entry of `w` lies in `[-1, 1]`, and what a row over `w` attains is its 1-norm or its 2-norm. Where the
-set is smaller than `q + M w`, a part `S` of it cuts off more: for any row `a`,
+entry of `w` lies in `[-1, 1]`, and what a row over `w` attains is its 1-norm or its 2-norm. Where
+the set is smaller than `q + M w`, a set `S` that also holds it cuts off more: for any row `a`,
 
     r . w  <=  sup_S a - a . q + |r - a M|,
 
@@ -21,6 +21,8 @@ from reachjax.numerics.pytrees import pytree, static
 from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
 from reachjax.sets import AbstractSet, Box, Ellipsoid, Intersection, PolyhedralSet, Polytope
 from reachjax.sets.polyhedra import support
+
+Rows = Float[Array | np.ndarray, "k n"]
 
 Ends = tuple[Any, Any]
 """Lower and upper bounds `(k,)`."""
@@ -52,16 +54,16 @@ class InitialColumns:
             X: the set. A polytope is itself the cut on the host, and is held by its box in JAX.
             box: around it.
         """
-        cut = X.polytope if isinstance(X, Intersection) else X
-        if isinstance(cut, Polytope) and namespace(cut.A) is not np:
-            cut = box
-        if isinstance(X, Intersection):
-            return _of_ball(X.ellipsoid, cut)
         if isinstance(X, Ellipsoid):
             return _of_ball(X, None)
-        return _of_box(box, cut if isinstance(cut, Polytope) else None)
+        if isinstance(X, Intersection):
+            on_host = isinstance(X.polytope, Box) or namespace(X.polytope.facets[0]) is np
+            return _of_ball(X.ellipsoid, X.polytope if on_host else box)
+        if isinstance(X, Polytope) and namespace(X.A) is np:
+            return _of_box(box, X)
+        return _of_box(box, None)
 
-    def norms(self, rows: Float[Array, "k n"]) -> Float[Array, " k"]:
+    def norms(self, rows: Rows) -> Any:
         """What `r . w` does not exceed for each row, whatever the cut."""
         if not self.round:
             return abs(rows).sum(axis=1) * (1 + gamma(rows.shape[1]))
@@ -72,7 +74,7 @@ class InitialColumns:
         squares = xp.where(some, ((rows / unit[:, None]) ** 2).sum(axis=1), 1.0)
         return xp.where(some, unit * xp.sqrt(squares) * (1 + gamma(rows.shape[1] + 8)), 0.0)
 
-    def farthest(self, rows: Float[Array, "k n"]) -> Float[Array, "k n"]:
+    def farthest(self, rows: Rows) -> Rows:
         """Initial states at which `r . w` is largest for each row, whatever the cut; rounded."""
         xp = namespace(rows)
         if not self.round:
@@ -80,12 +82,12 @@ class InitialColumns:
         length = xp.sqrt((rows**2).sum(axis=1, keepdims=True))
         return self.center + rows / xp.where(length > 0, length, 1.0) @ self.spread.T
 
-    def ends(self, rows: Float[Array, "k n"]) -> Ends:
+    def ends(self, rows: Rows) -> Ends:
         """Bounds of `r . w` for each row, by the norm."""
         norms = self.norms(rows)
         return -norms, norms
 
-    def cut_ends(self, rows: Float[Array, "k n"]) -> Ends:
+    def cut_ends(self, rows: Rows) -> Ends:
         """Bounds of `r . w` for each row, by the cut as well."""
         if self.cut is None:
             return self.ends(rows)
@@ -130,7 +132,7 @@ def settled(parts: Any) -> Any:
     return parts if on_host else jax.lax.optimization_barrier(parts)
 
 
-def _ends(cut: PolyhedralSet, directions: Float[Array, "k n"]) -> Ends:
+def _ends(cut: PolyhedralSet, directions: Rows) -> Ends:
     """Least and largest values of directions on the cut, rounded outwards."""
     if isinstance(cut, Box):
         values = directions @ Ball.between(cut.lower, cut.upper)

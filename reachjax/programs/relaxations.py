@@ -135,10 +135,10 @@ class LocalBounds(AbstractRelaxation):
 class LinearBounds(AbstractRelaxation):
     """No products, and so no programs: affine forms over the whole horizon (`programs.affine`).
 
-    Each unit that switches is held between two parallel lines, and everything else is affine, so that
-    every state is a row over the initial state and one column for each such unit. A tube takes
-    milliseconds, is compiled, differentiated and mapped over like any other JAX function, and loosens
-    with the number of units that switch, not with the number of steps: nothing is wrapped.
+    Each unit that switches is held between two parallel lines, and everything else is affine, so
+    that every state is a row over the initial state and one column for each such unit. A tube takes
+    milliseconds, is compiled, differentiated and mapped over like any other JAX function, and
+    loosens with the number of units that switch, not with that of steps: nothing is wrapped.
 
     It bounds facets, of a `Template`. Neither `window` nor `solver` matter: forms always go back to
     the initial set, and there is nothing to solve.

@@ -5,7 +5,7 @@ On the host step by step in numpy, where nothing is compiled; for traced numbers
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -42,6 +42,7 @@ def unrolled(
     directions: Float[np.ndarray, "N m n_x"],
     t: int = 0,
     slopes: Float[np.ndarray, "N units"] | None = None,
+    known: Sequence[Box] | None = None,
 ) -> Iterator[ByForms]:
     """Bounds of directions of the states after 1, ..., N steps, one step after the other in numpy.
 
@@ -52,6 +53,7 @@ def unrolled(
         directions: one row a facet, for each step.
         t: the time of the initial set.
         slopes: of lines for the units of each step, of which any are sound; None for good ones.
+        known: boxes that surely hold the states after each step, where they are known.
 
     Example:
         >>> from reachjax import MLP, AffinePlant
@@ -60,14 +62,15 @@ def unrolled(
         >>> [step.offsets.round(6).tolist() for step in unrolled(loop, X0, X0, np.ones((2, 1, 1)))]
         [[1.2], [0.72]]
     """
-    loop, X0, box = jax.device_get((loop, X0, box))
+    loop, X0, box, known = jax.device_get((loop, X0, box, known))
     with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
         start = InitialColumns.of(X0, box)
         state = AffineForms.beginning(start)
     for k, rows in enumerate(np.asarray(directions)):
         with np.errstate(all="ignore"):
             given = None if slopes is None else np.asarray(slopes[k])
-            state, units = step_forms(loop, state, t + k, start, slopes=given)
+            held = None if known is None else known[k]
+            state, units = step_forms(loop, state, t + k, start, slopes=given, known=held)
             found = _bounds(rows @ state, units, start)
         yield found
 
@@ -80,7 +83,7 @@ def unrolled_at_once(
     directions: Float[Array, "N m n_x"],
     t: int = 0,
 ) -> ByForms:
-    """The same for all steps at once, compiled, differentiable, also under `vmap`; no host is called.
+    """The same for all steps at once, compiled and differentiable, without a call to the host.
 
     A polytope counts as the box around it.
     """
@@ -88,7 +91,7 @@ def unrolled_at_once(
     n, steps = loop.states, len(directions)
     more = loop.units + n  # columns of one step
 
-    # a derivative computes a step again: to store what it needs of it is most of the code to compile
+    # a derivative computes a step again: storing what it needs of it is most of what is compiled
     @partial(jax.checkpoint, prevent_cse=False)
     def advance(state: AffineForms, step: tuple[Array, Array]) -> tuple[AffineForms, ByForms]:
         k, rows = step

@@ -63,7 +63,8 @@ class LinearCertificate(AbstractProof):
             ValueError: the slopes contain NaN or infinity, or have another shape.
 
         Example:
-            >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, LinearBounds, Template, reach
+            >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template
+            >>> from reachjax import LinearBounds, reach
             >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
             >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net)
             >>> tube = reach(loop, Box([-1.0], [2.0]), 2, Template.box(1), LinearBounds())

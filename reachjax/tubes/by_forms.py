@@ -48,19 +48,22 @@ def sets_by_forms(
         steps = _at_once(unrolled_at_once(loop, X0, box, directions[:horizon], start))
     for k, (step, seconds) in enumerate(steps, start=1):
         shaped, facets = template.at(k), len(template)
-        yield shaped.polytope(step.offsets), LinearCertificate(
-            loop=loop,
-            X0=X0,
-            directions=shaped.directions,
-            slopes=step.slopes,
-            corners=step.corners,
-            codes=np.full(facets, SolverStatus.SOLVED),
-            bounds=step.offsets,
-            witnesses=np.full(facets, np.nan),
-            witness_states=np.full((facets, 0), np.nan),
-            seconds=np.full(facets, seconds / facets),
-            k=k,
-            start=start,
+        yield (
+            shaped.polytope(jnp.asarray(step.offsets)),
+            LinearCertificate(
+                loop=loop,
+                X0=X0,
+                directions=shaped.directions,
+                slopes=step.slopes,
+                corners=step.corners,
+                codes=np.full(facets, SolverStatus.SOLVED),
+                bounds=step.offsets,
+                witnesses=np.full(facets, np.nan),
+                witness_states=np.full((facets, 0), np.nan),
+                seconds=np.full(facets, seconds / facets),
+                k=k,
+                start=start,
+            ),
         )
 
 

@@ -223,7 +223,7 @@ def reach(
     """
     _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
     loop, X0, template = owned((loop, X0, template))
-    boxed(X0, "X0")
+    box = boxed(X0, "X0")
     fixed = jax.lax.stop_gradient((loop, X0))
     simulations = None
     if is_concrete(fixed):
@@ -238,8 +238,9 @@ def reach(
         simulations=simulations,
     )
     sets, certificates, steps = [X0], [], []
-    numbers = range(horizon)
-    found = sets_by_forms(loop, X0, boxed(X0, "X0"), template, horizon, start)
+    numbers, found = range(horizon), iter(())
+    if relaxation.by_forms:
+        found = sets_by_forms(loop, X0, box, template, horizon, start)
     for _, k in zip(wrapped(progress, numbers), numbers, strict=False):
         if relaxation.by_forms:
             following, certificate = next(found)

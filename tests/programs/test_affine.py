@@ -49,10 +49,11 @@ def by_hand(case, box, D, steps):
 
     def bent(y, a):
         c, G, *_ = y
-        l, u = ends(y)
-        s = np.where(l >= 0, 1.0, np.where(u <= 0, a, (u - a * l) / np.where(u > l, u - l, 1)))
-        e = np.where((l < 0) & (u > 0), (1 - s) * u / 2, 0.0)
-        z = np.maximum(l, a * l), np.maximum(u, a * u)
+        lo, u = ends(y)
+        s = np.where(u <= 0, a, (u - a * lo) / np.where(u > lo, u - lo, 1))
+        s = np.where(lo >= 0, 1.0, s)
+        e = np.where((lo < 0) & (u > 0), (1 - s) * u / 2, 0.0)
+        z = np.maximum(lo, a * lo), np.maximum(u, a * u)
         return s * c + e, np.hstack([s[:, None] * G, np.diag(e)]), *z
 
     def sum_of(x, y):
@@ -207,3 +208,17 @@ def test_a_polytope_is_more_than_its_box(kind):
     loop = rj.ClosedLoop(rj.AffinePlant(case.data.A, np.eye(2)), net)
     exact = X0.support(D @ np.linalg.matrix_power(case.data.A + W, STEPS))
     np.testing.assert_allclose(offsets(loop, X0, D)[-1], exact, atol=1e-9)
+
+
+def test_what_is_known_of_states_is_used():
+    case, box, D = controlled(rj.ReLU(), seed=1), box_of(2), directions(2)
+    boxes = [
+        rj.Box(x.min(axis=0), x.max(axis=0))
+        for x in np.asarray(case.loop.simulate(box.sample(jax.random.key(0), 3000), STEPS))[
+            :, 1:
+        ].swapaxes(0, 1)
+    ]
+    better = offsets(case.loop, box, D, known=boxes)
+    assert (better <= offsets(case.loop, box, D) + 1e-12).all()
+    for t, held in enumerate(boxes):
+        assert (better[t] <= held.support(D) + 1e-12).all()

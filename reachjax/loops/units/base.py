@@ -140,8 +140,8 @@ class AbstractUnit(AbstractActivation):
     def remainder(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
         """Bounds of `f(y) - slope y` for inputs in `[lower, upper]`, rounding included.
 
-        They hold for any slope, and are one number where the unit is affine and has this one. Here from
-        the two lines, which a unit that knows where it bends can better.
+        They hold for any slope, and are one number where the unit is affine and has this one. Here
+        they come from the two lines; a unit that knows where it bends can do better.
 
         Args:
             slope: `(k,)`, finite.

@@ -34,7 +34,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.pytrees import pytree
 from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
-from reachjax.programs.initial import Ends, InitialColumns, settled
+from reachjax.programs.initial import Ends, InitialColumns, constant, settled
 from reachjax.sets import Box
 
 SPILL = 1e-13
@@ -91,7 +91,7 @@ class AffineForms:
     def __rmatmul__(self, matrix) -> AffineForms:
         """`matrix @ self` for an exact matrix."""
         matrix, count = namespace(self.rows).asarray(matrix), matrix.shape[1]
-        error = gamma(count) * abs(_constant(self.rows)).sum(axis=1)
+        error = gamma(count) * abs(constant(self.rows)).sum(axis=1)
         radii = abs(matrix) @ (self.radii + error[:, None])
         return AffineForms(matrix @ self.rows, radii * (1 + gamma(count + self.rows.shape[1])))
 
@@ -104,7 +104,7 @@ class AffineForms:
             changed = self.rows[:, :2] + xp.asarray(other)[..., None]
             rows = xp.concatenate([changed, self.rows[:, 2:]], axis=1)
             radii = self.radii
-        error = gamma(1) * abs(_constant(changed)).sum(axis=1)
+        error = gamma(1) * abs(constant(changed)).sum(axis=1)
         return AffineForms(rows, (radii + error[:, None]) * (1 + gamma(rows.shape[1] + 4)))
 
     __radd__ = __add__
@@ -133,11 +133,11 @@ class AffineForms:
         center, middle = self.rows[:, 0], self.rows[:, 1]
         first = self.rows[:, 2 : 2 + w]
         lower, upper = start.cut_ends(first) if cut else start.ends(first)
-        largest = abs(_constant(center)) + _constant(larger(-lower, upper))
+        largest = abs(constant(center)) + constant(larger(-lower, upper))
         rest = abs(self.rows[:, 2 + w :]).sum(axis=1) * (1 + gamma(n))
         slack = rest + (self.radii[:, 0] + gamma(8) * largest) * (1 + gamma(n))
         by_forms = center + lower - slack, center + upper + slack
-        reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(_constant(middle))
+        reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(constant(middle))
         return met(by_forms, (middle - reach, middle + reach))
 
     def with_own(self, by: Float[Array, " k"], place: Place) -> tuple[AffineForms, Any]:
@@ -238,10 +238,10 @@ def _unit(
     rows = slope[:, None] * y.rows
     constants = xp.stack([rows[:, 0] + offset, values.mid], axis=1)
     # products with 0 and 1 are exact
-    size = abs(_constant(rows)).sum(axis=1) + abs(_constant(offset))
+    size = abs(constant(rows)).sum(axis=1) + abs(constant(offset))
     rounded = (slope != 0) & (abs(slope) != 1) | (offset != 0)
     radius = abs(slope) * y.radii[:, 0] + xp.where(rounded, gamma(4) * size, 0.0)
-    radius = _constant(radius) * (1 + gamma(rows.shape[1]))
+    radius = constant(radius) * (1 + gamma(rows.shape[1]))
     z = AffineForms(
         xp.concatenate([constants, rows[:, 2:]], axis=1), xp.stack([radius, values.rad], axis=1)
     )
@@ -287,8 +287,3 @@ def _sum(one: Any, other: Any) -> Any:
     rows = many.copy()
     rows[:, : few.shape[1]] += few
     return rows
-
-
-def _constant(numbers: Any) -> Any:
-    """What derivatives take for a constant: what rounding may add does not depend on anything."""
-    return jax.lax.stop_gradient(numbers) if isinstance(numbers, jax.Array) else numbers

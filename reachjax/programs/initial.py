@@ -67,10 +67,10 @@ class InitialColumns:
         """What `r . w` does not exceed for each row, whatever the cut."""
         if not self.round:
             return abs(rows).sum(axis=1) * (1 + gamma(rows.shape[1]))
-        xp, fixed = namespace(rows), jax.lax.stop_gradient
+        xp = namespace(rows)
         largest = abs(rows).max(axis=1, initial=0.0)
         some = largest > 0
-        unit = xp.where(some, largest if xp is np else fixed(largest), 1.0)
+        unit = xp.where(some, constant(largest), 1.0)
         squares = xp.where(some, ((rows / unit[:, None]) ** 2).sum(axis=1), 1.0)
         return xp.where(some, unit * xp.sqrt(squares) * (1 + gamma(rows.shape[1] + 8)), 0.0)
 
@@ -91,13 +91,13 @@ class InitialColumns:
         """Bounds of `r . w` for each row, by the cut as well."""
         if self.cut is None:
             return self.ends(rows)
-        n, norms, a = rows.shape[1], self.norms(rows), rows @ self.back
+        n, norms, a = rows.shape[1], self.norms(rows), settled(rows @ self.back)
         least, most = _ends(self.cut, a)
         left = abs(rows - a @ self.spread) + gamma(n + 2) * (abs(a) @ abs(self.spread) + abs(rows))
         at, size = a @ self.center, abs(a) @ abs(self.center)
         error = left.sum(axis=1) + gamma(n + 8) * (size + abs(rows).sum(axis=1))
-        lower = least - at - (error + gamma(4) * abs(least)) * (1 + gamma(n))
-        upper = most - at + (error + gamma(4) * abs(most)) * (1 + gamma(n))
+        lower = least - at - constant((error + gamma(4) * abs(least)) * (1 + gamma(n)))
+        upper = most - at + constant((error + gamma(4) * abs(most)) * (1 + gamma(n)))
         return larger(-norms, lower), smaller(norms, upper)
 
 
@@ -119,8 +119,7 @@ def _of_ball(ball: Ellipsoid, cut: PolyhedralSet | None) -> InitialColumns:
 @jax.jit
 def _ball_map(ball: Ellipsoid) -> tuple[Array, Array, Array]:
     spread = ball.from_ball()
-    back = jax.numpy.linalg.inv(jax.lax.stop_gradient(spread))
-    return settled((ball.center, spread, back))
+    return settled((ball.center, spread, jax.numpy.linalg.inv(spread)))
 
 
 def settled(parts: Any) -> Any:
@@ -130,6 +129,11 @@ def settled(parts: Any) -> Any:
     """
     on_host = namespace(*jax.tree.leaves(parts)) is np
     return parts if on_host else jax.lax.optimization_barrier(parts)
+
+
+def constant(numbers: Any) -> Any:
+    """What derivatives take for a constant: what rounding may add does not depend on anything."""
+    return jax.lax.stop_gradient(numbers) if namespace(numbers) is not np else numbers
 
 
 def _ends(cut: PolyhedralSet, directions: Rows) -> Ends:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.programs.affine import AffineForms, UnitForms, step_forms
-from reachjax.programs.initial import InitialColumns
+from reachjax.programs.initial import InitialColumns, constant
 from reachjax.sets import AbstractSet, Box
 
 
@@ -105,5 +105,5 @@ def unrolled_at_once(
 def _bounds(rows: AffineForms, units: tuple[UnitForms, ...], start: InitialColumns) -> ByForms:
     xp = jnp if isinstance(rows.rows, jax.Array) else np
     slopes = xp.concatenate([layer.slope for layer in units] or [xp.zeros(0)])
-    corners = start.farthest(rows.columns[:, : len(start.spread)])
+    corners = start.farthest(constant(rows.columns[:, : len(start.spread)]))
     return ByForms(rows.ends(start, cut=True)[1], slopes, corners)

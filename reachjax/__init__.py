@@ -27,12 +27,14 @@ from reachjax.programs.relaxations import (
     AbstractRelaxation,
     AllProducts,
     CuttingPlanes,
+    LinearBounds,
     LocalBounds,
     PaperQC,
 )
-from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.proofs.ellipsoids import EllipsoidCertificate
 from reachjax.proofs.facets import Certificate
+from reachjax.proofs.linear import LinearCertificate
 from reachjax.proofs.mixed import MixedCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import (
@@ -79,6 +81,7 @@ __all__ = [
     "AbstractActivation",
     "AbstractCertificate",
     "AbstractNetwork",
+    "AbstractProof",
     "AbstractRelaxation",
     "AbstractSet",
     "AbstractSolver",
@@ -102,6 +105,8 @@ __all__ = [
     "InteriorPoint",
     "Intersection",
     "LeakyReLU",
+    "LinearBounds",
+    "LinearCertificate",
     "LocalBounds",
     "MixedCertificate",
     "MixedTemplate",

@@ -37,6 +37,7 @@ def parts(
         return rj.reach_step(case.loop, case.box, template, **options)[1]
 
     certificate = step()
+    assert isinstance(certificate, rj.AbstractCertificate)
     program = jax.device_get(certificate.program)
 
     def size(loop):

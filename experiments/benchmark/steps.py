@@ -76,6 +76,7 @@ def pipeline(case: Case, relaxation: rj.AbstractRelaxation, solver: rj.AbstractS
     """`reachjax.reach_step`: rows, program, solver, recheck and witnesses."""
     task = case.loop, case.box, case.template
     _, proof = rj.reach_step(*task, relaxation=relaxation, solver=solver)
+    assert isinstance(proof, rj.AbstractCertificate)
     size = int(np.sum(proof.program.used))
     multipliers = int(np.any(np.asarray(proof.multipliers) != 0, axis=0).sum())
     statuses = tuple(status.name for status in proof.statuses)

@@ -22,9 +22,13 @@ def owned(tree: Any) -> Any:
 
     `jnp.asarray` and `jax.device_put` keep aligned numpy arrays as they are, so what is written
     into these later would change objects that were built from them. Leaves that are sharded over
-    devices come to one of them; traced ones are left alone.
+    devices come to one of them; traced ones are left alone. A leaf that is there more than once is
+    copied once.
     """
-    return jax.tree.map(_own, tree)
+    leaves, structure = jax.tree.flatten(tree)
+    copies = {id(leaf): leaf for leaf in leaves}
+    copies = {key: _own(leaf) for key, leaf in copies.items()}
+    return jax.tree.unflatten(structure, [copies[id(leaf)] for leaf in leaves])
 
 
 def _own(leaf: Any) -> Any:

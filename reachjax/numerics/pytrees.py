@@ -32,10 +32,9 @@ def pytree(cls: type[T]) -> type[T]:
     check = cls.__dict__.get("__post_init__", lambda self: None)
 
     def convert_and_check(self) -> None:
-        for field in dataclasses.fields(self):
-            value, converter = getattr(self, field.name), field.metadata.get("converter")
-            left_out = value is None and field.default is None
-            if converter is not None and not left_out:
+        for field, converter in converters:
+            value = getattr(self, field.name)
+            if not (value is None and field.default is None):
                 name = f"{type(self).__name__}.{field.name}"
                 object.__setattr__(self, field.name, converter(value, name=name))
         check(self)
@@ -43,6 +42,7 @@ def pytree(cls: type[T]) -> type[T]:
     cls.__post_init__ = convert_and_check  # type: ignore[attr-defined]
     cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    converters = [(f, f.metadata["converter"]) for f in fields if "converter" in f.metadata]
     data = tuple(f.name for f in fields if not f.metadata.get("static"))
     meta = tuple(f.name for f in fields if f.metadata.get("static"))
 

@@ -24,6 +24,34 @@ TINY = float(np.finfo(float).tiny)
 """The smallest positive number that XLA tells from zero: what underflow takes from a product."""
 
 
+def namespace(*numbers: Any) -> Any:
+    """The module whose functions these numbers want: `jax.numpy`, or numpy if none is of JAX.
+
+    What is written over it serves compiled code and the host alike, where nothing is compiled.
+
+    Example:
+        >>> namespace(np.zeros(2), 1.0).__name__, namespace(jnp.zeros(2)).__name__
+        ('numpy', 'jax.numpy')
+    """
+    for each in numbers:
+        if type(each) is not np.ndarray and isinstance(each, jax.Array):
+            return jnp
+    return np
+
+
+def larger(one: Any, other: Any) -> Any:
+    """The larger of two numbers each: NaN if the first one is, the first one if the second is NaN.
+
+    `jnp.maximum` halves its derivative where both are equal, which takes long to compile.
+    """
+    return namespace(one, other).where(one < other, other, one)
+
+
+def smaller(one: Any, other: Any) -> Any:
+    """The smaller of two numbers each, as `larger`."""
+    return namespace(one, other).where(one > other, other, one)
+
+
 def gamma(operations: int) -> float:
     """Relative error bound of `operations` rounded operations, with some to spare."""
     count = (operations + 8) * UNIT
@@ -80,7 +108,7 @@ class Ball:
     @classmethod
     def exact(cls, mid) -> Self:
         """Numbers taken as they are: a ball of radius zero."""
-        return cls(mid, jnp.zeros_like(mid))
+        return cls(mid, namespace(mid).zeros_like(mid))
 
     @property
     def lower(self):
@@ -99,9 +127,9 @@ class Ball:
         A compiler may evaluate an expression in several places and round it differently in each,
         so the radius holds for every rounding of the midpoint.
         """
-        mid = lower + (upper - lower) / 2
-        rad = jnp.maximum(upper - mid, mid - lower) * (1 + gamma(4)) + gamma(4) * abs(mid)
-        return cls(mid, jnp.where(lower == upper, 0.0, rad))
+        xp, mid = namespace(lower, upper), lower + (upper - lower) / 2
+        rad = (upper - lower) / 2 * (1 + gamma(4)) + gamma(4) * abs(mid)
+        return cls(mid, xp.where(lower == upper, 0.0, rad))
 
     def lift(self, other) -> Ball:
         """`other` as a ball of this kind; plain numbers are taken to be exact."""
@@ -128,7 +156,7 @@ class Ball:
 
     def __rmul__(self, factors) -> Self:
         """Every entry, or every row, times an exact factor; those of 0, 1 and -1 round nothing."""
-        factors = jnp.asarray(factors)
+        factors = namespace(factors, self.mid).asarray(factors)
         factors = factors.reshape(factors.shape + (1,) * (self.mid.ndim - factors.ndim))
         mid, inexact = factors * self.mid, (factors != 0) & (abs(factors) != 1)
         return self._rebuilt(mid, abs(factors) * self.rad, gamma(1) * inexact * abs(mid))

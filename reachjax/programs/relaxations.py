@@ -56,10 +56,12 @@ class AbstractRelaxation(abc.ABC):
     Attributes:
         linear_bounds: whether the pre-activation bounds are those of supports and linear
             relaxations, where they are better than those of intervals.
+        by_forms: whether there are no programs at all, and sets are bounded by affine forms.
     """
 
     remove_stable: bool
     linear_bounds: ClassVar[bool] = False
+    by_forms: ClassVar[bool] = False
 
     @property
     def cuts(self) -> CuttingPlanes | None:
@@ -132,6 +134,37 @@ class LocalBounds(AbstractRelaxation):
         """The paper's groups, then the products that rest on bounds."""
         groups, free = PaperQC(self.repeated).groups(facts)
         return groups + [[pair] for pair in facts.products(Mark.BOUND)], free
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearBounds(AbstractRelaxation):
+    """No products, and so no programs: affine forms over the whole horizon (`programs.affine`).
+
+    Each unit that switches is held between two parallel lines, and everything else is affine, so
+    that every state is a row over the initial state and one column for each such unit. A tube takes
+    milliseconds, is compiled, differentiated and mapped over like any other JAX function, and
+    loosens with the number of units that switch, not with that of steps: nothing is wrapped.
+
+    It bounds facets, of a `Template`. Neither `window` nor `solver` matter: forms always go back to
+    the initial set, and there is nothing to solve.
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> tube = reach(loop, Box([1.0], [2.0]), 3, Template.box(1), LinearBounds())
+        >>> tube.sets[3].b.round(6).tolist()
+        [0.432, -0.216]
+    """
+
+    remove_stable: bool = dataclasses.field(default=True, init=False, repr=False)
+
+    linear_bounds: ClassVar[bool] = True
+    by_forms: ClassVar[bool] = True
+
+    def groups(self, facts: FactLayout) -> Groups:
+        """None."""
+        return [], 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,9 +19,41 @@ from reachjax.programs.lmi import Program
 from reachjax.proofs.proposal import SolverStatus
 
 
+class AbstractProof(Replaceable, abc.ABC):
+    """What every proof of one step's set says, whatever it rests on.
+
+    Attributes:
+        codes: `(f,)`, how what found it ended, as values of `SolverStatus`.
+        bounds: `(f,)`, what was proved.
+        witnesses: `(f,)`, the largest simulated values of what is bounded.
+        witness_states: `(f, n_x)`, the initial states that attain them.
+        seconds: `(f,)`, the time that it took to find.
+    """
+
+    codes: Int[Array | np.ndarray, " f"]
+    bounds: Float[Array | np.ndarray, " f"]
+    witnesses: Float[Array | np.ndarray, " f"]
+    witness_states: Float[Array | np.ndarray, "f n_x"]
+    seconds: Float[Array | np.ndarray, " f"]
+
+    @property
+    def statuses(self) -> tuple[SolverStatus, ...]:
+        """How the solver ended on each program; each has a sentence of `advice`."""
+        return tuple(SolverStatus(int(code)) for code in self.codes)
+
+    @property
+    def gaps(self) -> Float[Array | np.ndarray, " f"]:
+        """`bounds - witnesses`: how much tightness may be left; negative by rounding at most."""
+        return self.bounds - self.witnesses
+
+    @abc.abstractmethod
+    def recheck(self) -> np.ndarray:
+        """Prove the bounds anew."""
+
+
 @pytree
-class AbstractCertificate(Replaceable, abc.ABC):
-    """What the proof of one step's set has, whatever the set.
+class AbstractCertificate(AbstractProof):
+    """What the proof of one step's set by semidefinite programs has, whatever the set.
 
     Attributes:
         program: facts, products and objective rows over the scaled basis.
@@ -43,16 +75,6 @@ class AbstractCertificate(Replaceable, abc.ABC):
     witnesses: Float[Array | np.ndarray, " f"]
     witness_states: Float[Array | np.ndarray, "f n_x"]
     seconds: Float[Array | np.ndarray, " f"]
-
-    @property
-    def statuses(self) -> tuple[SolverStatus, ...]:
-        """How the solver ended on each program; each has a sentence of `advice`."""
-        return tuple(SolverStatus(int(code)) for code in self.codes)
-
-    @property
-    def gaps(self) -> Float[Array | np.ndarray, " f"]:
-        """`bounds - witnesses`: how much tightness may be left; negative by rounding at most."""
-        return self.bounds - self.witnesses
 
     @property
     def products_in_use(self) -> Int[np.ndarray, "p 2"]:

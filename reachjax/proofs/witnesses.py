@@ -93,10 +93,16 @@ class Simulations:
         begin = np.where(known, states, self._middle)
         fixed = self._loop, self._X0, self._scale, self._middle
         found = ascended(*fixed, begin, region, which, k, self._horizon, self._start)
-        trajectories = self._loop.simulate(found, self._horizon, self._start)
-        inside = np.asarray(self._X0.contains(found)) & np.isfinite(trajectories).all(axis=(1, 2))
-        self._states = np.concatenate([self._states, np.asarray(found)[inside]])
-        self._trajectories = np.concatenate([self._trajectories, np.asarray(trajectories)[inside]])
+        self.include(np.asarray(found))
+
+    def include(self, states: Float[np.ndarray, "m n_x"]) -> None:
+        """Simulate these initial states too, those that are in the set or just outside."""
+        inside = np.asarray(self._X0.contains(states))[:, None]
+        states = np.where(inside, states, self._middle + PULL * (states - self._middle))
+        trajectories = np.asarray(self._loop.simulate(states, self._horizon, self._start))
+        kept = np.asarray(self._X0.contains(states)) & np.isfinite(trajectories).all(axis=(1, 2))
+        self._states = np.concatenate([self._states, states[kept]])
+        self._trajectories = np.concatenate([self._trajectories, trajectories[kept]])
 
     def _values(self, k: int, region: AbstractSet) -> Float[np.ndarray, "c m"]:
         """What a set bounds, at each trajectory after `k` steps."""

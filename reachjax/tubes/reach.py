@@ -26,13 +26,14 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
-from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.witnesses import Simulations, initial_states
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.by_forms import sets_by_forms
+from reachjax.tubes.by_programs import sets_by_programs
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
-from reachjax.tubes.steps import Setting, Step, boxed
-from reachjax.tubes.successors import successors
+from reachjax.tubes.steps import Reached, Setting, boxed
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 """Wraps the iteration over time steps, such as `tqdm.tqdm` or `rich.progress.track`."""
@@ -70,7 +71,7 @@ class ReachTube(Replaceable):
     loop: ClosedLoop
     template: AbstractTemplate
     sets: tuple[AbstractSet, ...]
-    certificates: tuple[AbstractCertificate | None, ...]
+    certificates: tuple[AbstractProof | None, ...]
     start: int = static(default=0)
     seal: Seal | None = None
 
@@ -97,7 +98,7 @@ class ReachTube(Replaceable):
         """The number of steps."""
         return len(self.sets) - 1
 
-    def proof(self, t: int) -> AbstractCertificate:
+    def proof(self, t: int) -> AbstractProof:
         """The certificate of `sets[t]`.
 
         Raises:
@@ -124,7 +125,7 @@ def reach_step(
     solver: AbstractSolver = Auto(),  # noqa: B008
     samples: int = SAMPLES,
     seed: int = 0,
-) -> tuple[AbstractSet, AbstractCertificate]:
+) -> tuple[AbstractSet, AbstractProof]:
     """A set that surely contains every successor of a set, and its certificate.
 
     Args:
@@ -220,7 +221,7 @@ def reach(
     """
     _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
     loop, X0, template = owned((loop, X0, template))
-    boxed(X0, "X0")
+    box = boxed(X0, "X0")
     fixed = jax.lax.stop_gradient((loop, X0))
     simulations = None
     if is_concrete(fixed):
@@ -234,22 +235,20 @@ def reach(
         compact=window != 1 and is_concrete(fixed, jax.lax.stop_gradient(template)),
         simulations=simulations,
     )
-    sets, certificates, steps = [X0], [], []
-    numbers = range(horizon)
-    for _, k in zip(wrapped(progress, numbers), numbers, strict=False):
-        before = steps if window is None else steps[max(0, k + 1 - window) :]
-        proof = certificates[-1] if certificates else None
-        steps.append(Step(setting, sets[-1], k, tuple(before), proof))
-        following, certificate = successors(steps[-1], template.at(k + 1))
-        sets.append(following)
-        certificates.append(certificate)
+    if relaxation.by_forms:
+        following = sets_by_forms(loop, X0, box, template, horizon, start)
+    else:
+        following = sets_by_programs(setting, X0, template, horizon, window)
+    steps = [step for _, step in zip(wrapped(progress, range(horizon)), following, strict=False)]
     if len(steps) < horizon:
         raise ValueError(
             f"progress must pass on each of the {horizon} steps, but {len(steps)} arrived"
         )
+    certificates = [step.proof for step in steps]
     if simulations is not None and is_concrete(certificates):
-        certificates = _with_witnesses(certificates, sets, simulations, steps)
-    proved = loop, template, tuple(sets), (None, *owned(certificates))
+        certificates = _with_witnesses(steps, simulations)
+    sets = X0, *(step.region for step in steps)
+    proved = loop, template, sets, (None, *owned(certificates))
     return ReachTube(*proved, start, seal_of(*proved, start=start))
 
 
@@ -273,21 +272,17 @@ def _simulations(
     return None
 
 
-def _with_witnesses(
-    certificates: list[AbstractCertificate],
-    sets: list[AbstractSet],
-    simulations: Simulations,
-    steps: list[Step],
-) -> list[AbstractCertificate]:
+def _with_witnesses(steps: list[Reached], simulations: Simulations) -> list[AbstractProof]:
     """Simulate what the certificates bound, from the initial set."""
-    for k, certificate in enumerate(certificates, start=1):
-        if len(steps[k - 1].window) == k:
-            states = np.asarray(certificate.moments)[:, : sets[0].dimension, -1]
-            simulations.climb(k, sets[k], np.arange(len(states)), states)
-    found = [simulations.attained(k, sets[k]) for k in range(1, len(sets))]
+    for k, step in enumerate(steps, start=1):
+        if len(step.states) and step.climb:
+            simulations.climb(k, step.region, np.arange(len(step.states)), step.states)
+        elif len(step.states):
+            simulations.include(step.states)
+    found = [simulations.attained(k, step.region) for k, step in enumerate(steps, start=1)]
     return [
-        certificate.replace(witnesses=values, witness_states=states)
-        for certificate, (values, states) in zip(certificates, found, strict=True)
+        step.proof.replace(witnesses=values, witness_states=states)
+        for step, (values, states) in zip(steps, found, strict=True)
     ]
 
 
@@ -319,7 +314,7 @@ def _check(
     whole_number("seed", seed, 0)
     if window is not None:
         whole_number("window", window, 1)
-    elif not is_concrete(jax.lax.stop_gradient((loop, X0, template))):
+    elif not (relaxation.by_forms or is_concrete(jax.lax.stop_gradient((loop, X0, template)))):
         raise ValueError(
             "window=None is chosen from numbers: inside jax.jit, vmap or scan give a number, such "
             "as window=1"

@@ -41,7 +41,8 @@ def seal_of(*parts: Any, start: int = 0) -> Seal:
         >>> bool((before == seal_of({"W": jnp.array([1.0, 2.0 + 4e-16])})).all())
         False
     """
-    leaves, structure = jax.tree.flatten(jax.lax.stop_gradient(parts))
+    fixed = parts if is_concrete(parts) else jax.lax.stop_gradient(parts)
+    leaves, structure = jax.tree.flatten(fixed)
     # an object that does not say what it is, is called by its address: not so in another process
     named = re.sub(r" at 0x[0-9a-f]+", "", f"{structure}, start={start}")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cached_property
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from reachjax.programs.lmi import Program
 from reachjax.programs.preactivations import first_inputs, first_rows
 from reachjax.programs.relaxations import AbstractRelaxation
 from reachjax.programs.windows import Window
-from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, Box, Polytope
 from reachjax.solvers import AbstractSolver
@@ -33,6 +34,22 @@ def boxed(X: AbstractSet, name: str) -> Box:
         return X.bounding_box()
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"{name} cannot be used: {error}") from None
+
+
+class Reached(NamedTuple):
+    """The set of one step.
+
+    Attributes:
+        region: it surely holds the states.
+        proof: of that.
+        states: `(c, n_x)`, initial states that the proof thinks of as the worst; there may be none.
+        climb: whether ascents begin at them, one for each value that the set bounds.
+    """
+
+    region: AbstractSet
+    proof: AbstractProof
+    states: Float[np.ndarray, "c n_x"]
+    climb: bool
 
 
 @dataclasses.dataclass(frozen=True)

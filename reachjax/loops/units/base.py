@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 from jaxtyping import Array, Bool, Float
 
 from reachjax.numerics.pytrees import Replaceable, pytree, static
+from reachjax.numerics.rounding import gamma, namespace
 
 
 class Mark(enum.Enum):
@@ -135,6 +136,28 @@ class AbstractUnit(AbstractActivation):
         Whether they are the same is decided by the signs of bounds, and the slopes of such lines
         are at most 1 in size.
         """
+
+    def remainder(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """Bounds of `f(y) - slope y` for inputs in `[lower, upper]`, rounding included.
+
+        They hold for any slope, and are one number where the unit is affine and has this one. Here
+        they come from the two lines; a unit that knows where it bends can do better.
+
+        Args:
+            slope: `(k,)`, finite.
+            lower: `(k,)`.
+            upper: `(k,)`.
+        """
+        xp, size = namespace(slope, lower, upper), abs(lower) + abs(upper)
+        ends = []
+        for extreme, (its, offset) in zip(
+            (xp.minimum, xp.maximum), self.lines(lower, upper), strict=True
+        ):
+            end = extreme((its - slope) * lower, (its - slope) * upper) + offset
+            rounding = gamma(4) * (abs(its - slope) * size + abs(end))
+            ends.append((end, xp.where(its == slope, 0.0, rounding)))
+        (low, under), (high, over) = ends
+        return low - under, high + over
 
     @abc.abstractmethod
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:

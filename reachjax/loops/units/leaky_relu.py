@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark
-from reachjax.loops.units.relu import PRODUCTS, ZERO, ReLU
+from reachjax.loops.units.relu import PRODUCTS, ZERO, ReLU, bent
 from reachjax.numerics.checks import real_number
-from reachjax.numerics.rounding import gamma
+from reachjax.numerics.rounding import gamma, namespace
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,7 @@ class LeakyReLU(AbstractUnit):
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`max(y, slope y)`, with derivative 1 at 0."""
-        return jnp.where(y >= 0, y, self.slope * y)
+        return namespace(y).where(y >= 0, y, self.slope * y)
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """A monotone function maps bounds to bounds; products are rounded outwards."""
@@ -53,16 +53,21 @@ class LeakyReLU(AbstractUnit):
 
     def lines(self, lower: Array, upper: Array) -> Lines:
         """`y` where `l >= 0`, else `a y` where `u <= 0`, else the chord above one of the two."""
+        xp = namespace(lower, upper)
         below, above = ReLU().lines(lower, upper)
         switching = ~Lines(below, above).affine
-        under = jnp.where(below.slope == 1, 1.0, self.slope)
-        slope = jnp.where(switching, self.slope + (1 - self.slope) * above.slope, under)
+        under = xp.where(below.slope == 1, 1.0, self.slope)
+        slope = xp.where(switching, self.slope + (1 - self.slope) * above.slope, under)
         # what rounding of the slope may take away is given back by the offset: |y| <= u - l
         offset = (1 - self.slope) * above.offset + gamma(16) * (upper - lower)
         return Lines(
-            below=Line(under, jnp.zeros_like(under)),
-            above=Line(slope, jnp.where(switching, offset, 0.0)),
+            below=Line(under, xp.zeros_like(under)),
+            above=Line(slope, xp.where(switching, offset, 0.0)),
         )
+
+    def remainder(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """`(1 - slope) y` where `y >= 0` and `(a - slope) y` elsewhere: bent at 0."""
+        return bent(self.slope, slope, lower, upper)
 
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:
         """The two sides of the maximum and, from the bounds, how far `z` is above each."""

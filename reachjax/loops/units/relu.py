@@ -9,14 +9,14 @@ of slopes between two of them.
 from __future__ import annotations
 
 import dataclasses
+from functools import reduce
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark, Product
-from reachjax.numerics.rounding import gamma
+from reachjax.numerics.rounding import gamma, larger, namespace, smaller
 
 ZERO = (("output", "slack"),)
 PRODUCTS = (
@@ -25,6 +25,20 @@ PRODUCTS = (
     Product("slack", "slack cap", Mark.BOUND),
     Product("output cap", "slack cap", Mark.BOUND),
 )
+
+
+def bent(
+    leak: float, slope: Array, lower: Array, upper: Array
+) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """Bounds of `max(y, leak y) - slope y` for inputs in `[lower, upper]`, rounded outwards.
+
+    The function is bent at 0 alone, where it is 0, and zero all along where `slope` is its own.
+    """
+    right, left = 1.0 - slope, leak - slope
+    ends = [right * larger(end, 0.0) + left * smaller(end, 0.0) for end in (lower, upper)]
+    ends.append(namespace(lower).where((lower < 0) & (upper > 0), 0.0, ends[0]))
+    low, high = reduce(smaller, ends), reduce(larger, ends)
+    return low - gamma(4) * abs(low), high + gamma(4) * abs(high)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,21 +56,27 @@ class ReLU(AbstractUnit):
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """A monotone function maps bounds to bounds."""
-        return jax.nn.relu(lower), jax.nn.relu(upper)
+        xp = namespace(lower, upper)
+        return xp.where(lower <= 0, 0.0, lower), xp.where(upper <= 0, 0.0, upper)
 
     def lines(self, lower: Array, upper: Array) -> Lines:
         """`y` where `l >= 0`, else 0 where `u <= 0`, else the chord above `y` or above 0.
 
         Below, it is the one that leaves less out; any slope between 0 and 1 is sound there.
         """
+        xp = namespace(lower, upper)
         active, inactive = lower >= 0, (upper <= 0) & (lower < 0)
         switching = ~(active | inactive)
-        width = jnp.where(switching, upper - lower, 1.0)
+        width = xp.where(switching, upper - lower, 1.0)
         # both rounded up: the chord stays above at its two ends
-        slope = jnp.where(switching, upper / width, 1.0 * active) * (1 + gamma(4) * switching)
-        offset = jnp.where(switching, -slope * lower * (1 + gamma(4)), 0.0)
+        slope = xp.where(switching, upper / width, 1.0 * active) * (1 + gamma(4) * switching)
+        offset = xp.where(switching, -slope * lower * (1 + gamma(4)), 0.0)
         under = 1.0 * (active | (switching & (upper > -lower)))
-        return Lines(below=Line(under, jnp.zeros_like(under)), above=Line(slope, offset))
+        return Lines(below=Line(under, xp.zeros_like(under)), above=Line(slope, offset))
+
+    def remainder(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """`(1 - slope) y` where `y >= 0` and `-slope y` elsewhere: attained at ends and at 0."""
+        return bent(0.0, slope, lower, upper)
 
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:
         """Equation (relu::sector) and, from the bounds, the caps of `z` and of `z - y`."""

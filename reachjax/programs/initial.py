@@ -1,0 +1,148 @@
+"""The columns that stand for the initial state: `x_0 = q + M w`, `w` in a unit ball.
+
+The ball is that of the largest entry around a box, and the round one around an ellipsoid, so every
+entry of `w` lies in `[-1, 1]`, and what a row over `w` attains is its 1-norm or its 2-norm. Where
+the set is smaller than `q + M w`, a set `S` that also holds it cuts off more: for any row `a`,
+
+    r . w  <=  sup_S a - a . q + |r - a M|,
+
+since `x_0` is in `S`; `a = r M^+` leaves nothing over but rounding.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.numerics.pytrees import pytree, static
+from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
+from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
+from reachjax.sets.polyhedra import support
+
+Rows = Float[Array | np.ndarray, "k n"]
+
+Ends = tuple[Any, Any]
+"""Lower and upper bounds `(k,)`."""
+
+
+@pytree
+class InitialColumns:
+    """The columns `w` of an initial set, `x_0 = center + spread w`.
+
+    Attributes:
+        center: `(n,)`.
+        spread: `(n, n)`.
+        back: `(n, n)`, nearly the pseudoinverse of `spread`.
+        cut: a set that also holds `x_0`, where there is one: a box, or on the host a polytope.
+        round: whether `|w| <= 1` in the 2-norm; in that of the largest entry if not.
+    """
+
+    center: Float[Array | np.ndarray, " n"]
+    spread: Float[Array | np.ndarray, "n n"]
+    back: Float[Array | np.ndarray, "n n"]
+    cut: PolyhedralSet | None
+    round: bool = static()
+
+    @classmethod
+    def of(cls, X: AbstractSet, box: Box) -> InitialColumns:
+        """Those of a set, numpy arrays if the set has numpy arrays.
+
+        Args:
+            X: the set. A polytope is itself the cut on the host, and is held by its box in JAX.
+            box: around it.
+        """
+        cut, ball = X.parts
+        if cut is not None and cut.needs_programs and namespace(*cut.facets) is not np:
+            cut = box
+        if ball is not None:
+            return _of_ball(ball, cut)
+        return _of_box(box, cut if cut is not None and cut.needs_programs else None)
+
+    def norms(self, rows: Rows) -> Any:
+        """What `r . w` does not exceed for each row, whatever the cut."""
+        if not self.round:
+            return abs(rows).sum(axis=1) * (1 + gamma(rows.shape[1]))
+        xp = namespace(rows)
+        largest = abs(rows).max(axis=1, initial=0.0)
+        some = largest > 0
+        unit = xp.where(some, constant(largest), 1.0)
+        squares = xp.where(some, ((rows / unit[:, None]) ** 2).sum(axis=1), 1.0)
+        return xp.where(some, unit * xp.sqrt(squares) * (1 + gamma(rows.shape[1] + 8)), 0.0)
+
+    def farthest(self, rows: Rows) -> Rows:
+        """Initial states at which `r . w` is largest for each row, whatever the cut; rounded."""
+        xp = namespace(rows)
+        if not self.round:
+            return self.center + xp.sign(rows) @ self.spread.T
+        length = xp.sqrt((rows**2).sum(axis=1, keepdims=True))
+        return self.center + rows / xp.where(length > 0, length, 1.0) @ self.spread.T
+
+    def ends(self, rows: Rows) -> Ends:
+        """Bounds of `r . w` for each row, by the norm."""
+        norms = self.norms(rows)
+        return -norms, norms
+
+    def cut_ends(self, rows: Rows) -> Ends:
+        """Bounds of `r . w` for each row, by the cut as well."""
+        if self.cut is None:
+            return self.ends(rows)
+        n, norms, a = rows.shape[1], self.norms(rows), settled(rows @ self.back)
+        least, most = _ends(self.cut, a)
+        left = abs(rows - a @ self.spread) + gamma(n + 2) * (abs(a) @ abs(self.spread) + abs(rows))
+        at, size = a @ self.center, abs(a) @ abs(self.center)
+        error = left.sum(axis=1) + gamma(n + 8) * (size + abs(rows).sum(axis=1))
+        lower = least - at - constant((error + gamma(4) * abs(least)) * (1 + gamma(n)))
+        upper = most - at + constant((error + gamma(4) * abs(most)) * (1 + gamma(n)))
+        return larger(-norms, lower), smaller(norms, upper)
+
+
+def _of_box(box: Box, cut: PolyhedralSet | None) -> InitialColumns:
+    around = Ball.between(box.lower, box.upper)
+    xp = namespace(around.mid)
+    center, rad = settled((around.mid, around.rad))
+    back = xp.where(rad > 0, 1.0 / xp.where(rad > 0, rad, 1.0), 0.0)
+    return InitialColumns(center, xp.diag(rad), xp.diag(back), cut, round=False)
+
+
+def _of_ball(ball: Ellipsoid, cut: PolyhedralSet | None) -> InitialColumns:
+    center, spread, back = _ball_map(ball)
+    if namespace(ball.center) is np:
+        center, spread, back = jax.device_get((center, spread, back))
+    return InitialColumns(center, spread, back, cut, round=True)
+
+
+@jax.jit
+def _ball_map(ball: Ellipsoid) -> tuple[Array, Array, Array]:
+    spread = ball.from_ball()
+    return settled((ball.center, spread, jax.numpy.linalg.inv(spread)))
+
+
+def settled(parts: Any) -> Any:
+    """One rounding of numbers for all that is made of them, whatever a compiler fuses.
+
+    They define what a column stands for, which must be the same wherever it is.
+    """
+    on_host = namespace(*jax.tree.leaves(parts)) is np
+    return parts if on_host else jax.lax.optimization_barrier(parts)
+
+
+def constant(numbers: Any) -> Any:
+    """What derivatives take for a constant: what rounding may add does not depend on anything."""
+    return jax.lax.stop_gradient(numbers) if namespace(numbers) is not np else numbers
+
+
+def _ends(cut: PolyhedralSet, directions: Rows) -> Ends:
+    """Least and largest values of directions on the cut, rounded outwards."""
+    if isinstance(cut, Box):
+        values = directions @ Ball.between(cut.lower, cut.upper)
+        return values.lower, values.upper
+    A, b = (np.asarray(part) for part in cut.facets)
+    count = len(directions)
+    try:
+        found, *_ = support(A, b, np.concatenate([-directions, directions]))
+    except RuntimeError:  # linear programs too hard for the solver: the norms do
+        return np.full(count, -np.inf), np.full(count, np.inf)
+    return -found[:count], found[count:]

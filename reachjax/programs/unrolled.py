@@ -1,0 +1,109 @@
+"""The whole horizon in affine forms: bounds of directions of every later state, over `X_0` alone.
+
+On the host step by step in numpy, where nothing is compiled; for traced numbers as one `scan`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.programs.affine import AffineForms, UnitForms, step_forms
+from reachjax.programs.initial import InitialColumns, constant
+from reachjax.sets import AbstractSet, Box
+
+
+class ByForms(NamedTuple):
+    """What affine forms say of the states of one step; or of `N` steps, with a leading axis.
+
+    Attributes:
+        offsets: `(m,)`, upper bounds of the directions.
+        slopes: `(units,)`, of the lines that stand for the units of the step before.
+        corners: `(m, n_x)`, initial states at which the forms are largest, but for their columns of
+            units and what cuts the initial set.
+    """
+
+    offsets: Float[Array | np.ndarray, "*N m"]
+    slopes: Float[Array | np.ndarray, "*N units"]
+    corners: Float[Array | np.ndarray, "*N m n_x"]
+
+
+def unrolled(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[np.ndarray, "N m n_x"],
+    t: int = 0,
+    slopes: Float[np.ndarray, "N units"] | None = None,
+    known: Sequence[Box] | None = None,
+) -> Iterator[ByForms]:
+    """Bounds of directions of the states after 1, ..., N steps, one step after the other in numpy.
+
+    Args:
+        loop: of concrete numbers.
+        X0: the initial set.
+        box: around it.
+        directions: one row a facet, for each step.
+        t: the time of the initial set.
+        slopes: of lines for the units of each step, of which any are sound; None for good ones.
+        known: boxes that surely hold the states after each step, where they are known.
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop, X0 = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net), Box([1.0], [2.0])
+        >>> [step.offsets.round(6).tolist() for step in unrolled(loop, X0, X0, np.ones((2, 1, 1)))]
+        [[1.2], [0.72]]
+    """
+    loop, X0, box, known = jax.device_get((loop, X0, box, known))
+    with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
+        start = InitialColumns.of(X0, box)
+        state = AffineForms.beginning(start)
+    for k, rows in enumerate(np.asarray(directions)):
+        with np.errstate(all="ignore"):
+            given = None if slopes is None else np.asarray(slopes[k])
+            held = None if known is None else known[k]
+            state, units = step_forms(loop, state, t + k, start, slopes=given, known=held)
+            found = _bounds(rows @ state, units, start)
+        yield found
+
+
+@partial(jax.jit, static_argnames="t")
+def unrolled_at_once(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[Array, "N m n_x"],
+    t: int = 0,
+) -> ByForms:
+    """The same for all steps at once, compiled and differentiable, without a call to the host.
+
+    A polytope counts as the box around it.
+    """
+    start = InitialColumns.of(X0, box)
+    n, steps = loop.states, len(directions)
+    more = loop.units + n  # columns of one step
+
+    # a derivative computes a step again: storing what it needs of it is most of what is compiled
+    @partial(jax.checkpoint, prevent_cse=False)
+    def advance(state: AffineForms, step: tuple[Array, Array]) -> tuple[AffineForms, ByForms]:
+        k, rows = step
+        state, units = step_forms(loop, state, t + k, start, place=n + k * more)
+        return state, _bounds(rows @ state, units, start)
+
+    state = AffineForms.beginning(start, n + steps * more)
+    return jax.lax.scan(advance, state, (jnp.arange(steps), directions))[1]
+
+
+def _bounds(rows: AffineForms, units: tuple[UnitForms, ...], start: InitialColumns) -> ByForms:
+    xp = jnp if isinstance(rows.rows, jax.Array) else np
+    slopes = xp.concatenate([layer.slope for layer in units] or [xp.zeros(0)])
+    corners = start.farthest(constant(rows.columns[:, : len(start.spread)]))
+    return ByForms(rows.ends(start, cut=True)[1], slopes, corners)

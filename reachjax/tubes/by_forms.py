@@ -1,0 +1,95 @@
+"""Sets of a template around the states of each step by affine forms, without any program."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from reachjax.loops import ClosedLoop
+from reachjax.numerics.checks import is_concrete
+from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
+from reachjax.proofs.linear import LinearCertificate
+from reachjax.proofs.proposal import SolverStatus
+from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
+from reachjax.tubes.steps import Reached
+
+
+def sets_by_forms(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    box: Box,
+    template: AbstractTemplate,
+    horizon: int,
+    start: int,
+) -> Iterator[Reached]:
+    """The smallest sets that affine forms show to hold the states, one step after the other.
+
+    Concrete numbers are propagated in numpy as the sets are asked for, traced ones all at once.
+
+    Raises:
+        TypeError: the template has no facets.
+        ValueError: states overflow.
+    """
+    if not isinstance(template, Template):
+        raise TypeError(
+            f"LinearBounds() bounds facets, but the template is of kind {type(template).__name__}: "
+            "give a Template, or for ellipsoids another relaxation, such as CuttingPlanes() or "
+            "LocalBounds()"
+        )
+    directions = template.directions
+    if template.steps is None:
+        directions = jnp.broadcast_to(directions, (horizon, *directions.shape))
+    if is_concrete(loop, X0, box, directions):
+        steps = _timed(unrolled(loop, X0, box, np.asarray(directions[:horizon]), start), start)
+    else:
+        steps = _at_once(unrolled_at_once(loop, X0, box, directions[:horizon], start))
+    for k, (step, seconds) in enumerate(steps, start=1):
+        shaped, facets = template.at(k), len(template)
+        proof = LinearCertificate(
+            loop=loop,
+            X0=X0,
+            directions=shaped.directions,
+            slopes=step.slopes,
+            corners=step.corners,
+            codes=np.full(facets, SolverStatus.SOLVED),
+            bounds=step.offsets,
+            witnesses=np.full(facets, np.nan),
+            witness_states=np.full((facets, 0), np.nan),
+            seconds=np.full(facets, seconds / facets),
+            k=k,
+            start=start,
+        )
+        region = shaped.polytope(jnp.asarray(step.offsets))
+        states = np.asarray(step.corners) if is_concrete(step.corners) else np.zeros((0, 0))
+        yield Reached(region, proof, states, climb=False)
+
+
+def _timed(steps: Iterator[ByForms], start: int) -> Iterator[tuple[ByForms, float]]:
+    """Each step with the slopes of all up to it, and the seconds that it took.
+
+    Raises:
+        ValueError: states overflow.
+    """
+    slopes, began = [], time.perf_counter()
+    for t, step in enumerate(steps, start=start + 1):
+        if not np.isfinite(step.offsets).all():
+            raise ValueError(
+                f"the loop's states at t = {t} overflow or are not numbers: check the weights of "
+                "loop.controller and the entries of loop.plant"
+            )
+        slopes.append(step.slopes)
+        seconds = time.perf_counter() - began
+        yield step._replace(slopes=np.stack(slopes)), seconds
+        began = time.perf_counter()
+
+
+def _at_once(found: ByForms) -> Iterator[tuple[ByForms, float]]:
+    """The same of traced numbers, of which nobody knows how long they take."""
+    slopes, corners = jax.lax.stop_gradient((found.slopes, found.corners))
+    offsets = jnp.where(jnp.isfinite(found.offsets), found.offsets, jnp.nan)
+    for k in range(len(offsets)):
+        yield ByForms(offsets[k], slopes[: k + 1], corners[k]), 0.0

@@ -1,0 +1,42 @@
+"""Sets of a template around the states of each step by semidefinite programs, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from reachjax.numerics.checks import is_concrete
+from reachjax.sets import AbstractSet, AbstractTemplate
+from reachjax.tubes.steps import Reached, Setting, Step
+from reachjax.tubes.successors import successors
+
+
+def sets_by_programs(
+    setting: Setting,
+    X0: AbstractSet,
+    template: AbstractTemplate,
+    horizon: int,
+    window: int | None,
+) -> Iterator[Reached]:
+    """The smallest sets that are proved, each being the next one's set of states.
+
+    Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
+
+    Args:
+        setting: what all steps have in common.
+        X0: the initial set.
+        template: what the sets look like.
+        horizon: how many steps there are.
+        window: over how many of them a program reaches back; None for as many as may be.
+    """
+    X, proof, steps = X0, None, []
+    for k in range(horizon):
+        before = steps if window is None else steps[max(0, k + 1 - window) :]
+        step = Step(setting, X, k, tuple(before), proof)
+        steps.append(step)
+        X, proof = successors(step, template.at(k + 1))
+        states = np.zeros((0, X0.dimension))
+        if len(step.window) == k + 1 and is_concrete(proof.moments):
+            states = np.asarray(proof.moments)[:, : X0.dimension, -1]
+        yield Reached(X, proof, states, climb=True)

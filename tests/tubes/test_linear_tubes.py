@@ -1,0 +1,211 @@
+"""Tubes by affine forms: they hold trajectories, have derivatives, compile, can be rechecked."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from tests.activations import CONTROLLERS, NAMES, controlled
+from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
+from tests.differences import error_in_all_parts
+from tests.networks import directions
+
+HORIZON = 5
+ROUNDING = 1e-13
+"""Of what is simulated, as a part of its size."""
+KINDS = ["box", "polytope", "simplex", "ellipsoid", "intersection", "far intersection"]
+
+
+def tube_of(loop, X0, template, horizon=HORIZON, **options):
+    return rj.reach(loop, X0, horizon, template, rj.LinearBounds(), **options)
+
+
+def assert_holds(tube, start=0):
+    trajectories = np.asarray(tube.simulate(2000))
+    for t in range(1, tube.horizon + 1):
+        values = trajectories[:, t] @ np.asarray(tube.sets[t].A).T
+        slack = ROUNDING * abs(values).max()
+        assert (values <= np.asarray(tube.sets[t].b) + slack).all()
+        assert (tube.proof(t).gaps >= -slack).all()
+
+
+@pytest.mark.parametrize("n_x", [1, 2, 3, 6])
+@pytest.mark.parametrize("options", CONTROLLERS, ids=NAMES)
+def test_every_trajectory_is_inside(options, n_x):
+    loop = controlled(**options, n_x=n_x, seed=n_x).loop
+    assert_holds(tube_of(loop, initial_set("box", n_x, n_x), rj.Template(directions(n_x, 0, 3))))
+
+
+@pytest.mark.parametrize("n_x", [2, 3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_trajectory_from_any_set_is_inside(kind, n_x):
+    loop = closed_loop(random_loop(n_x, seed=1))
+    assert_holds(tube_of(loop, initial_set(kind, n_x, 1), rj.Template(directions(n_x, 0, 3))))
+
+
+@pytest.mark.parametrize("boxed", [True, False])
+def test_plants_and_input_boxes_may_vary_in_time(boxed):
+    loop = closed_loop(random_loop(2, boxed=boxed, steps=7))
+    tube = tube_of(loop, initial_set("box", 2), rj.Template.octagonal(2), start=2)
+    assert_holds(tube)
+    late = rj.reach(loop, initial_set("box", 2), HORIZON, rj.Template.octagonal(2), start=2)
+    for t in range(1, HORIZON + 1):
+        assert (tube.sets[t].b >= late.sets[t].b - 1e-7).all()
+
+
+def test_templates_may_vary_in_time():
+    loop, X0 = closed_loop(random_loop(2)), initial_set("box", 2)
+    tube = tube_of(loop, X0, rj.Template.adapted(loop, X0, HORIZON, 8, samples=500))
+    assert_holds(tube)
+    np.testing.assert_array_equal(tube.proof(2).recheck(), tube.proof(2).bounds)
+
+
+@pytest.mark.parametrize("width", [0.0, 1e-12])
+@pytest.mark.parametrize("flat", [1, 2])
+def test_flat_sets_stay_flat(flat, width):
+    box = initial_set("box", 2)
+    upper = np.where(np.arange(2) < flat, box.lower + width, box.upper)
+    loop = closed_loop(random_loop(2))
+    tube = tube_of(loop, rj.Box(box.lower, upper), rj.Template.box(2))
+    assert_holds(tube)
+    if flat == 2:
+        assert (rj.log_widths(tube.sets[-1]) < np.log(1e-10)).all()
+
+
+def test_affine_loops_are_exact():
+    A = np.array([[0.9, 0.4], [-0.4, 0.9]])
+    X0, D = initial_set("ellipsoid", 2), directions(2)
+    tube = tube_of(autonomous(A), X0, rj.Template(D), 20)
+    exact = X0.support(D @ np.linalg.matrix_power(A, 20))
+    np.testing.assert_allclose(tube.sets[20].b, exact, rtol=1e-12)
+
+
+def test_a_recheck_gives_the_same_bounds_and_holds_for_any_slopes():
+    loop, X0 = closed_loop(random_loop(2, seed=1)), initial_set("box", 2, 1)
+    tube = tube_of(loop, X0, rj.Template.octagonal(2))
+    proof, rng = tube.proof(HORIZON), np.random.default_rng(0)
+    np.testing.assert_array_equal(proof.recheck(), proof.bounds)
+    attained = np.max(np.asarray(tube.simulate()[:, -1]) @ proof.directions.T, axis=0)
+    slopes = np.asarray(proof.slopes)
+    for garbage in (rng.normal(size=slopes.shape), 0 * slopes, 1 + 0 * slopes, -slopes):
+        found = proof.recheck(garbage)
+        assert (found >= attained - ROUNDING).all()
+    assert np.any(found > proof.bounds + 0.01)
+    with pytest.raises(ValueError, match=r"slopes must be finite and have shape \(5, 14\)"):
+        proof.recheck(slopes * np.nan)
+
+
+def test_a_certificate_says_what_every_other_says():
+    loop, X0 = closed_loop(random_loop(2)), initial_set("box", 2)
+    tube = tube_of(loop, X0, rj.Template.octagonal(2))
+    proof = tube.proof(3)
+    assert isinstance(proof, rj.AbstractProof)
+    assert set(proof.statuses) == {rj.SolverStatus.SOLVED}
+    assert (proof.witnesses <= proof.bounds).all()
+    assert proof.witness_states.shape == (8, 2)
+    assert (proof.seconds > 0).all()
+    assert int(rj.unsolved(tube)) == 0
+    verdict = rj.verify(tube, safe=rj.Box([-9.0, -9.0], [9.0, 9.0]))
+    assert verdict.status is rj.VerdictStatus.PROVED
+    assert np.isfinite(float(rj.log_volume(tube)))
+
+
+def test_cells_are_tighter():
+    loop, X0 = closed_loop(random_loop(2, seed=1)), initial_set("box", 2, 1)
+    template = rj.Template.octagonal(2)
+    whole = tube_of(loop, X0, template)
+    cells = rj.reach_partitioned(loop, X0, HORIZON, template, rj.LinearBounds(), cells=(2, 2))
+    assert (cells.bounds(HORIZON) <= np.asarray(whole.sets[-1].b) + 1e-12).all()
+
+
+def penalty(loop, X0):
+    tube = tube_of(loop, X0, rj.Template.octagonal(2))
+    widths = jnp.stack([region.b[0:4:2] + region.b[1:4:2] for region in tube.sets[1:]])
+    return jnp.sum(jnp.log(widths))
+
+
+@pytest.mark.parametrize(
+    ("options", "kind"),
+    [*((options, "box") for options in CONTROLLERS)]
+    + [(CONTROLLERS[0], kind) for kind in ("ellipsoid", "far intersection")],
+    ids=[*NAMES, "ellipsoid", "intersection"],
+)
+def test_a_gradient_is_that_of_the_bounds(options, kind):
+    """In all parts at once, away from where a unit becomes affine; differences of the compiled."""
+    X0 = initial_set(kind, 2, 2)
+    if kind == "far intersection":  # whose box touches the ellipsoid, which is a kink
+        box, by = X0.polytope, 0.1 * X0.polytope.widths
+        X0 = X0.replace(polytope=rj.Box(box.lower + by, box.upper - by))
+    args = controlled(**options, hidden=(4, 3), seed=2).loop, X0
+    value, gradient = jax.jit(jax.value_and_grad(penalty, argnums=(0, 1)))(*args)
+    np.testing.assert_allclose(value, penalty(*args), rtol=1e-9)  # compiled, and in numpy
+    assert error_in_all_parts(penalty, args, gradient, 1e-5) < 1e-5
+
+
+def test_nothing_is_called_from_compiled_code():
+    args = closed_loop(random_loop(2)), initial_set("box", 2)
+    compiled = jax.jit(jax.value_and_grad(penalty)).lower(*args)
+    assert "callback" not in compiled.as_text()
+
+
+def test_a_training_step_compiles_once_whatever_switches():
+    traced = []
+
+    @jax.jit
+    def step(loop, X0):
+        traced.append(1)
+        return jax.value_and_grad(penalty)(loop, X0)
+
+    loop, X0 = closed_loop(random_loop(2)), initial_set("box", 2)
+    for shift in (-5.0, 0.0, 5.0):  # all off, some switch, all on
+        layers = [(W, b + shift) for W, b in loop.controller.layers]
+        value, gradient = step(loop.replace(controller=rj.MLP.from_layers(layers)), X0)
+        assert np.isfinite(value)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert len(traced) == 1
+
+
+def test_loops_and_sets_are_mapped_over():
+    loops = [closed_loop(random_loop(2, seed=seed)) for seed in range(3)]
+    X0 = initial_set("box", 2)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loops)
+    values = jax.vmap(penalty, in_axes=(0, None))(stacked, X0)
+    np.testing.assert_allclose(values, [float(penalty(loop, X0)) for loop in loops], rtol=1e-9)
+
+
+def test_penalties_take_it():
+    loop, X0, template = closed_loop(random_loop(2)), initial_set("box", 2), rj.Template.box(2)
+    options = {"relaxation": rj.LinearBounds()}
+    volume = jax.jit(lambda X0: rj.volume_penalty(loop, X0, 2, template, **options))(X0)
+    np.testing.assert_allclose(volume, rj.volume_penalty(loop, X0, 2, template, **options))
+    goal = rj.Box([-0.1, -0.1], [0.1, 0.1])
+    missed = jax.grad(lambda X0: rj.specification_penalty(loop, X0, 2, template, goal, **options))
+    assert any(np.any(leaf != 0) for leaf in jax.tree.leaves(missed(X0)))
+
+
+def test_what_overflows_has_no_bound():
+    loop = autonomous(1e200 * np.eye(2))
+    X0, template = rj.Box([1.0, 1.0], [2.0, 2.0]), rj.Template.box(2)
+    with pytest.raises(ValueError, match="states at t = 2 overflow"):
+        tube_of(loop, X0, template, 3)
+    found = jax.jit(lambda loop: tube_of(loop, X0, template, 3).sets[3].b)(loop)
+    assert np.isnan(found).all()
+
+
+@pytest.mark.parametrize("template", [rj.EllipsoidTemplate(), rj.MixedTemplate(rj.Template.box(2))])
+def test_ellipsoids_need_another_relaxation(template):
+    with pytest.raises(TypeError, match=r"bounds facets.*CuttingPlanes\(\)"):
+        tube_of(closed_loop(random_loop(2)), initial_set("box", 2), template)
+
+
+def test_a_step_and_a_bar():
+    loop, X0, template = closed_loop(random_loop(2)), initial_set("box", 2), rj.Template.box(2)
+    first, proof = rj.reach_step(loop, X0, template, relaxation=rj.LinearBounds())
+    seen = []
+    tube = tube_of(loop, X0, template, progress=lambda steps: (seen.append(t) or t for t in steps))
+    assert seen == list(range(HORIZON))
+    np.testing.assert_array_equal(first.b, tube.sets[1].b)
+    assert proof.k == 1
+    with pytest.raises(ValueError, match="progress must pass on each of the 5 steps"):
+        tube_of(loop, X0, template, progress=lambda steps: steps[:3])

@@ -152,9 +152,8 @@ class AbstractSet(Replaceable, abc.ABC):
         """
         near, limits = self.nearest(point, scale), self.limits
         here, there = self.bounded_values(middle), self.bounded_values(near)
-        grown = jnp.where(
-            there > here, there - here, 1.0
-        )  # not where the middle is outside as well
+        # where the middle is as far outside, by rounding, a share would be 0 / 0
+        grown = jnp.where(there > here, there - here, 1.0)
         share = jnp.where(there > limits, jnp.maximum(limits - here, 0.0) / grown, 1.0)
         return middle + INSIDE * jnp.min(share) * (near - middle)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.proofs.ascent import _projected, ascended
+from reachjax.proofs.ascent import ascended
 from reachjax.proofs.witnesses import Simulations
 from tests.cases import some
 from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
@@ -162,8 +162,8 @@ def test_projections_onto_a_set_without_interior_are_points_of_it(facets):
     middle, box = states.mean(axis=0), X.bounding_box()
     scale = np.diag(np.asarray(box.upper - box.lower) / 2)
     moved = states + np.random.default_rng(1).normal(size=states.shape) @ scale
-    project = jax.jit(jax.vmap(_projected, in_axes=(None, None, None, None, 0)))
+    project = jax.jit(jax.vmap(lambda state: X.brought_inside(state, middle, scale)))
     # where both ends of the way are outside, equally far, a share of it would be 0 / 0
-    found = np.asarray(project(X, box, middle, scale, moved))
+    found = np.asarray(project(moved))
     away = (found @ np.asarray(X.A).T - X.b) / np.linalg.norm(X.A / abs(X.A).max(), axis=1)
     assert np.all(away <= 1e-8 * abs(X.A).max() * abs(middle).max())

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 import reachjax as rj
+from reachjax.programs.windows import Window
 from tests.networks import (
     LoopData,
     box_region,
@@ -89,3 +90,9 @@ def one_step(
 ) -> tuple[Any, Any]:
     """A step of `recursion`."""
     return rj.reach_step(loop, X, template, relaxation=relaxation, **options)
+
+
+def step_program(loop, X, box, directions, t, relaxation):
+    """Theorem 1 for every facet of the successors of `X` at time `t`: a window of one step."""
+    window = Window.beginning(loop, X, box, t, relaxation)
+    return window.extended(loop, X, box).program(directions, relaxation)

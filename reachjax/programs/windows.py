@@ -6,7 +6,7 @@ window of one step is the paper's recursion; one that begins at the initial set 
 
 A window grows by one step at a time, by functions that are compiled once. Units that bounds prove
 to be affine leave the basis; outside of `jax.jit` their columns can be left out as well
-(`compact`), so that a window of many steps has as many columns as it has units that switch.
+(`drop_columns`), so that a window of many steps has as many columns as it has units that switch.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from reachjax.programs.scaling import scaled_states, scaled_units
 from reachjax.sets import AbstractSet, Box, Ellipsoid
 
 COLUMNS = 16
-"""The columns of a compact basis come in multiples of this many."""
+"""Where columns are dropped, those that stay come in multiples of this many."""
 
 
 @pytree
@@ -51,7 +51,7 @@ class Window(Replaceable):
         taken: how many columns are.
         prune: whether units that bounds prove to be affine leave the basis.
         linear: whether bounds are those of supports and linear relaxations.
-        compact: whether units that left the basis take no columns either.
+        drop_columns: whether units that left the basis take no columns either.
     """
 
     facts: tuple[Rows, ...]
@@ -64,7 +64,7 @@ class Window(Replaceable):
     taken: int = static()
     prune: bool = static()
     linear: bool = static()
-    compact: bool = static()
+    drop_columns: bool = static()
 
     @classmethod
     def beginning(
@@ -74,7 +74,7 @@ class Window(Replaceable):
         box: Box,
         t: int,
         relaxation: AbstractRelaxation,
-        compact: bool = False,
+        drop_columns: bool = False,
     ) -> Window:
         """No step yet.
 
@@ -85,7 +85,7 @@ class Window(Replaceable):
             t: the time.
             relaxation: whether units that bounds prove to be affine leave the basis, and by which
                 bounds.
-            compact: whether their columns are left out as well, which needs concrete numbers.
+            drop_columns: whether their columns are left out as well, which needs concrete numbers.
         """
         (_, ball), prune, linear = X.parts, relaxation.remove_stable, relaxation.linear_bounds
         state, cone, T = _first(X.cone_facts(), box, ball)
@@ -100,7 +100,7 @@ class Window(Replaceable):
             taken=loop.states,
             prune=prune,
             linear=linear,
-            compact=compact and prune,
+            drop_columns=drop_columns and prune,
         )
 
     def __len__(self) -> int:
@@ -158,7 +158,7 @@ class Window(Replaceable):
 
     def _places(self, bounds: LoopBounds) -> tuple[Int[np.ndarray, " k"], int]:
         """The column of each unit of one more step, and how many are taken then."""
-        if not self.compact:
+        if not self.drop_columns:
             return self.taken + np.arange(self.units), self.taken + self.units
         stays = ~jax.device_get(jax.lax.stop_gradient(bounds.affine))
         places = np.where(stays, self.taken + np.cumsum(stays) - 1, -1)
@@ -166,25 +166,14 @@ class Window(Replaceable):
 
     def _padded(self, needed: int) -> Window:
         """The same with at least so many columns; new ones are empty."""
-        more = (-(-needed // COLUMNS) * COLUMNS if self.compact else needed) - len(self.transform)
+        more = (-(-needed // COLUMNS) * COLUMNS if self.drop_columns else needed) - len(
+            self.transform
+        )
         if more <= 0:
             return self
         rows = self.facts, self.cone, self.state
         (facts, cone, state), T = _widened(rows, self.transform, more)
         return self.replace(facts=facts, cone=cone, state=state, transform=T)
-
-
-def step_program(
-    loop: ClosedLoop,
-    X: AbstractSet,
-    box: Box,
-    directions: Float[Array, "f n_x"],
-    t: int,
-    relaxation: AbstractRelaxation,
-) -> Program:
-    """Theorem 1 for every facet of the successors of `X` at time `t`: a window of one step."""
-    window = Window.beginning(loop, X, box, t, relaxation)
-    return window.extended(loop, X, box).program(directions, relaxation)
 
 
 @jax.jit

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from reachjax.loops import ClosedLoop
 from reachjax.sets import AbstractSet
 
-STEPS = 80
+ASCENT_STEPS = 80
 """Gradient steps of an ascent. After 60, one on a polytope of six dimensions lacked 1e-4."""
 
 LONGEST = 4.0
@@ -77,6 +77,6 @@ def ascended(
 
         first = X0.brought_inside(state, middle, scale)
         begun = (*jax.value_and_grad(value)(first), first, jnp.array(0.5))
-        return jax.lax.scan(improve, begun, length=STEPS)[0][2]
+        return jax.lax.scan(improve, begun, length=ASCENT_STEPS)[0][2]
 
     return jax.vmap(climb)(states, which)

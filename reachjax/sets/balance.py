@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from reachjax.numerics.rounding import TINY
 
-LARGEST = float(np.finfo(float).max)
+LARGEST_FLOAT = float(np.finfo(float).max)
 
 
 def exponents(rows: Float[np.ndarray, "*m n"]) -> Int[np.ndarray, "*m"]:
@@ -39,7 +39,7 @@ def upwards(
     What is left between 0 and `TINY` in size is rounded as well: JAX would take it for zero.
     """
     with np.errstate(over="ignore", under="ignore"):
-        values = np.maximum(np.ldexp(numbers, by), -LARGEST)
+        values = np.maximum(np.ldexp(numbers, by), -LARGEST_FLOAT)
     values = np.where(numbers > 0, np.maximum(values, TINY), values)
     return np.where((values < 0) & (values > -TINY), 0.0, values)
 

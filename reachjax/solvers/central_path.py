@@ -19,10 +19,10 @@ PRICES = (10.0, 100.0, 1000.0)
 (`EllipsoidBarrier.unit`). The trace of moments stays below the price; with many neurons kept, 1 was
 seen to be too low by half."""
 
-LARGEST = 1500
+MOST_MULTIPLIERS = 1500
 """Multipliers beyond which no path is followed: a step costs their cube."""
 
-STEPS = 200
+NEWTON_STEPS = 200
 """Newton steps after which the centre counts as not found."""
 
 CENTRED = 1e-8
@@ -87,7 +87,7 @@ def minimiser(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Newton's method from a point inside: the minimiser and the Hessian there."""
     value, before = barrier.value(y, weight), np.inf
-    for _ in range(STEPS if np.isfinite(value) else 0):
+    for _ in range(NEWTON_STEPS if np.isfinite(value) else 0):
         gradient, hessian = barrier.derivatives(y, weight)
         step = -solved(hessian, gradient)
         decrement = -float(gradient @ step)

@@ -21,7 +21,7 @@ from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import Enclosure, SolverStatus
 from reachjax.sets import NormalForm
 from reachjax.solvers.barrier import EllipsoidBarrier
-from reachjax.solvers.central_path import FROM_AFAR, LARGEST, Centre, path_end, solved
+from reachjax.solvers.central_path import FROM_AFAR, MOST_MULTIPLIERS, Centre, path_end, solved
 
 WEIGHTS = (1e-6, 1e-7, 1e-8)
 """Barrier weights `mu`, followed downwards. At the last one the logarithm of the volume is off by
@@ -79,7 +79,7 @@ def enclosed(program: Program, given: NormalForm | None = None) -> Enclosure:
     if not all_finite((program, given)) or (given is not None and not given.A.any()):
         return proposal
     reduced = presolved(program)
-    if len(reduced.kept) > LARGEST or not len(reduced.columns):
+    if len(reduced.kept) > MOST_MULTIPLIERS or not len(reduced.columns):
         return proposal
     barrier = EllipsoidBarrier(reduced, given)
     found = path_end(barrier, barrier.inside, FROM_AFAR + WEIGHTS)
@@ -103,7 +103,7 @@ def centred(
     None where the path is not reached, or the program is so large that it would take long.
     """
     reduced = presolved(program)
-    if len(reduced.kept) > LARGEST or not all_finite((multipliers, form)):
+    if len(reduced.kept) > MOST_MULTIPLIERS or not all_finite((multipliers, form)):
         return None
     barrier = EllipsoidBarrier(reduced)
     found = _centre(barrier, multipliers, form)
@@ -130,7 +130,7 @@ def sensitivity(
         return Sensitivity.unknown(program)
     barrier = EllipsoidBarrier(presolved(with_successor(program, frame)))
     found = None
-    if barrier.count <= LARGEST:
+    if barrier.count <= MOST_MULTIPLIERS:
         found = _centre(barrier, multipliers, form.of(frame.inverse))
     if found is None:
         return Sensitivity.unknown(program)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SET = {"facecolor": "none", "edgecolor": "tab:red", "linewidth": 1.4}
-SAMPLES = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
+SAMPLE_STYLE = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
 
 
 def plot_set(
@@ -112,7 +112,7 @@ def _plot_cell(
     except RuntimeError:  # the initial set is too thin to be sampled: the sets alone
         trajectories = np.zeros((0, tube.horizon + 1, 2))
     for t, region in enumerate(tube.sets):
-        ax.scatter(*trajectories[:, t].T, **SAMPLES, label=None if t else simulated)
+        ax.scatter(*trajectories[:, t].T, **SAMPLE_STYLE, label=None if t else simulated)
         first = {"edgecolor": "black", "label": initial}
         plot_set(region, ax, (i, j), **({"label": None if t > 1 else certified} if t else first))
 

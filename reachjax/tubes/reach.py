@@ -40,7 +40,7 @@ Progress = Callable[[Iterable[int]], Iterable[int]]
 
 SAMPLES = 1000
 
-LARGEST = 64
+LARGEST_WINDOW = 64
 """The most columns of a window whose length is chosen."""
 
 EXAMPLES = {
@@ -231,8 +231,8 @@ def reach(
         start=start,
         relaxation=relaxation,
         solver=solver,
-        limit=LARGEST if window is None else None,
-        compact=window != 1 and is_concrete(fixed, jax.lax.stop_gradient(template)),
+        limit=LARGEST_WINDOW if window is None else None,
+        drop_columns=window != 1 and is_concrete(fixed, jax.lax.stop_gradient(template)),
         simulations=simulations,
     )
     if relaxation.by_forms:

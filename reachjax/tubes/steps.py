@@ -62,7 +62,7 @@ class Setting:
         relaxation: which products of facts are used.
         solver: what solves the semidefinite programs.
         limit: how many columns a window of more than one step may have; None if any number.
-        compact: whether units that are affine take no columns of the basis.
+        drop_columns: whether units that are affine take no columns of the basis.
         simulations: trajectories from the initial set; None where numbers are traced.
     """
 
@@ -71,7 +71,7 @@ class Setting:
     relaxation: AbstractRelaxation
     solver: AbstractSolver
     limit: int | None
-    compact: bool
+    drop_columns: bool
     simulations: Simulations | None
 
 
@@ -126,7 +126,7 @@ class Step:
         first, *others = (*before, self)
         setting = self.setting
         window = Window.beginning(
-            setting.loop, first.X, first.box, first.t, setting.relaxation, setting.compact
+            setting.loop, first.X, first.box, first.t, setting.relaxation, setting.drop_columns
         )
         for step in (first, *others):
             window = step._added_to(window)

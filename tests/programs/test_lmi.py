@@ -17,9 +17,8 @@ from experiments.benchmark.reference import (
     relu_qc,
 )
 from reachjax.programs.lmi import weighted_products
-from reachjax.programs.windows import step_program
 from tests.cases import some
-from tests.closed_loops import closed_loop, random_loop
+from tests.closed_loops import closed_loop, random_loop, step_program
 from tests.networks import box_region, dead_network, directions, simplex_region
 
 STATES = [1, 2, 3, 6]

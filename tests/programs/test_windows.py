@@ -76,7 +76,7 @@ def test_a_window_of_any_length_may_be_asked_for():
 
 
 def test_the_length_is_chosen_by_the_columns_that_are_needed(monkeypatch):
-    monkeypatch.setattr(importlib.import_module("reachjax.tubes.reach"), "LARGEST", 8)
+    monkeypatch.setattr(importlib.import_module("reachjax.tubes.reach"), "LARGEST_WINDOW", 8)
     data = random_loop(2, hidden=(5, 4), seed=2)
     tube = tube_of(data, rj.CuttingPlanes(), None)
     used = [int(tube.proof(t).program.used.sum()) for t in range(1, HORIZON + 1)]
@@ -92,7 +92,8 @@ def test_units_that_left_the_basis_take_no_columns():
     box = rj.Box([0.0, 0.0], [1e-3, 1e-3])
     relaxation = rj.CuttingPlanes()
     windows = [
-        Window.beginning(loop, box, box, 0, relaxation, compact) for compact in (False, True)
+        Window.beginning(loop, box, box, 0, relaxation, drop_columns)
+        for drop_columns in (False, True)
     ]
     for _ in range(2):
         windows = [window.extended(loop, box, box) for window in windows]
@@ -153,8 +154,8 @@ def test_facts_hold_of_every_trajectory(n_x, kind, relaxation):
     loop, X0 = closed_loop(random_loop(n_x, hidden=(5, 4), seed=3)), initial_set(kind, n_x)
     sets = [X0, *around(loop, X0)]
     windows = [
-        Window.beginning(loop, X0, X0.bounding_box(), 0, relaxation, compact)
-        for compact in (False, True)
+        Window.beginning(loop, X0, X0.bounding_box(), 0, relaxation, drop_columns)
+        for drop_columns in (False, True)
     ]
     for X in sets:
         windows = [window.extended(loop, X, X.bounding_box()) for window in windows]

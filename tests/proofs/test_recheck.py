@@ -7,9 +7,8 @@ import pytest
 import reachjax as rj
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import weighted_products
-from reachjax.programs.windows import step_program
 from reachjax.proofs.recheck import interval_offsets, sound_offsets
-from tests.closed_loops import closed_loop, random_loop
+from tests.closed_loops import closed_loop, random_loop, step_program
 from tests.networks import box_region, dead_network, directions, he_network, simulate
 
 STATES = [1, 2, 3, 6]

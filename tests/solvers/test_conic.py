@@ -7,11 +7,10 @@ from scipy.linalg import eigvalsh
 
 import reachjax as rj
 from reachjax.programs.presolve import presolved
-from reachjax.programs.windows import step_program
 from reachjax.proofs.recheck import interval_offsets
 from reachjax.proofs.reported import judged_offsets
 from reachjax.solvers.conic import STATUSES
-from tests.closed_loops import closed_loop, one_step, random_loop
+from tests.closed_loops import closed_loop, one_step, random_loop, step_program
 from tests.networks import box_region, directions, simulate
 
 SOLVERS = {

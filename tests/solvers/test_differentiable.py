@@ -10,9 +10,8 @@ import pytest
 
 import reachjax as rj
 from reachjax.programs.lmi import lagrangian_slopes
-from reachjax.programs.windows import step_program
 from reachjax.solvers import Facets, proved
-from tests.closed_loops import closed_loop, random_loop, recursion
+from tests.closed_loops import closed_loop, random_loop, recursion, step_program
 from tests.differences import along, error_in_all_parts, norm, relative_error
 from tests.networks import box_region, simplex_region
 

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.programs.windows import step_program
 from reachjax.proofs.proposal import Enclosure
 from reachjax.proofs.recheck import sound_level
 from reachjax.proofs.reported import judged_form
 from reachjax.sets import NormalForm
-from tests.closed_loops import closed_loop, random_loop, recursion
+from tests.closed_loops import closed_loop, random_loop, recursion, step_program
 from tests.differences import error_in_all_parts
 
 

@@ -10,14 +10,13 @@ from scipy.linalg import eigvalsh
 
 import reachjax as rj
 from reachjax.programs.presolve import presolved
-from reachjax.programs.windows import step_program
 from reachjax.proofs.proposal import ANSWERS
 from reachjax.proofs.recheck import interval_offsets
 from reachjax.proofs.reported import judged_form, judged_offsets, log_volume
 from reachjax.sets import NormalForm
 from reachjax.solvers import barrier, centring
 from reachjax.solvers.barrier import EllipsoidBarrier
-from tests.closed_loops import closed_loop, one_step, random_loop, recursion
+from tests.closed_loops import closed_loop, one_step, random_loop, recursion, step_program
 from tests.differences import dot, error_in_all_parts
 from tests.networks import (
     affine_network,
@@ -453,7 +452,7 @@ def test_the_barrier_s_derivatives_are_its_differences(shape, monkeypatch):
 
 
 def test_programs_with_too_many_multipliers_are_left_alone(monkeypatch):
-    monkeypatch.setattr(centring, "LARGEST", 3)
+    monkeypatch.setattr(centring, "MOST_MULTIPLIERS", 3)
     found = SOLVER.enclose(program(X=round_of, rows=np.eye(3)))
     assert int(found.status) == rj.SolverStatus.FAILED
     assert np.all(found.multipliers == 0)
@@ -470,7 +469,7 @@ def test_auto_chooses_by_size_alone_and_asks_the_small_one_where_the_large_one_f
     assert auto.choice(many) == rj.Clarabel()
     given = program(X=round_of, rows=np.eye(3), relaxation=rj.PaperQC(repeated=False))
     np.testing.assert_array_equal(auto.enclose(given).form.A, SOLVER.enclose(given).form.A)
-    monkeypatch.setattr(centring, "LARGEST", 3)
+    monkeypatch.setattr(centring, "MOST_MULTIPLIERS", 3)
     np.testing.assert_array_equal(auto.enclose(given).form.A, rj.Clarabel().enclose(given).form.A)
     with pytest.raises(TypeError, match=r"Auto\.small"):
         rj.Auto(small="clarabel")

@@ -166,9 +166,9 @@ class Window(Replaceable):
 
     def _padded(self, needed: int) -> Window:
         """The same with at least so many columns; new ones are empty."""
-        more = (-(-needed // COLUMNS) * COLUMNS if self.drop_columns else needed) - len(
-            self.transform
-        )
+        if self.drop_columns:
+            needed = -(-needed // COLUMNS) * COLUMNS
+        more = needed - len(self.transform)
         if more <= 0:
             return self
         rows = self.facts, self.cone, self.state

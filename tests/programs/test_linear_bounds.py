@@ -10,7 +10,6 @@ from reachjax.programs.bounds import loop_bounds, successor_box
 from reachjax.programs.preactivations import bounds_over, known_inputs
 from reachjax.programs.windows import Window
 from reachjax.tubes.steps import Setting, Step
-from tests.cases import some
 from tests.closed_loops import closed_loop, random_loop
 from tests.networks import (
     affine_network,
@@ -21,6 +20,7 @@ from tests.networks import (
     simplex_region,
     simulate,
 )
+from tests.quick_cases import some
 
 NETWORKS = [he_network, saturating_network, dead_network, affine_network]
 SETS = [

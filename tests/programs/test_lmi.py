@@ -17,9 +17,9 @@ from experiments.benchmark.reference import (
     relu_qc,
 )
 from reachjax.programs.lmi import weighted_products
-from tests.cases import some
 from tests.closed_loops import closed_loop, random_loop, step_program
 from tests.networks import box_region, dead_network, directions, simplex_region
+from tests.quick_cases import some
 
 STATES = [1, 2, 3, 6]
 

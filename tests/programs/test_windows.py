@@ -10,9 +10,9 @@ import pytest
 
 import reachjax as rj
 from reachjax.programs.windows import COLUMNS, Window
-from tests.cases import some
 from tests.closed_loops import closed_loop, initial_set, random_loop
 from tests.networks import box_region, simulate
+from tests.quick_cases import some
 
 HORIZON = 3
 RELAXATIONS = [

@@ -10,9 +10,9 @@ import pytest
 import reachjax as rj
 from reachjax.proofs.ascent import ascended
 from reachjax.proofs.witnesses import Simulations
-from tests.cases import some
 from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
 from tests.networks import plant, simulate
+from tests.quick_cases import some
 
 HORIZON, STARTS = 2, 6
 DIMENSIONS = (1, 2, 3, 6)

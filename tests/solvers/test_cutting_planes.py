@@ -12,9 +12,9 @@ import reachjax as rj
 from reachjax.programs.windows import Window
 from reachjax.solvers import Facets, Rounds
 from reachjax.solvers.cut_pool import CutPool, joint
-from tests.cases import some
 from tests.closed_loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, saturating_network, simplex_region, simulate
+from tests.quick_cases import some
 
 CUTS = rj.CuttingPlanes()
 CASES = {

@@ -109,8 +109,12 @@ def test_the_lagrangian_at_the_solution_is_the_offset():
 
 
 def agree(first, second):
-    """Compilations round differently; multipliers are exact to the root of a tolerance, 1e-9."""
-    np.testing.assert_allclose(first, second, rtol=3e-5, atol=1e-8)
+    """Compilations round differently; multipliers are exact to the root of a tolerance, 1e-9.
+
+    That is a part of the whole derivative: its small entries are sums of large ones.
+    """
+    largest = np.max(abs(np.asarray(second)), initial=1e-3)
+    np.testing.assert_allclose(first, second, rtol=0, atol=3e-5 * largest)
 
 
 def test_compiled_and_plain_gradients_agree():

@@ -10,9 +10,9 @@ import pytest
 import reachjax as rj
 from reachjax.programs.bounds import loop_bounds
 from tests.activations import ACTIVATIONS, CONTROLLERS, NAMES, controlled
-from tests.cases import some
 from tests.closed_loops import step_program
 from tests.networks import box_region, directions
+from tests.quick_cases import some
 
 STATES = [1, 2, 3, 6]
 MIXED = [

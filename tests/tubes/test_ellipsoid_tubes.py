@@ -14,10 +14,10 @@ from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import ANSWERS, Enclosure
 from reachjax.sets import NormalForm
 from reachjax.solvers import ellipsoids
-from tests.cases import some
 from tests.closed_loops import closed_loop, one_step, random_loop, recursion
 from tests.differences import error_in_all_parts
 from tests.networks import box_region, simplex_region
+from tests.quick_cases import some
 from tests.solvers.test_enclosures import case, ellipsoid, final
 
 RELAXATIONS = [rj.LocalBounds(), rj.PaperQC(), rj.PaperQC(repeated=False)]

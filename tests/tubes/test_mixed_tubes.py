@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.cases import some
 from tests.closed_loops import one_step, recursion
 from tests.differences import error_in_all_parts
 from tests.networks import box_region, simplex_region
+from tests.quick_cases import some
 from tests.sets.test_intersection import intersection
 from tests.solvers.test_enclosures import PROMISED, case
 from tests.tubes.test_ellipsoid_tubes import holds

@@ -13,7 +13,6 @@ import pytest
 
 import reachjax as rj
 from experiments.benchmark.reference import paper_E_in, paper_E_mid, paper_E_out, paper_step
-from tests.cases import some
 from tests.closed_loops import recursion
 from tests.networks import (
     LoopData,
@@ -28,6 +27,7 @@ from tests.networks import (
     simplex_region,
     simulate,
 )
+from tests.quick_cases import some
 
 STATES = [1, 2, 3, 6]
 STEPS = 3

@@ -36,10 +36,14 @@ def on_host(function: Any, shapes: Any, argument: Any) -> Any:
         function: from a tree of numpy arrays to a tree of numpy arrays, without side effects.
         shapes: the tree of `jax.ShapeDtypeStruct` that it returns.
         argument: a tree of JAX arrays.
+
+    Raises:
+        TypeError: a derivative through it is asked for. Who calls gives the first one by a rule.
     """
     if is_concrete(argument):
         # copied: a solver may use its arrays again
         return jax.device_put(jax.tree.map(np.array, function(jax.device_get(argument))))
+    argument = jax.tree.map(_held, argument)
     core = [leaf.ndim for leaf in jax.tree.leaves(argument)]
     kinds = [leaf.dtype for leaf in jax.tree.leaves(argument)]
     structure = jax.tree.structure(argument)
@@ -73,6 +77,20 @@ def on_host(function: Any, shapes: Any, argument: Any) -> Any:
     )
     flat = [_joined(half, kind) for half, kind in zip(halves, returned, strict=True)]
     return jax.tree.unflatten(described, flat)
+
+
+@jax.custom_jvp
+def _held(leaf: Any) -> Any:
+    """The same; as integers, in which numbers cross, it would have a derivative of zero."""
+    return leaf
+
+
+@_held.defjvp
+def _refused(primals: Any, tangents: Any) -> Any:
+    raise TypeError(
+        "certified bounds have first derivatives in reverse mode only, and this is a second one: "
+        "hold what is differentiated once more by jax.lax.stop_gradient"
+    )
 
 
 def _halved(leaf: Array | np.ndarray) -> Array | np.ndarray:

@@ -140,8 +140,19 @@ class AffineForms:
         reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(constant(middle))
         return met(by_forms, (middle - reach, middle + reach))
 
+    def widened(self, width: int) -> AffineForms:
+        """The same over at least so many columns, the new ones empty (numpy)."""
+        more = width - self.rows.shape[1] + 2
+        if more <= 0:
+            return self
+        return AffineForms(np.pad(self.rows, ((0, 0), (0, more))), self.radii)
+
     def with_own(self, by: Float[Array, " k"], place: Place) -> tuple[AffineForms, Any]:
-        """Each number with so much of a column of its own, and where that is, -1 where none is."""
+        """Each number with so much of a column of its own, and where that is, -1 where none is.
+
+        Without a place they come after the columns of these forms, which have to be over all the
+        columns there are: see `widened`.
+        """
         k, n = self.rows.shape
         if place is not None:
             rows = jax.lax.dynamic_update_slice(self.rows, jnp.diag(by), (0, 2 + place))
@@ -203,17 +214,22 @@ def step_forms(
         Forms of the successor, and those of each layer of units.
     """
     found: list[UnitForms] = []
-    done = 0
+    done, width = 0, state.columns.shape[1]
 
-    def unit(unit: AbstractUnit, y: AffineForms) -> AffineForms:
-        nonlocal done
+    def apply(unit: AbstractUnit, y: AffineForms) -> AffineForms:
+        nonlocal done, width
         here, done = slice(done, done + len(y.rows)), done + len(y.rows)
         slope = None if slopes is None else slopes[here]
+        if place is None:  # branches that began alike must not share the columns they add
+            y = y.widened(width)
         z, forms = _unit(unit, y, start, None if place is None else place + here.start, slope)
+        width = z.columns.shape[1]
         found.append(forms)
         return z
 
-    successor = loop.step(state, t, unit)
+    successor = loop.step(state, t, apply)
+    if place is None:
+        successor = successor.widened(width)
     successor = _spilled(successor, None if place is None else place + done)
     ends = successor.ends(start)
     if known is not None:

@@ -124,8 +124,7 @@ def lagrangian_slopes(
     for each, X, weight in zip(multipliers, moments, weights, strict=True):
         if weight != 0:
             facts += weight / 2 * _products_slope(program, each, X)
-    asked = weights[:, None] != 0  # what has no bound has no part in the derivative of others
-    return Slopes(facts, np.where(asked, weights[:, None] * moments[:, :, -1], 0.0))
+    return Slopes(facts, weights[:, None] * moments[:, :, -1])
 
 
 def schur_slopes(

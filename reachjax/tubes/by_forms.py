@@ -55,7 +55,7 @@ def sets_by_forms(
             directions=shaped.directions,
             slopes=step.slopes,
             corners=step.corners,
-            codes=np.full(facets, SolverStatus.SOLVED),
+            codes=jnp.where(jnp.isfinite(step.offsets), SolverStatus.SOLVED, SolverStatus.FAILED),
             bounds=step.offsets,
             witnesses=np.full(facets, np.nan),
             witness_states=np.full((facets, 0), np.nan),

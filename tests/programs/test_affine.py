@@ -8,11 +8,12 @@ import pytest
 
 import reachjax as rj
 from reachjax.loops.units import AbstractUnit
+from reachjax.numerics.pytrees import pytree
 from reachjax.programs.affine import AffineForms, step_forms
 from reachjax.programs.initial import InitialColumns
 from reachjax.programs.unrolled import unrolled, unrolled_at_once
 from tests.activations import ACTIVATIONS, CONTROLLERS, LEAK, NAMES, UNITS, controlled
-from tests.closed_loops import closed_loop, initial_set, random_loop
+from tests.closed_loops import closed_loop, initial_set, random_loop, recursion
 from tests.networks import box_region, directions
 
 STEPS = 4
@@ -212,13 +213,51 @@ def test_a_polytope_is_more_than_its_box(kind):
 
 def test_what_is_known_of_states_is_used():
     case, box, D = controlled(rj.ReLU(), seed=1), box_of(2), directions(2)
-    boxes = [
-        rj.Box(x.min(axis=0), x.max(axis=0))
-        for x in np.asarray(case.loop.simulate(box.sample(jax.random.key(0), 3000), STEPS))[
-            :, 1:
-        ].swapaxes(0, 1)
-    ]
+    tube = recursion(case.loop, box, STEPS, rj.Template.box(2), relaxation=rj.LocalBounds())
+    boxes = [region.bounding_box() for region in tube.sets[1:]]
     better = offsets(case.loop, box, D, known=boxes)
     assert (better <= offsets(case.loop, box, D) + 1e-12).all()
     for t, held in enumerate(boxes):
         assert (better[t] <= held.support(D) + 1e-12).all()
+
+
+@pytree
+class Sum(rj.AbstractNetwork):
+    """Two networks side by side, of one input, whose outputs are added."""
+
+    one: rj.MLP
+    two: rj.MLP
+
+    @property
+    def inputs(self):
+        return self.one.inputs
+
+    @property
+    def outputs(self):
+        return self.one.outputs
+
+    @property
+    def unit_layers(self):
+        return (*self.one.unit_layers, *self.two.unit_layers)
+
+    def propagate(self, x, unit):
+        return self.one.propagate(x, unit) + self.two.propagate(x, unit)
+
+
+def test_branches_that_began_alike_have_columns_of_their_own():
+    """`|x_1| - |x_2|` over a box around zero: shared columns would cancel to nothing."""
+    branches = [
+        rj.MLP.from_layers([([row], [0.0]), ([[sign]], [0.0])])
+        for row, sign in (([2.0, 0.0], 0.5), ([0.0, 2.0], -0.5))
+    ]
+    net = rj.Residual(Sum(*branches), [[-0.5, 0.5]])
+    loop = rj.ClosedLoop(rj.AffinePlant(np.zeros((2, 2)), [[1.0], [0.0]]), net)
+    box = rj.Box([-1.0, -1.0], [1.0, 1.0])
+    tube = rj.reach(loop, box, 2, rj.Template.box(2), rj.LinearBounds())
+    assert (tube.proof(1).gaps >= 0).all()
+    assert tube.sets[1].b[0] >= 0.5
+    assert tube.proof(1).recheck()[0] >= 0.5
+    start = InitialColumns.of(*jax.device_get((box, box)))
+    _, layers = step_forms(jax.device_get(loop), AffineForms.beginning(start), 0, start)
+    places = np.concatenate([layer.places for layer in layers])
+    assert len(np.unique(places)) == len(places) == 2

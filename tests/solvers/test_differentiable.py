@@ -185,6 +185,23 @@ def test_forward_mode_and_second_derivatives_raise():
         jax.hessian(of)(loop.plant.c)
 
 
+@pytest.mark.parametrize("wrapped", [jax.jit, lambda f: f], ids=["compiled", "eager"])
+@pytest.mark.parametrize(
+    "template", [TEMPLATE, rj.EllipsoidTemplate(), rj.EllipsoidTemplate(np.eye(2))], ids=str
+)
+def test_second_derivatives_in_reverse_mode_raise(template, wrapped):
+    """Numbers cross to the host as integers, whose derivative would be zero."""
+    loop, X0 = planar(0)
+
+    def once(scale):
+        scaled = loop.replace(plant=loop.plant.replace(c=scale * loop.plant.c))
+        tube = recursion(scaled, X0, 1, template, relaxation=rj.LocalBounds())
+        return tube.sets[1].support(jnp.eye(2)).sum() ** 2
+
+    with pytest.raises(TypeError, match="first derivatives"):
+        wrapped(jax.grad(jax.grad(once)))(1.0)
+
+
 @pytest.mark.parametrize("n", [1, 3])
 def test_the_gradient_is_the_central_difference_in_other_dimensions(n):
     region = box_region(n, seed=n)

@@ -231,3 +231,16 @@ def test_a_verdict_is_not_a_truth_value(tube):
 def test_certificates_are_for_the_steps_after_the_first_set(tube, t):
     with pytest.raises(ValueError, match=rf"t = 1 .. 2, but {t} was asked for"):
         tube.proof(t)
+
+
+def test_a_verdict_is_decided_on_known_numbers(tube):
+    with pytest.raises(ValueError, match=r"tube holds traced numbers.*outside of jax\.jit"):
+        jax.jit(lambda tube: rj.verify(tube, goal=rj.Box([-9.0] * 2, [9.0] * 2)).margins)(tube)
+
+
+@pytest.mark.parametrize(
+    ("name", "draw"), [("tube", rj.plot_tube), ("region", rj.plot_set)], ids=["tube", "set"]
+)
+def test_what_cannot_be_drawn_is_named(name, draw):
+    with pytest.raises(TypeError, match=f"{name} must be a .*, but .* arrived"):
+        draw([1, 2])

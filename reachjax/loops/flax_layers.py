@@ -238,7 +238,11 @@ def _require_same_module(module: Any, pairs: list[tuple[Any, Any]], activation: 
         fresh = jax.tree.unflatten(structure, drawn)
         read = _linen_layers(fresh["params"])
         if [W.shape for W, _ in read] != [W.shape for W, _ in pairs]:
-            raise ValueError("source holds other layers than module has when it is initialised")
+            raise ValueError(
+                f"module of {pairs[0][0].shape[1]} inputs has other layers than source holds. "
+                "linen numbers layers as they are constructed: in Dense(1)(relu(Dense(3)(x))) the "
+                f"last one is the first. Then {ADVICE}"
+            )
         _require_same_outputs(lambda points: module.apply(fresh, points), read, activation)
 
 

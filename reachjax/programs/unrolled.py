@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.programs.affine import AffineForms, UnitForms, step_forms
+from reachjax.programs.affine import AffineForms
+from reachjax.programs.affine_steps import UnitForms, step_forms
 from reachjax.programs.initial import InitialColumns, constant
 from reachjax.sets import AbstractSet, Box
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from reachjax.numerics.checks import require_kind
 from reachjax.sets import AbstractSet
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
@@ -36,6 +37,7 @@ def plot_set(
         style: keyword arguments of `matplotlib.patches.Polygon`.
 
     Raises:
+        TypeError: the region is no set.
         ValueError: the set has one dimension, or is unbounded, or the coordinates are not two of
             its own.
 
@@ -45,6 +47,7 @@ def plot_set(
         >>> ax.dataLim.extents.tolist()
         [2.0, 0.0, 5.0, 1.0]
     """
+    require_kind("region", region, AbstractSet, "a set such as tube.sets[1]")
     if coordinates is None and region.dimension > 2:
         raise ValueError(
             f"a set of dimension {region.dimension} arrived: choose the two coordinates to draw, "
@@ -89,9 +92,13 @@ def plot_tube(
             one.
 
     Raises:
+        TypeError: the tube is none.
         ValueError: the loop has one state, or the coordinates are not two of its states.
     """
-    first, *others = tube.tubes if isinstance(tube, PartitionedTube) else (tube,)
+    cells = tube.tubes if isinstance(tube, PartitionedTube) else (tube,)
+    for cell in cells:
+        require_kind("tube", cell, ReachTube, "a ReachTube, as reach(...) returns it")
+    first, *others = cells
     i, j = _two_of(first.loop.states, coordinates)
     ax = _axes(ax)
     _plot_cell(first, ax, samples, i, j, ("simulated", "initial set", "certified"))

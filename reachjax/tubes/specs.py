@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import contextlib
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from reachjax.numerics.checks import whole_number
+from reachjax.numerics.checks import is_concrete, whole_number
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
 from reachjax.proofs.proposal import SolverStatus
@@ -50,8 +51,8 @@ def verify(
 
     Raises:
         TypeError: a set is of a kind without facets.
-        ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or a
-            part of the tube was exchanged for another one.
+        ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, a part
+            of the tube was exchanged for another one, or the tube is traced inside `jax.jit`.
 
     Source: equations (reach_avoid) and (reach_avoid_approx) of the paper.
 
@@ -78,6 +79,11 @@ def _decided(
     tube: ReachTube, required: list[Requirement], samples: int, seed: int, X0: AbstractSet
 ) -> Verdict:
     """What a tube proves, or a trajectory from `X0` refutes."""
+    if not is_concrete(jax.lax.stop_gradient(tube)):
+        raise ValueError(
+            "tube holds traced numbers, and a verdict is decided on known ones: call verify "
+            "outside of jax.jit, or rj.shortfall inside"
+        )
     proofs = [tube.proof(t) for t in range(1, tube.horizon + 1)]
     unsolved = sum(s is not SolverStatus.SOLVED for proof in proofs for s in proof.statuses)
     trajectories = _trajectories(tube, samples, seed)

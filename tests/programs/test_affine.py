@@ -9,7 +9,8 @@ import pytest
 import reachjax as rj
 from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.pytrees import pytree
-from reachjax.programs.affine import AffineForms, step_forms
+from reachjax.programs.affine import AffineForms
+from reachjax.programs.affine_steps import step_forms
 from reachjax.programs.initial import InitialColumns
 from reachjax.programs.unrolled import unrolled, unrolled_at_once
 from tests.activations import ACTIVATIONS, CONTROLLERS, LEAK, NAMES, UNITS, controlled

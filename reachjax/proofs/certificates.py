@@ -19,6 +19,7 @@ from reachjax.programs.lmi import Program
 from reachjax.proofs.proposal import SolverStatus
 
 
+@pytree
 class AbstractProof(Replaceable, abc.ABC):
     """What every proof of one step's set says, whatever it rests on.
 
@@ -60,21 +61,11 @@ class AbstractCertificate(AbstractProof):
         multipliers: `(f, K)`, one row for each semidefinite program.
         moments: `(f, n, n)`, dual matrices over the unscaled basis with corner 1; NaN where the
             solver gave none.
-        codes: `(f,)`, how the solver ended, as values of `SolverStatus`.
-        bounds: `(f,)`, what was proved.
-        witnesses: `(f,)`, the largest simulated values of what is bounded.
-        witness_states: `(f, n_x)`, the initial states that attain them.
-        seconds: `(f,)`, solver time.
     """
 
     program: Program
     multipliers: Float[Array | np.ndarray, "f K"]
     moments: Float[Array | np.ndarray, "f n n"]
-    codes: Int[Array | np.ndarray, " f"]
-    bounds: Float[Array | np.ndarray, " f"]
-    witnesses: Float[Array | np.ndarray, " f"]
-    witness_states: Float[Array | np.ndarray, "f n_x"]
-    seconds: Float[Array | np.ndarray, " f"]
 
     @property
     def products_in_use(self) -> Int[np.ndarray, "p 2"]:

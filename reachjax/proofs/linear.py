@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import floats_of, require_double_precision
@@ -26,11 +26,6 @@ class LinearCertificate(AbstractProof):
         directions: `(f, n_x)`, of the facets.
         slopes: `(k, units)`, of the units at each time before.
         corners: `(f, n_x)`, initial states at which the forms are largest.
-        codes: `(f,)`, whether there is a bound, as values of `SolverStatus`.
-        bounds: `(f,)`, what was proved.
-        witnesses: `(f,)`, the largest simulated values of what is bounded.
-        witness_states: `(f, n_x)`, the initial states that attain them.
-        seconds: `(f,)`, the time that forms took, shared among the facets.
         k: how many steps after the initial set.
         start: the time of the initial set.
     """
@@ -40,11 +35,6 @@ class LinearCertificate(AbstractProof):
     directions: Float[Array | np.ndarray, "f n_x"]
     slopes: Float[Array | np.ndarray, "k units"]
     corners: Float[Array | np.ndarray, "f n_x"]
-    codes: Int[Array | np.ndarray, " f"]
-    bounds: Float[Array | np.ndarray, " f"]
-    witnesses: Float[Array | np.ndarray, " f"]
-    witness_states: Float[Array | np.ndarray, "f n_x"]
-    seconds: Float[Array | np.ndarray, " f"]
     k: int = static()
     start: int = static()
 

@@ -63,7 +63,7 @@ class MixedCertificate(AbstractCertificate):
             for name in STACKED
         }
         return cls(
-            program,
+            program=program,
             **stacked,
             solver_offsets=facets.solver_offsets,
             form=ellipsoid.form,

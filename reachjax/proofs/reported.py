@@ -12,7 +12,7 @@ from reachjax.programs.lmi import Program, form_rows
 from reachjax.programs.presolve import LEAST_WIDTH, NormalProgram, presolved
 from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution
 from reachjax.proofs.recheck import clipped, interval_offsets, sound_level, sound_offsets
-from reachjax.proofs.slopes import held_offsets
+from reachjax.proofs.slopes import Held, held_offsets
 from reachjax.sets import NormalForm
 
 SHORTFALL = 1e-3
@@ -37,18 +37,6 @@ class Judged(NamedTuple):
     optimal: Bool[Array | np.ndarray, "*f"]
     held: Any
     proposal: Any
-
-
-class Held(NamedTuple):
-    """What the derivative of offsets rests on: that of the Lagrangian, these being held.
-
-    Attributes:
-        multipliers: `(f, K)`.
-        moments: `(f, n, n)`.
-    """
-
-    multipliers: Float[Array | np.ndarray, "f K"]
-    moments: Float[Array | np.ndarray, "f n n"]
 
 
 def judged_offsets(program: Program, solution: Solution) -> Judged:

@@ -14,8 +14,10 @@ them does: where a solver has them they are used instead (`reported`). A bound b
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import Program, form_rows
@@ -30,8 +32,17 @@ from reachjax.proofs.recheck import (
 )
 from reachjax.sets import NormalForm
 
-Held = tuple[np.ndarray, np.ndarray]
-"""Multipliers and moments of the Lagrangian whose derivative is that of a bound."""
+
+class Held(NamedTuple):
+    """What the derivative of bounds rests on: that of the Lagrangian, these being held.
+
+    Attributes:
+        multipliers: `(f, K)` of offsets; `(K,)` of a level.
+        moments: `(f, n, n)` of offsets; `(n + q, n + q)` of a level.
+    """
+
+    multipliers: Float[Array | np.ndarray, "*f K"]
+    moments: Float[Array | np.ndarray, "*f n n"]
 
 
 def held_offsets(
@@ -54,7 +65,7 @@ def held_offsets(
         else:
             corner = np.append(np.sign(mid[:-1]), 1.0)
             moments[i] = np.outer(corner, corner)
-    return np.where(by_multipliers[:, None], clipped(program, multipliers), 0.0), moments
+    return Held(np.where(by_multipliers[:, None], clipped(program, multipliers), 0.0), moments)
 
 
 def held_level(program: Program, multipliers: Float[np.ndarray, " K"], form: NormalForm) -> Held:
@@ -68,7 +79,7 @@ def held_level(program: Program, multipliers: Float[np.ndarray, " K"], form: Nor
     moments, held = np.zeros((n + q, n + q)), np.zeros(len(multipliers))
     level = sound_level(program, multipliers, form)
     if not 0 < level < np.inf:
-        return held, moments
+        return Held(held, moments)
     if level**2 / 2 < half_square_by_intervals(V):
         X = _moments(program, multipliers, squared(V))
         held, rows = clipped(program, multipliers) / level, V.mid @ X / level
@@ -77,7 +88,7 @@ def held_level(program: Program, multipliers: Float[np.ndarray, " K"], form: Nor
         signs = np.sign(V.mid)
         rows = signs * abs(V.mid).sum(axis=1, keepdims=True) / level
     moments[n:, :n] = rows / 2
-    return held, moments
+    return Held(held, moments)
 
 
 def _moments(program: Program, multipliers: np.ndarray, goal: Ball) -> Float[np.ndarray, "n n"]:

@@ -16,7 +16,8 @@ from reachjax.programs.relaxations import CuttingPlanes, Products
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import Solution, SolverStatus
 from reachjax.proofs.recheck import interval_offsets, sound_offsets
-from reachjax.proofs.reported import Held, Judged, judged_offsets
+from reachjax.proofs.reported import Judged, judged_offsets
+from reachjax.proofs.slopes import Held
 from reachjax.sets import Polytope
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.cut_pool import CutPool, joint

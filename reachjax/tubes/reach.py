@@ -226,18 +226,18 @@ def reach(
     simulations = None
     if is_concrete(fixed):
         simulations = _simulations(*fixed, horizon, start, samples, seed)
-    setting = Setting(
-        loop=loop,
-        start=start,
-        relaxation=relaxation,
-        solver=solver,
-        limit=LARGEST_WINDOW if window is None else None,
-        drop_columns=window != 1 and is_concrete(fixed, jax.lax.stop_gradient(template)),
-        simulations=simulations,
-    )
     if relaxation.by_forms:
         following = sets_by_forms(loop, X0, box, template, horizon, start)
     else:
+        setting = Setting(
+            loop=loop,
+            start=start,
+            relaxation=relaxation,
+            solver=solver,
+            limit=LARGEST_WINDOW if window is None else None,
+            drop_columns=window != 1 and is_concrete(fixed, jax.lax.stop_gradient(template)),
+            simulations=simulations,
+        )
         following = sets_by_programs(setting, X0, template, horizon, window)
     steps = [step for _, step in zip(wrapped(progress, range(horizon)), following, strict=False)]
     if len(steps) < horizon:
@@ -274,11 +274,12 @@ def _simulations(
 
 def _with_witnesses(steps: list[Reached], simulations: Simulations) -> list[AbstractProof]:
     """Simulate what the certificates bound, from the initial set."""
+    simulated = [step.states for step in steps if not step.climb]
+    if simulated:
+        simulations.include(np.concatenate(simulated))
     for k, step in enumerate(steps, start=1):
-        if len(step.states) and step.climb:
+        if step.climb and len(step.states):
             simulations.climb(k, step.region, np.arange(len(step.states)), step.states)
-        elif len(step.states):
-            simulations.include(step.states)
     found = [simulations.attained(k, step.region) for k, step in enumerate(steps, start=1)]
     return [
         step.proof.replace(witnesses=values, witness_states=states)

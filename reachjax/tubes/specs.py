@@ -79,7 +79,7 @@ def _decided(
     tube: ReachTube, required: list[Requirement], samples: int, seed: int, X0: AbstractSet
 ) -> Verdict:
     """What a tube proves, or a trajectory from `X0` refutes."""
-    if not is_concrete(jax.lax.stop_gradient(tube)):
+    if not (is_concrete(tube) or is_concrete(jax.lax.stop_gradient(tube))):
         raise ValueError(
             "tube holds traced numbers, and a verdict is decided on known ones: call verify "
             "outside of jax.jit, or rj.shortfall inside"

@@ -10,6 +10,7 @@ import pytest
 import reachjax as rj
 from reachjax.programs.basis import columns, loop_rows
 from reachjax.programs.bounds import loop_bounds
+from tests.closed_loops import closed_loop
 from tests.networks import LoopData, dead_network, he_network, input_box, plant
 
 STATES = [1, 2, 3, 6]
@@ -26,13 +27,6 @@ def loop_data(n_x, boxed, hidden=(6, 4)):
         layers[0][1][-1] += 20.0  # and one is always on
         layers[1][1][:] -= 20.0 * layers[1][0][:, -1]
     return LoopData(layers, *plant(n_x, n_u, n_x, steps=STEPS), *box)
-
-
-def closed_loop(data):
-    box = None if data.u_lower is None else rj.Box(data.u_lower, data.u_upper)
-    return rj.ClosedLoop(
-        rj.AffinePlant(data.A, data.B, data.c), rj.MLP.from_layers(data.layers), box
-    )
 
 
 def state_box(n_x):

@@ -9,6 +9,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.programs.bounds import loop_bounds
+from tests.closed_loops import closed_loop
 from tests.networks import (
     LoopData,
     affine_network,
@@ -29,13 +30,6 @@ def loop_data(n_x, boxed, network=he_network, hidden=(6, 4)):
     box = input_box(n_u, n_x, STEPS) if boxed else (None, None)
     return LoopData(
         network((n_x, *hidden, n_u), 30 + n_x), *plant(n_x, n_u, n_x, steps=STEPS), *box
-    )
-
-
-def closed_loop(data):
-    box = None if data.u_lower is None else rj.Box(data.u_lower, data.u_upper)
-    return rj.ClosedLoop(
-        rj.AffinePlant(data.A, data.B, data.c), rj.MLP.from_layers(data.layers), box
     )
 
 

@@ -26,11 +26,13 @@ from reachjax.programs.basis import ChangeOfBasis, change_of_basis
 from reachjax.programs.relaxations import (
     AbstractRelaxation,
     AllProducts,
+    BranchAndCut,
     CuttingPlanes,
     LinearBounds,
     LocalBounds,
     PaperQC,
 )
+from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.proofs.ellipsoids import EllipsoidCertificate
 from reachjax.proofs.facets import Certificate
@@ -91,6 +93,8 @@ __all__ = [
     "AllProducts",
     "Auto",
     "Box",
+    "BranchAndCut",
+    "BranchCertificate",
     "Certificate",
     "ChangeOfBasis",
     "Clarabel",
@@ -118,6 +122,7 @@ __all__ = [
     "ReLU",
     "ReachTube",
     "Residual",
+    "Rung",
     "SolverStatus",
     "Template",
     "Verdict",

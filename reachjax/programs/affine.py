@@ -105,6 +105,16 @@ class AffineForms:
     def __neg__(self) -> AffineForms:
         return AffineForms(-self.rows, self.radii)
 
+    def __mul__(self, factor) -> AffineForms:
+        """Each number times an exact one, or all times one."""
+        xp = namespace(self.rows)
+        factor = xp.broadcast_to(xp.asarray(factor, float), (len(self.rows),))
+        error = gamma(1) * abs(constant(self.rows)).sum(axis=1)
+        radii = abs(factor)[:, None] * (self.radii + error[:, None])
+        return AffineForms(factor[:, None] * self.rows, radii * (1 + gamma(self.rows.shape[1] + 4)))
+
+    __rmul__ = __mul__
+
     def __sub__(self, other) -> AffineForms:
         return self + (-other)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +32,7 @@ class UnitForms(NamedTuple):
         offset: `(k,)`.
         gap: `(k,)`, zero where the unit is affine there.
         places: `(k,)`, the column that each got; -1 where it needs none.
+        outputs: forms of the values.
     """
 
     unit: AbstractUnit
@@ -41,6 +43,11 @@ class UnitForms(NamedTuple):
     offset: Float[Array | np.ndarray, " k"]
     gap: Float[Array | np.ndarray, " k"]
     places: Int[Array | np.ndarray, " k"]
+    outputs: AffineForms
+
+
+Ranges = Callable[[AbstractUnit, AffineForms, Ends, Sequence[UnitForms]], Ends]
+"""Bounds of a layer's inputs that are no worse than these, given the layers before."""
 
 
 def step_forms(
@@ -51,6 +58,7 @@ def step_forms(
     place: Place = None,
     slopes: Float[Array | np.ndarray, " units"] | None = None,
     known: Box | None = None,
+    ranges: Ranges | None = None,
 ) -> tuple[AffineForms, tuple[UnitForms, ...]]:
     """One step of the loop, whose own forward pass is run over affine forms.
 
@@ -62,6 +70,7 @@ def step_forms(
         place: where the columns of this step begin, `units + n_x` of them; None to append.
         slopes: of the units; None for those of their lines. What is found holds for any.
         known: a box that surely holds the successor, where one is known.
+        ranges: what else bounds the inputs of a layer, if anything does.
 
     Returns:
         Forms of the successor, and those of each layer of units.
@@ -75,7 +84,10 @@ def step_forms(
         slope = None if slopes is None else slopes[here]
         if place is None:  # branches that began alike must not share the columns they add
             y = y.widened(width)
-        z, forms = _unit(unit, y, start, None if place is None else place + here.start, slope)
+        ends = _cut(unit, y, start)
+        if ranges is not None:
+            ends = ranges(unit, y, ends, found)
+        z, forms = _unit(unit, y, ends, None if place is None else place + here.start, slope)
         width = z.columns.shape[1]
         found.append(forms)
         return z
@@ -91,12 +103,10 @@ def step_forms(
 
 
 def _unit(
-    unit: AbstractUnit, y: AffineForms, start: InitialColumns, place: Place, slope: Any
+    unit: AbstractUnit, y: AffineForms, ends: Ends, place: Place, slope: Any
 ) -> tuple[AffineForms, UnitForms]:
-    """What a layer of units makes of its inputs."""
-    xp, (lower, upper) = namespace(y.rows), y.ends(start)
-    if start.cut is not None:
-        lower, upper = _cut(unit, y, start, lower, upper)
+    """What a layer of units makes of its inputs, whose bounds are known."""
+    xp, (lower, upper) = namespace(y.rows), ends
     if slope is None:
         slope = unit.lines(lower, upper).above.slope
     rest, values = (
@@ -115,12 +125,15 @@ def _unit(
         xp.concatenate([constants, rows[:, 2:]], axis=1), xp.stack([radius, values.rad], axis=1)
     )
     z, places = z.with_own(gap, place)
-    return z, UnitForms(unit, y, lower, upper, slope, offset, gap, places)
+    return z, UnitForms(unit, y, lower, upper, slope, offset, gap, places, z)
 
 
-def _cut(unit: AbstractUnit, y: AffineForms, start: InitialColumns, lower: Any, upper: Any) -> Ends:
-    """Bounds of inputs by what cuts the initial set; where that takes programs, if they switch."""
-    if start.cut is not None and not start.cut.needs_programs:
+def _cut(unit: AbstractUnit, y: AffineForms, start: InitialColumns) -> Ends:
+    """Bounds of inputs, also by what cuts the initial set; if that takes programs, of switching."""
+    lower, upper = y.ends(start)
+    if start.cut is None:
+        return lower, upper
+    if not start.cut.needs_programs:
         return y.ends(start, cut=True)
     switching = np.flatnonzero(~unit.lines(lower, upper).affine)
     if len(switching):

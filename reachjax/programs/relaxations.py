@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.loops.units import Mark
-from reachjax.numerics.checks import real_number, whole_number
+from reachjax.numerics.checks import real_number, require_kind, whole_number
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.facts import FactLayout, Pair
 
@@ -57,11 +57,14 @@ class AbstractRelaxation(abc.ABC):
         linear_bounds: whether the pre-activation bounds are those of supports and linear
             relaxations, where they are better than those of intervals.
         by_forms: whether there are no programs at all, and sets are bounded by affine forms.
+        nodes: how many linear programs a facet may take before it gets products; None where there
+            are products only.
     """
 
     remove_stable: bool
     linear_bounds: ClassVar[bool] = False
     by_forms: ClassVar[bool] = False
+    nodes: int | None = None
 
     @property
     def cuts(self) -> CuttingPlanes | None:
@@ -203,7 +206,7 @@ class CuttingPlanes(AbstractRelaxation):
         rounds: how often products are added, at most.
         batch: how many at a time.
         gap: rounds stop where a simulated trajectory attains the bound up to this part of the
-            interval of the facet.
+            interval of the facet; None for that of `reach`.
         remove_stable: whether neurons that bounds prove to be affine leave the basis.
 
     Raises:
@@ -213,7 +216,7 @@ class CuttingPlanes(AbstractRelaxation):
 
     rounds: int = 8
     batch: int = 60
-    gap: float = 1e-4
+    gap: float | None = None
     remove_stable: bool = True
 
     linear_bounds: ClassVar[bool] = True
@@ -221,7 +224,8 @@ class CuttingPlanes(AbstractRelaxation):
     def __post_init__(self):
         whole_number("CuttingPlanes.rounds", self.rounds, 0)
         whole_number("CuttingPlanes.batch", self.batch, 1)
-        real_number("CuttingPlanes.gap", self.gap, 0.0)
+        if self.gap is not None:
+            real_number("CuttingPlanes.gap", self.gap, 0.0)
 
     @property
     def cuts(self) -> CuttingPlanes:
@@ -231,6 +235,51 @@ class CuttingPlanes(AbstractRelaxation):
     def groups(self, facts: FactLayout) -> Groups:
         """The products to begin with."""
         return LocalBounds(repeated=False).groups(facts)
+
+
+@dataclasses.dataclass(frozen=True)
+class BranchAndCut(AbstractRelaxation):
+    """The cheapest proof first: each facet climbs a ladder only while its gap is open.
+
+    Its affine form over the whole horizon, the linear program with all facts of the horizon, splits
+    of that by the phases of units, each a linear program, and last products of facts, by
+    semidefinite programs as in `CuttingPlanes`. The first three go back to the initial set and know
+    how all states depend on it. Where numbers are traced (inside `jax.jit`), where a window is
+    given, and for ellipsoids, it is `CuttingPlanes`.
+
+    Args:
+        nodes: how many linear programs a facet may take before it gets products.
+        products_by: the rounds in which these are added.
+        remove_stable: whether neurons that bounds prove to be affine leave the basis.
+
+    Raises:
+        TypeError: `nodes` is no whole number, or `products_by` is no `CuttingPlanes`.
+        ValueError: `nodes` is negative.
+
+    Source: branch and cut for unrolled networks as in Bunel, Turkaslan, Torr, Kohli, Kumar (NeurIPS
+    2018), with the products of Burer (2009) for cuts.
+    """
+
+    nodes: int = 200
+    products_by: CuttingPlanes = CuttingPlanes()
+    remove_stable: bool = True
+
+    linear_bounds: ClassVar[bool] = True
+
+    def __post_init__(self):
+        whole_number("BranchAndCut.nodes", self.nodes, 0)
+        require_kind(
+            "BranchAndCut.products_by", self.products_by, CuttingPlanes, "of type CuttingPlanes"
+        )
+
+    @property
+    def cuts(self) -> CuttingPlanes:
+        """By which rounds products are added."""
+        return self.products_by
+
+    def groups(self, facts: FactLayout) -> Groups:
+        """The products to begin with."""
+        return self.products_by.groups(facts)
 
 
 def _crossed(facts: FactLayout) -> list[list[Pair]]:

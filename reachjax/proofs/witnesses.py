@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.batches import trajectories
 from reachjax.proofs.ascent import ascended
 from reachjax.sets import AbstractSet
 
@@ -36,6 +37,11 @@ def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, 
     states = jnp.concatenate([X0.corners(), states])
     states, inside = jax.device_get(_brought_inside(X0, states))
     return states[inside] if inside.any() else states  # a flat set contains none exactly
+
+
+def _padded(points: Float[np.ndarray, "c n_x"]) -> Float[np.ndarray, "b n_x"]:
+    """The same points and some of them again, so that there are few numbers of them."""
+    return np.resize(points, (-(-len(points) // BLOCK) * BLOCK, points.shape[1]))
 
 
 @jax.jit
@@ -69,10 +75,24 @@ class Simulations:
         self, loop: ClosedLoop, X0: AbstractSet, horizon: int, start: int, samples: int, seed: int
     ):
         self._loop, self._X0, self._start, self._horizon = loop, X0, start, horizon
+        self._on_host = jax.device_get(loop)
         self._scale = X0.scale()
         states = initial_states(X0, samples, seed)
         self._states, self._middle = states, states.mean(axis=0)
-        self._trajectories = np.asarray(loop.simulate(states, horizon, start))
+        self._trajectories = self.simulated(states, horizon)
+
+    def simulated(
+        self, states: Float[np.ndarray, "c n_x"], steps: int
+    ) -> Float[np.ndarray, "c steps+1 n_x"]:
+        """Trajectories from these states."""
+        return trajectories(self._on_host, states, steps, self._start)
+
+    def values(
+        self, k: int, directions: Float[np.ndarray, "f n_x"]
+    ) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]:
+        """The least and the largest values of directions after `k` steps."""
+        found = self._trajectories[:, k] @ directions.T
+        return found.min(axis=0), found.max(axis=0)
 
     def climb(
         self,
@@ -97,18 +117,23 @@ class Simulations:
 
     def include(self, states: Float[np.ndarray, "m n_x"]) -> None:
         """Simulate these initial states too, those that are in the set or just outside."""
-        inside = np.asarray(self._X0.contains(states))[:, None]
+        if not len(states):
+            return
+        inside = self._inside(states)[:, None]
         states = np.where(inside, states, self._middle + PULL * (states - self._middle))
-        trajectories = np.asarray(self._loop.simulate(states, self._horizon, self._start))
-        kept = np.asarray(self._X0.contains(states)) & np.isfinite(trajectories).all(axis=(1, 2))
+        found = self.simulated(states, self._horizon)
+        kept = self._inside(states) & np.isfinite(found).all(axis=(1, 2))
         self._states = np.concatenate([self._states, states[kept]])
-        self._trajectories = np.concatenate([self._trajectories, trajectories[kept]])
+        self._trajectories = np.concatenate([self._trajectories, found[kept]])
+
+    def _inside(self, states: Float[np.ndarray, "m n_x"]) -> Bool[np.ndarray, " m"]:
+        """Which states are in the initial set."""
+        return np.asarray(self._X0.contains(_padded(states)))[: len(states)]
 
     def _values(self, k: int, region: AbstractSet) -> Float[np.ndarray, "c m"]:
         """What a set bounds, at each trajectory after `k` steps."""
         points = self._trajectories[:, k]
-        padded = np.resize(points, (-(-len(points) // BLOCK) * BLOCK, points.shape[1]))
-        return np.asarray(region.bounded_values(padded))[: len(points)]
+        return np.asarray(region.bounded_values(_padded(points)))[: len(points)]
 
     def attained(
         self, k: int, region: AbstractSet

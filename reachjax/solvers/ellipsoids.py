@@ -81,7 +81,7 @@ class _AbstractEllipsoid(AbstractGoal):
             moment = moments[:n, :n] / moments[n - 1, n - 1]
             return Shown(moment, idle(np.asarray(enclosure.multipliers), len(pairs)))
 
-        products = joint(pool.core, in_rounds(pool, rounds.cuts, NONE, solve))
+        products = joint(pool.core, in_rounds(pool, rounds, NONE, solve))
         return products, self.judged(program.replace(products=products), solver)
 
     def region(self, value: Sized) -> Ellipsoid:

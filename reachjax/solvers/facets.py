@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from reachjax.numerics.host import all_finite
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.lmi import Program, Slopes, lagrangian_slopes
-from reachjax.programs.relaxations import CuttingPlanes, Products
+from reachjax.programs.relaxations import Products
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import Solution, SolverStatus
 from reachjax.proofs.recheck import interval_offsets, sound_offsets
@@ -65,7 +65,7 @@ class Facets(AbstractGoal):
         for facet in range(len(program.objective.mid)):
             one = program.with_objective(slice(facet, facet + 1))
             attained = None if rounds.witness is None else partial(rounds.witness, facet)
-            found.append(_facet(one, pool, solver, rounds.cuts, attained, used))
+            found.append(_facet(one, pool, solver, rounds, attained, used))
             used = found[-1].in_use
         return _joined(program, pool, found)
 
@@ -124,7 +124,7 @@ def _facet(
     program: Program,
     pool: CutPool,
     solver: AbstractSolver,
-    cuts: CuttingPlanes,
+    rounds: Rounds,
     attained: Callable[[Float[np.ndarray, " n"]], float] | None,
     pairs: Int[np.ndarray, "p 2"],
 ) -> _Round:
@@ -141,9 +141,9 @@ def _facet(
             return Shown(moment, found[-1].idle)
         least = min(each.offset for each in found)
         gap = least - attained(transform @ moment[:, -1])
-        return Shown(moment, found[-1].idle, enough=gap <= cuts.gap * size)
+        return Shown(moment, found[-1].idle, enough=gap <= (rounds.cuts.gap or 0.0) * size)
 
-    in_rounds(pool, cuts, pairs, solve)
+    in_rounds(pool, rounds, pairs, solve)
     least = min(each.offset for each in found)
     near = [each for each in found if each.offset <= least + NEAR * size]
     best = max(near, key=lambda each: each.is_optimal)  # the first that is, if any is

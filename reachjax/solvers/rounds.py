@@ -9,6 +9,7 @@ nothing is violated, or they run out.
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -34,12 +35,14 @@ class Rounds(NamedTuple):
         cuts: how many rounds, and of how many products.
         witness: what simulations attain of a facet; rounds do not stop for them if it is None.
         warm_start: products that the first facet begins with, those that may be added.
+        deadline: when to stop, as `time.monotonic` says it.
     """
 
     layout: FactLayout
     cuts: CuttingPlanes
     witness: Witness | None = None
     warm_start: Int[np.ndarray, "p 2"] = NONE
+    deadline: float = np.inf
 
 
 class Shown(NamedTuple):
@@ -58,7 +61,7 @@ def idle(multipliers: Float[np.ndarray, " K"], added: int) -> Bool[np.ndarray, "
 
 def in_rounds(
     pool: CutPool,
-    cuts: CuttingPlanes,
+    rounds: Rounds,
     pairs: Int[np.ndarray, "p 2"],
     solve: Callable[[Int[np.ndarray, "q 2"]], Shown],
 ) -> Int[np.ndarray, "q 2"]:
@@ -70,13 +73,16 @@ def in_rounds(
 
     Args:
         pool: what may be added.
-        cuts: how many rounds, and of how many products.
+        rounds: how many, of how many products, and until when.
         pairs: what is added from the beginning.
         solve: what a round with these products shows.
     """
+    cuts = rounds.cuts
     resting = np.zeros(len(pairs), dtype=bool)
     for number in itertools.count():
         shown = solve(pairs)
+        if time.monotonic() >= rounds.deadline:
+            break
         if not np.isfinite(shown.moment).all():
             if number == 0 and len(missing := pool.missing(pairs)):
                 pairs = np.concatenate([pairs, missing])  # no moment to choose by: all that is due

@@ -6,6 +6,7 @@ recheck. A tube repeats it, each set being the next one's set of states (equatio
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 
 import jax
@@ -17,6 +18,7 @@ from reachjax.numerics.checks import (
     floats_of,
     is_concrete,
     owned,
+    real_number,
     require_bar,
     require_double_precision,
     require_kind,
@@ -25,11 +27,12 @@ from reachjax.numerics.checks import (
     wrapped,
 )
 from reachjax.numerics.pytrees import Replaceable, pytree, static
-from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
+from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.witnesses import Simulations, initial_states
-from reachjax.sets import AbstractSet, AbstractTemplate
+from reachjax.sets import AbstractSet, AbstractTemplate, Template
 from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.by_branching import sets_by_branching
 from reachjax.tubes.by_forms import sets_by_forms
 from reachjax.tubes.by_programs import sets_by_programs
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
@@ -40,6 +43,9 @@ Progress = Callable[[Iterable[int]], Iterable[int]]
 
 SAMPLES = 1000
 
+GAP = 1e-4
+"""What may stay open of a facet, as a part of its range."""
+
 LARGEST_WINDOW = 64
 """The most columns of a window whose length is chosen."""
 
@@ -47,7 +53,7 @@ EXAMPLES = {
     ClosedLoop: "a ClosedLoop",
     AbstractSet: "a set such as Box(lower, upper) or Polytope(A, b)",
     AbstractTemplate: "a template, such as Template.box(n) or EllipsoidTemplate()",
-    AbstractRelaxation: "a relaxation object, such as CuttingPlanes()",
+    AbstractRelaxation: "a relaxation object, such as BranchAndCut()",
     AbstractSolver: "a solver object, such as Auto()",
 }
 
@@ -121,7 +127,7 @@ def reach_step(
     template: AbstractTemplate,
     *,
     t: int = 0,
-    relaxation: AbstractRelaxation = CuttingPlanes(),  # noqa: B008  (immutable)
+    relaxation: AbstractRelaxation = BranchAndCut(),  # noqa: B008  (immutable)
     solver: AbstractSolver = Auto(),  # noqa: B008
     samples: int = SAMPLES,
     seed: int = 0,
@@ -163,7 +169,7 @@ def reach(
     X0: AbstractSet,
     horizon: int,
     template: AbstractTemplate,
-    relaxation: AbstractRelaxation = CuttingPlanes(),  # noqa: B008  (immutable)
+    relaxation: AbstractRelaxation = BranchAndCut(),  # noqa: B008  (immutable)
     window: int | None = None,
     solver: AbstractSolver = Auto(),  # noqa: B008
     *,
@@ -171,6 +177,8 @@ def reach(
     samples: int = SAMPLES,
     seed: int = 0,
     progress: Progress | None = None,
+    gap: float = GAP,
+    time_limit: float | None = None,
 ) -> ReachTube:
     """Sets that surely contain every state of the loop at times `1 .. horizon`.
 
@@ -192,6 +200,10 @@ def reach(
         seed: of the samples.
         progress: wraps the iteration over steps to show a progress bar, such as `tqdm.tqdm`; inside
             `jax.jit` it sees them once, while the loop is traced.
+        gap: a facet is proved well enough if a trajectory attains its bound but for this part of
+            half the facet's simulated range.
+        time_limit: seconds for the whole call, after which nothing is solved any more: what is
+            proved by then is returned. None: until gaps are closed or budgets are used up.
 
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
@@ -220,24 +232,29 @@ def reach(
         True
     """
     _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
+    deadline = _deadline(gap, time_limit)
     loop, X0, template = owned((loop, X0, template))
     box = boxed(X0, "X0")
     fixed = jax.lax.stop_gradient((loop, X0))
     simulations = None
     if is_concrete(fixed):
         simulations = _simulations(*fixed, horizon, start, samples, seed)
+    setting = Setting(
+        loop=loop,
+        start=start,
+        relaxation=relaxation,
+        solver=solver,
+        limit=LARGEST_WINDOW if window is None else None,
+        drop_columns=window != 1 and is_concrete(fixed, jax.lax.stop_gradient(template)),
+        simulations=simulations,
+        gap=gap,
+        deadline=deadline,
+    )
     if relaxation.by_forms:
         following = sets_by_forms(loop, X0, box, template, horizon, start)
+    elif relaxation.nodes is not None and window is None and isinstance(template, Template):
+        following = sets_by_branching(setting, X0, box, template, horizon)
     else:
-        setting = Setting(
-            loop=loop,
-            start=start,
-            relaxation=relaxation,
-            solver=solver,
-            limit=LARGEST_WINDOW if window is None else None,
-            drop_columns=window != 1 and is_concrete(fixed, jax.lax.stop_gradient(template)),
-            simulations=simulations,
-        )
         following = sets_by_programs(setting, X0, template, horizon, window)
     steps = [step for _, step in zip(wrapped(progress, range(horizon)), following, strict=False)]
     if len(steps) < horizon:
@@ -285,6 +302,19 @@ def _with_witnesses(steps: list[Reached], simulations: Simulations) -> list[Abst
         step.proof.replace(witnesses=values, witness_states=states)
         for step, (values, states) in zip(steps, found, strict=True)
     ]
+
+
+def _deadline(gap: float, time_limit: float | None) -> float:
+    """When to stop, as `time.monotonic` says it.
+
+    Raises:
+        TypeError: an argument is no number.
+        ValueError: an argument is negative.
+    """
+    real_number("gap", gap, 0.0)
+    if time_limit is None:
+        return np.inf
+    return time.monotonic() + real_number("time_limit", time_limit, 0.0)
 
 
 def _check(

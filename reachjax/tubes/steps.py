@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from functools import cached_property
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import Program
 from reachjax.programs.preactivations import first_inputs, first_rows
-from reachjax.programs.relaxations import AbstractRelaxation
+from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
 from reachjax.programs.windows import Window
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.proofs.witnesses import Simulations
@@ -64,6 +65,8 @@ class Setting:
         limit: how many columns a window of more than one step may have; None if any number.
         drop_columns: whether units that are affine take no columns of the basis.
         simulations: trajectories from the initial set; None where numbers are traced.
+        gap: what is left open, as a part of a facet's range.
+        deadline: when to stop, as `time.monotonic` says it.
     """
 
     loop: ClosedLoop
@@ -73,6 +76,21 @@ class Setting:
     limit: int | None
     drop_columns: bool
     simulations: Simulations | None
+    gap: float
+    deadline: float
+
+    @property
+    def late(self) -> bool:
+        """Whether the time is over."""
+        return time.monotonic() >= self.deadline
+
+    @property
+    def cuts(self) -> CuttingPlanes | None:
+        """By which rounds products are added; None if a program has all of them at once."""
+        cuts = self.relaxation.cuts
+        if cuts is None or cuts.gap is not None:
+            return cuts
+        return dataclasses.replace(cuts, gap=self.gap)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,12 +21,13 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.host import all_finite
 from reachjax.programs.lmi import Program
 from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.facets import Certificate
 from reachjax.proofs.mixed import MixedCertificate
 from reachjax.sets import (
     AbstractSet,
@@ -58,15 +59,27 @@ def successors(step: Step, template: AbstractTemplate) -> tuple[AbstractSet, Abs
     return _together(program, parts)
 
 
+def facets_by_products(
+    step: Step, directions: Float[Array, "f n_x"]
+) -> tuple[Float[Array, " f"], Certificate]:
+    """The smallest offsets of some facets of a step's successors, and their proof.
+
+    Raises:
+        ValueError: the set of states is empty or unbounded, or states overflow.
+    """
+    region, proof = _proved(step, Facets(directions), _finite(step, step.program(directions)))
+    return region.facets[1], proof
+
+
 def _proved(
     step: Step, goal: AbstractGoal, program: Program
 ) -> tuple[AbstractSet, AbstractCertificate]:
     """The set of one goal, and its proof."""
-    cuts, witness, rounds = step.setting.relaxation.cuts, None, None
+    cuts, witness, rounds = step.setting.cuts, None, None
     if cuts is not None:
         if step.setting.simulations is not None:
             witness = partial(step.attained, goal.rows(step.setting.loop.states))
-        rounds = Rounds(step.window.layout, cuts, witness, step.warm_start)
+        rounds = Rounds(step.window.layout, cuts, witness, step.warm_start, step.setting.deadline)
     program, value, proposal = proved(goal, program, step.setting.solver, rounds)
     region = goal.region(_finite(step, value))
     return region, goal.certificate(program, value, proposal)

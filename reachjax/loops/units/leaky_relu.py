@@ -9,13 +9,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark
 from reachjax.loops.units.relu import PRODUCTS, ZERO, ReLU, bent
 from reachjax.numerics.checks import real_number
-from reachjax.numerics.rounding import gamma, namespace
+from reachjax.numerics.rounding import gamma, larger, namespace
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +75,7 @@ class LeakyReLU(AbstractUnit):
         blocks = (
             Block(output, "output", Mark.SECTOR),
             Block(slack, "slack", Mark.SECTOR),
-            Block(rise * jnp.maximum(upper, 0.0) - output, "output cap", Mark.BOUND),
-            Block(rise * jnp.maximum(-lower, 0.0) - slack, "slack cap", Mark.BOUND),
+            Block(rise * larger(upper, 0.0) - output, "output cap", Mark.BOUND),
+            Block(rise * larger(-lower, 0.0) - slack, "slack cap", Mark.BOUND),
         )
         return Facts(blocks, ZERO, PRODUCTS)

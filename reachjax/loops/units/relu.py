@@ -13,6 +13,7 @@ from functools import reduce
 from typing import Any
 
 import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark, Product
@@ -52,7 +53,7 @@ class ReLU(AbstractUnit):
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`max(y, 0)`, with derivative 0 at 0."""
-        return jax.nn.relu(y)
+        return np.maximum(y, 0.0) if namespace(y) is np else jax.nn.relu(y)
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """A monotone function maps bounds to bounds."""
@@ -84,7 +85,7 @@ class ReLU(AbstractUnit):
         blocks = (
             Block(z, "output", Mark.SECTOR),
             Block(slack, "slack", Mark.SECTOR),
-            Block(jax.nn.relu(upper) - z, "output cap", Mark.BOUND),
-            Block(jax.nn.relu(-lower) - slack, "slack cap", Mark.BOUND),
+            Block(larger(upper, 0.0) - z, "output cap", Mark.BOUND),
+            Block(larger(-lower, 0.0) - slack, "slack cap", Mark.BOUND),
         )
         return Facts(blocks, ZERO, PRODUCTS)

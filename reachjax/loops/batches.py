@@ -1,0 +1,77 @@
+"""Many trajectories at once on the host, in numpy: nothing is compiled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.loops.closed_loop import ClosedLoop
+from reachjax.loops.units import AbstractUnit
+
+
+class Batch:
+    """The values of `k` numbers at `c` points, as `(c, k)`: a kind of number."""
+
+    # numpy arrays on the left leave `array @ batch` and `array - batch` to this class
+    __array_ufunc__ = None
+
+    def __init__(self, values: Float[np.ndarray, "c k"]):
+        self.values = values
+
+    def __rmatmul__(self, matrix: Any) -> Batch:
+        return Batch(self.values @ np.asarray(matrix).T)
+
+    def __add__(self, other: Any) -> Batch:
+        return Batch(self.values + getattr(other, "values", other))
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Batch:
+        return Batch(-self.values)
+
+    def __sub__(self, other: Any) -> Batch:
+        return self + (-other)
+
+    def __rsub__(self, other: Any) -> Batch:
+        return (-self) + other
+
+    def __mul__(self, factor: Any) -> Batch:
+        return Batch(self.values * factor)
+
+    __rmul__ = __mul__
+
+    def __getitem__(self, index: Any) -> Batch:
+        return Batch(self.values[:, index])
+
+
+def _evaluated(unit: AbstractUnit, y: Batch) -> Batch:
+    return Batch(unit(y.values))
+
+
+def trajectories(
+    loop: ClosedLoop, states: Float[np.ndarray, "c n_x"], horizon: int, start: int = 0
+) -> Float[np.ndarray, "c h+1 n_x"]:
+    """Trajectories from many initial states, these included.
+
+    Args:
+        loop: of numpy arrays.
+        states: where they begin.
+        horizon: the number of steps.
+        start: the time of the initial states.
+
+    Example:
+        >>> import jax
+        >>> from reachjax import MLP, AffinePlant
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = jax.device_get(ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net))
+        >>> trajectories(loop, np.array([[1.0], [-1.0]]), 1)[:, 1].tolist()
+        [[0.6], [-0.6]]
+    """
+    found, batch = [states], Batch(states)
+    with np.errstate(all="ignore"):  # what overflows is no trajectory
+        for t in range(start, start + horizon):
+            batch = loop.step(batch, t, _evaluated)
+            found.append(batch.values)
+    return np.stack(found, axis=1)

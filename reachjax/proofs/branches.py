@@ -1,0 +1,196 @@
+"""Proofs by branches: bounds of rows in each of some branches that leave nothing out.
+
+In every branch some facts are known to be zero, so that their multipliers may have either sign. A
+row is bounded in all of them by the largest of its bounds (`programs.horizon`), whatever found the
+multipliers.
+"""
+
+from __future__ import annotations
+
+import enum
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from reachjax.numerics.checks import floats_of, require_double_precision
+from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.programs.affine import AffineForms
+from reachjax.programs.horizon import upper_bounds
+from reachjax.programs.initial import InitialColumns
+from reachjax.proofs.certificates import AbstractProof
+from reachjax.proofs.facets import Certificate
+
+
+class Rung(enum.IntEnum):
+    """By what a bound is proved, the cheapest first."""
+
+    AFFINE_FORM = 0
+    LINEAR_PROGRAM = 1
+    PHASE_SPLITS = 2
+    PRODUCTS = 3
+
+
+@pytree
+class Branches(Replaceable):
+    """Leaves of trees, one tree for each bound of a step.
+
+    Attributes:
+        owner: `(l,)`, which bound a leaf belongs to.
+        phases: `(l, p)`, which fact of each pair whose product is zero the leaf takes to be zero:
+            0 for the first, 1 for the second, -1 where it takes neither.
+        multipliers: `(l, m)`, of the facts.
+        weights: `(l, f)`, of the rows, the least of which is bounded; for a facet 1 of its own.
+    """
+
+    owner: Int[Array | np.ndarray, " l"]
+    phases: Int[Array | np.ndarray, "l p"]
+    multipliers: Float[Array | np.ndarray, "l m"]
+    weights: Float[Array | np.ndarray, "l f"]
+
+
+@pytree
+class HorizonFacts(Replaceable):
+    """What branches are about: rows over the columns of a horizon, on the host.
+
+    Attributes:
+        start: what the first columns are.
+        facts: rows `(m, n)` that are never negative.
+        zero: `(p, 2)`, pairs of facts of which one is zero at each state.
+        rows: `(f, n)`, what is bounded.
+    """
+
+    start: InitialColumns
+    facts: AffineForms
+    zero: Int[Array | np.ndarray, "p 2"]
+    rows: AffineForms
+
+
+@pytree
+class BranchCertificate(AbstractProof):
+    """Proof of the offsets of one step, `directions x[t] <= bounds`, each by the cheapest way.
+
+    A facet is proved by its affine form, by multipliers of the facts of the whole horizon, by these
+    in each of some branches, or by products of facts: whatever is best. Ranges of units are those
+    that the forms were made with; where sets of earlier steps bounded these, the proof is one given
+    them.
+
+    Attributes:
+        about: rows over the columns of the horizon.
+        branches: the leaves by which each facet is proved.
+        products: the proof of some facets by semidefinite programs; None where there is none.
+        by_products: `(p,)`, numbers of the facets of `products`.
+        rungs: `(f,)`, values of `Rung`.
+        nodes: `(f,)`, how many linear programs were solved for each facet.
+    """
+
+    about: HorizonFacts
+    branches: Branches
+    products: Certificate | None
+    by_products: Int[Array | np.ndarray, " p"]
+    rungs: Int[Array | np.ndarray, " f"]
+    nodes: Int[Array | np.ndarray, " f"]
+
+    def __repr__(self) -> str:
+        counts = np.bincount(np.asarray(self.rungs), minlength=len(Rung))
+        ways = ", ".join(f"{rung.name.lower()}={counts[rung]}" for rung in Rung if counts[rung])
+        columns = self.about.facts.columns.shape[1]
+        return f"BranchCertificate(facets={len(self.bounds)}, columns={columns}, {ways})"
+
+    @property
+    def ways(self) -> tuple[Rung, ...]:
+        """By what each facet is proved."""
+        return tuple(Rung(int(rung)) for rung in self.rungs)
+
+    def recheck(
+        self, multipliers: Float[np.ndarray, "l m"] | None = None
+    ) -> Float[np.ndarray, " f"]:
+        """Prove the offsets anew, with these or other multipliers of the facts.
+
+        Sound for any multipliers: where they prove nothing of use, affine forms bound the facet.
+
+        Raises:
+            ValueError: the multipliers contain NaN or infinity, or have another shape.
+
+        Example:
+            >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach
+            >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, -0.4]], [0.0])])
+            >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net)  # x+ = x - 0.4 |x|
+            >>> proof = reach(loop, Box([-1.0], [2.0]), 1, Template.box(1)).proof(1)
+            >>> proof.recheck().round(6).tolist()
+            [1.2, 1.4]
+            >>> garbage = -proof.branches.multipliers
+            >>> bool((proof.recheck(garbage) >= [1.2, 1.4]).all())
+            True
+        """
+        require_double_precision(certificate=floats_of(self))
+        about, branches = jax.device_get((self.about, self.branches))
+        if multipliers is not None:
+            given = np.asarray(multipliers, dtype=float)
+            if given.shape != branches.multipliers.shape or not np.isfinite(given).all():
+                raise ValueError(
+                    f"multipliers must be finite and have shape {branches.multipliers.shape} "
+                    f"(leaves, facts), but {given.shape} arrived, {np.isfinite(given).sum()} of "
+                    "them finite"
+                )
+            branches = branches.replace(multipliers=given)
+        found = bounds_of(about, branches, len(self.bounds))
+        found = np.fmin(found, about.rows.ends(about.start)[1])
+        if self.products is not None:
+            which = np.asarray(self.by_products)
+            found[which] = np.fmin(found[which], self.products.recheck())
+        return found
+
+
+def bounds_of(about: HorizonFacts, branches: Branches, count: int) -> Float[np.ndarray, " count"]:
+    """Upper bounds by the leaves of each tree; infinite where one of them is missing."""
+    phases, values = np.asarray(branches.phases), leaf_bounds(about, branches)
+    found = np.full(count, np.inf)
+    for number in range(count):
+        mine = np.asarray(branches.owner) == number
+        if covered(phases[mine]):
+            found[number] = values[mine].max()
+    return found
+
+
+def leaf_bounds(about: HorizonFacts, branches: Branches) -> Float[np.ndarray, " l"]:
+    """Upper bounds of the rows in each leaf; infinite where there is none.
+
+    Sound for any multipliers and weights: those of a sign that proves nothing are taken as zero.
+    """
+    given = np.asarray(branches.multipliers)
+    free = _free(about, np.asarray(branches.phases))
+    weights = np.fmax(np.asarray(branches.weights), 0.0)
+    total = weights.sum(axis=1, keepdims=True)
+    shares = np.where(total > 0, weights / np.where(total > 0, total, 1.0), np.nan)
+    multipliers = np.where(free, given, np.fmax(given, 0.0))
+    values = upper_bounds(shares @ about.rows, about.facts, multipliers, about.start)
+    return np.where(np.isnan(values), np.inf, values)
+
+
+def covered(phases: Int[np.ndarray, "l p"]) -> bool:
+    """Whether leaves leave nothing out, as those of a binary tree do.
+
+    Example:
+        >>> covered(np.array([[0, -1], [1, 0], [1, 1]])), covered(np.array([[0, -1], [1, 0]]))
+        (True, False)
+    """
+    held = phases >= 0
+    if not len(phases):
+        return False
+    if not held.any(axis=1).all():
+        return True
+    split = np.flatnonzero(held.all(axis=0))
+    if not len(split):
+        return False
+    sides = phases[:, split[0]]
+    rest = np.delete(phases, split[0], axis=1)
+    return covered(rest[sides == 0]) and covered(rest[sides == 1])
+
+
+def _free(about: HorizonFacts, phases: Int[np.ndarray, "l p"]) -> np.ndarray:
+    """Which multipliers `(l, m)` are of facts that their leaf takes to be zero."""
+    free = np.zeros((len(phases), len(about.facts.rows)), dtype=bool)
+    leaf, pair = np.nonzero(phases >= 0)
+    free[leaf, np.asarray(about.zero)[pair, phases[leaf, pair]]] = True
+    return free

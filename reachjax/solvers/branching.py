@@ -1,0 +1,177 @@
+"""Branch and bound on the phases of units, over linear programs of the whole horizon.
+
+Of the two facts of a unit whose product is zero, one is zero at each state. A branch holds one of
+them at zero, which frees the sign of its multiplier; the two branches together leave nothing out.
+The node of the largest bound is split first, at the pair of facts that its solution violates most,
+weighed by what the unit's column means to the bound. The bound is that of the largest leaf.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from reachjax.programs.affine import AffineForms
+from reachjax.programs.horizon import Horizon
+from reachjax.solvers.linear_programs import LinearPrograms, Vertex
+
+EXACT = 1e-9
+"""A unit whose value is off by no more than this part of its gap is not split."""
+
+SHARE = 0.1
+"""What a column's share of the objective counts, where its reduced cost counts 1."""
+
+
+class Node(NamedTuple):
+    """A branch and what its linear program says.
+
+    Attributes:
+        phases: pairs of facts, by their numbers, and which of the two is held at zero.
+        vertex: where its linear program ended.
+    """
+
+    phases: dict[int, int]
+    vertex: Vertex
+
+
+class Found(NamedTuple):
+    """The leaves of a tree, by which a bound is proved.
+
+    Attributes:
+        phases: `(l, p)`, which of each pair of facts is zero, 0 or 1; -1 where neither is held.
+        multipliers: `(l, m)`, of the facts.
+        weights: `(l, r)`, of the rows of which the least is bounded.
+        columns: `(l, n)`, where each attains its bound.
+        nodes: how many linear programs were solved.
+    """
+
+    phases: Int[np.ndarray, "l p"]
+    multipliers: Float[np.ndarray, "l m"]
+    weights: Float[np.ndarray, "l r"]
+    columns: Float[np.ndarray, "l n"]
+    nodes: int
+
+
+def affine_leaf(form: AffineForms, horizon: Horizon) -> Found:
+    """The leaf that takes nothing: a form is bounded by itself.
+
+    Args:
+        form: one.
+        horizon: whose facts it does without.
+    """
+    row, start = form.columns[0], horizon.start
+    columns = np.sign(row)
+    if start.round:
+        first = row[: start.spread.shape[1]]
+        length = np.linalg.norm(first)
+        columns[: len(first)] = first / length if length > 0 else 0.0
+    none = np.zeros((1, len(horizon.facts.rows)))
+    phases = np.full((1, len(horizon.zero)), -1, dtype=np.int8)
+    return Found(phases, none, np.ones((1, 1)), columns[None], nodes=0)
+
+
+def branched(
+    horizon: Horizon,
+    programs: LinearPrograms,
+    forms: AffineForms,
+    attained: Callable[[Float[np.ndarray, " n"]], float],
+    enough: Callable[[float, float], bool],
+    budget: int,
+) -> Found | None:
+    """Bound the largest value of a form, or of the least of several.
+
+    Args:
+        horizon: whose facts hold.
+        programs: over these.
+        forms: `r` of them.
+        attained: the largest value that is known to be attained, given one more solution's columns.
+        enough: whether to stop, given the bound and what is attained.
+        budget: how many linear programs may be solved.
+
+    Returns:
+        The leaves; None where the first program has no answer.
+    """
+    zero, facts = horizon.zero, horizon.facts
+    forms = forms.widened(facts.columns.shape[1])
+    rows, constants = forms.columns, forms.rows[:, 0]
+    size = abs(rows).max(initial=0.0)
+
+    def solved(phases: dict[int, int]) -> Vertex | None:
+        return programs.largest(rows, constants, (zero[i, side] for i, side in phases.items()))
+
+    def split_at(node: Node) -> int | None:
+        """The pair to be split; None if all that is not held is as it should be."""
+        if not len(zero):
+            return None
+        values = facts.columns @ node.vertex.columns + facts.rows[:, 0]
+        off = np.minimum(values[zero[:, 0]], values[zero[:, 1]]) / horizon.gaps
+        off[list(node.phases)] = 0.0
+        if off.max() <= EXACT:
+            return None
+        weight = abs(node.vertex.reduced) + SHARE * abs(rows).max(axis=0) + EXACT * size
+        return int(np.where(off > EXACT, off * weight[horizon.columns], -1.0).argmax())
+
+    first = solved({})
+    if first is None:
+        return None
+    count, serial = 1, itertools.count()
+    heap: list[tuple[float, int, Node]] = [(-first.value, next(serial), Node({}, first))]
+    empty: list[Node] = []
+    best = attained(first.columns) if len(first.columns) else -np.inf
+    while heap and count < budget and not enough(-heap[0][0], best):
+        bound, _, node = heap[0]
+        pair = split_at(node)
+        if pair is None:
+            break
+        children = []
+        for side in (0, 1):
+            phases = node.phases | {pair: side}
+            vertex = solved(phases)
+            count += 1
+            children.append(None if vertex is None else Node(phases, vertex))
+        if None in children:
+            break
+        heapq.heappop(heap)
+        for child in children:
+            if len(child.vertex.columns):
+                best = max(best, attained(child.vertex.columns))
+                value = min(child.vertex.value, -bound)
+                heapq.heappush(heap, (-value, next(serial), child))
+            else:
+                empty.append(_proved_empty(child, node, best, facts))
+    return _found([node for *_, node in heap] + empty, len(zero), count)
+
+
+def _proved_empty(child: Node, parent: Node, floor: float, facts: AffineForms) -> Node:
+    """A branch without states, with multipliers that bound it by what is attained elsewhere.
+
+    Those of its facts that show it to be empty are added to its parent's until they suffice.
+    """
+    vertex, best = parent.vertex, (0.0, child.vertex.multipliers)
+    for ray in (child.vertex.multipliers, -child.vertex.multipliers):
+        value = ray @ facts.rows[:, 0] + abs(ray @ facts.columns).sum()
+        best = min(best, (value, ray), key=lambda each: each[0])
+    value, ray = best
+    if value >= 0:
+        return Node(child.phases, vertex)
+    rest = vertex.value - floor if np.isfinite(floor) else 1.0 + abs(vertex.value)
+    multipliers = vertex.multipliers - 2 * rest / value * ray
+    return Node(child.phases, vertex._replace(multipliers=multipliers))
+
+
+def _found(leaves: list[Node], pairs: int, nodes: int) -> Found:
+    """The leaves as arrays."""
+    phases = np.full((len(leaves), pairs), -1, dtype=np.int8)
+    for leaf, held in zip(leaves, phases, strict=True):
+        held[list(leaf.phases)] = list(leaf.phases.values())
+    vertices = [leaf.vertex for leaf in leaves]
+    multipliers, weights, columns = (
+        np.stack([getattr(vertex, name) for vertex in vertices])
+        for name in ("multipliers", "weights", "columns")
+    )
+    return Found(phases, multipliers, weights, columns, nodes)

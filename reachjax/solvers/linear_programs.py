@@ -1,0 +1,186 @@
+"""Linear programs over the columns of a horizon, by the simplex method of HiGHS.
+
+The largest value of a row over `|eta_i| <= 1` and the facts `F eta + f >= 0`, some of which are
+held at zero. One model grows with the horizon, and each program begins at the basis where the one
+before ended, so most of them take a few pivots. Rows and objectives are of unit size: HiGHS's
+tolerances are absolute. What comes back is a proposal: multipliers prove what `programs.horizon`
+makes of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import highspy
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.programs.affine import AffineForms
+
+TOLERANCE = 1e-9
+"""Of feasibility, primal and dual, in rows of unit size."""
+
+TANGENTS = 8
+"""How often a round initial set is cut by a plane, at most, to solve one program."""
+
+OUTSIDE = 1e-6
+"""How far outside of its ball the initial state may be."""
+
+OPTIMAL, INFEASIBLE = highspy.HighsModelStatus.kOptimal, highspy.HighsModelStatus.kInfeasible
+
+
+class Vertex(NamedTuple):
+    """Where a linear program ended.
+
+    Attributes:
+        value: the largest value; minus infinity if no columns satisfy the facts.
+        columns: `(n,)`, where it is attained; empty if nowhere.
+        multipliers: `(m,)` of the facts that bound it, or that show that there is nothing.
+        weights: `(r,)` of the rows of which the least is largest, of sum 1.
+        reduced: `(n,)`, by how much the bound rises with the range of each column.
+    """
+
+    value: float
+    columns: Float[np.ndarray, " n"]
+    multipliers: Float[np.ndarray, " m"]
+    weights: Float[np.ndarray, " r"]
+    reduced: Float[np.ndarray, " n"]
+
+
+class LinearPrograms:
+    """The model, which grows.
+
+    Args:
+        states: how many columns are of the initial state.
+        round: whether these are in the unit ball.
+        bounded: whether the columns of the initial state are bounded by 1 each.
+    """
+
+    def __init__(self, states: int, round: bool, bounded: bool):
+        self._model = highspy.Highs()
+        for name, value in {
+            "output_flag": False,
+            "presolve": "off",
+            "threads": 1,
+            "primal_feasibility_tolerance": TOLERANCE,
+            "dual_feasibility_tolerance": TOLERANCE,
+        }.items():
+            self._model.setOptionValue(name, value)
+        self._model.changeObjectiveSense(highspy.ObjSense.kMaximize)
+        self._round, self._states = round, states
+        self._model.addVar(0.0, 0.0)  # the least of several rows, where that is maximised
+        self._add_columns(states, 1.0 if bounded else highspy.kHighsInf)
+        self._columns, self._held = states, np.zeros(0, dtype=int)
+        self._rows = np.zeros(0, dtype=int)  # numbers of the facts among the model's rows
+        self._size, self._constant = np.zeros(0), np.zeros(0)
+        self._count = 0
+
+    def grow(self, facts: AffineForms) -> None:
+        """Add the columns and the facts that are new."""
+        width, old = facts.columns.shape[1], len(self._rows)
+        self._add_columns(width - self._columns, 1.0)
+        self._columns = max(width, self._columns)
+        constants, rows = facts.rows[old:, 0], facts.columns[old:]
+        size = np.maximum(abs(rows).max(axis=1, initial=0.0), abs(constants))
+        size = np.where((size > 0) & np.isfinite(size), size, 1.0)
+        self._rows = np.append(self._rows, self._count + np.arange(len(rows)))
+        self._size = np.append(self._size, size)
+        self._constant = np.append(self._constant, constants / size)
+        for constant, row in zip(constants / size, rows / size[:, None], strict=True):
+            self._add_row(-constant, highspy.kHighsInf, np.concatenate([[0.0], row]))
+
+    def largest(
+        self,
+        rows: Float[np.ndarray, "r n"],
+        constants: Float[np.ndarray, " r"],
+        zero: Iterable[int],
+    ) -> Vertex | None:
+        """The largest value of a row, or of the least of several, with some facts at zero.
+
+        None where HiGHS has no answer.
+        """
+        if not (np.isfinite(rows).all() and np.isfinite(constants).all()):
+            return None
+        self._hold(np.array(sorted(zero), dtype=int))
+        size = abs(rows).max(initial=0.0) or 1.0
+        width = self._columns + 1
+        objective = np.zeros(width)
+        extra = 0
+        if len(rows) == 1:
+            objective[1 : 1 + rows.shape[1]] = rows[0] / size
+        else:
+            objective[0], extra = 1.0, len(rows)
+            self._model.changeColBounds(0, -highspy.kHighsInf, highspy.kHighsInf)
+            for row, constant in zip(rows / size, constants / size, strict=True):
+                self._add_row(-constant, highspy.kHighsInf, np.concatenate([[-1.0], row]))
+        self._model.changeColsCost(width, np.arange(width, dtype=np.int32), objective)
+        found = self._solved(rows, constants, size, extra)
+        if extra:
+            last = np.arange(self._count - extra, self._count, dtype=np.int32)
+            self._model.deleteRows(extra, last)
+            self._count -= extra
+            self._model.changeColBounds(0, 0.0, 0.0)
+        return found
+
+    def _solved(
+        self, rows: np.ndarray, constants: np.ndarray, size: float, extra: int
+    ) -> Vertex | None:
+        for _ in range(TANGENTS):
+            self._model.run()
+            status = self._model.getModelStatus()
+            if status != OPTIMAL:
+                break
+            solution = self._model.getSolution()
+            columns = np.array(solution.col_value)[1:]
+            initial = columns[: self._states]
+            length = np.linalg.norm(initial)
+            if not self._round or extra or length <= 1 + OUTSIDE:
+                break
+            plane = np.zeros(self._states + 1)
+            plane[1:] = -initial / length
+            self._add_row(-1.0, highspy.kHighsInf, plane)
+        count = len(rows)
+        if status == INFEASIBLE:
+            _, there, ray = self._model.getDualRay()
+            multipliers = np.array(ray)[self._rows] / self._size if there else None
+            if multipliers is None:
+                return None
+            none = np.zeros(0)
+            return Vertex(-np.inf, none, -multipliers, none, none)
+        if status != OPTIMAL:
+            return None
+        duals = np.array(solution.row_dual)
+        weights = np.ones(1)
+        if extra:
+            weights = np.maximum(-duals[self._count - count :], 0.0)
+            total = weights.sum()
+            weights = weights / total if total > 0 else np.full(count, 1 / count)
+        value = (constants + rows @ columns[: rows.shape[1]]).min()
+        return Vertex(
+            float(value),
+            columns,
+            -size * duals[self._rows] / self._size,
+            weights,
+            size * np.array(solution.col_dual)[1:],
+        )
+
+    def _hold(self, zero: np.ndarray) -> None:
+        """Hold these facts at zero, and no others."""
+        for fact in np.setdiff1d(self._held, zero):
+            self._bound(fact, highspy.kHighsInf)
+        for fact in np.setdiff1d(zero, self._held):
+            self._bound(fact, -self._constant[fact])
+        self._held = zero
+
+    def _bound(self, fact: int, upper: float) -> None:
+        self._model.changeRowBounds(int(self._rows[fact]), -self._constant[fact], upper)
+
+    def _add_columns(self, count: int, bound: float) -> None:
+        if count > 0:
+            self._model.addVars(count, np.full(count, -bound), np.full(count, bound))
+
+    def _add_row(self, lower: float, upper: float, row: np.ndarray) -> None:
+        there = np.flatnonzero(row)
+        self._model.addRow(lower, upper, len(there), there.astype(np.int32), row[there])
+        self._count += 1

@@ -1,0 +1,154 @@
+"""Sets of a template around the states of each step, each facet by the cheapest proof of it.
+
+A facet climbs the ladder of `BranchAndCut` only while its gap is open: the gap between what is
+proved and what a trajectory attains. All but the last rung go back to the initial set. What the
+facets of a step prove bounds the units of the next one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.numerics.checks import is_concrete
+from reachjax.proofs.branches import BranchCertificate, Rung
+from reachjax.proofs.facets import Certificate
+from reachjax.proofs.proposal import SolverStatus
+from reachjax.proofs.replayed import Replay, replayed
+from reachjax.sets import AbstractSet, Box, Polytope, Template
+from reachjax.tubes.ladder import Climbed, Ladder
+from reachjax.tubes.steps import Reached, Setting, Step
+from reachjax.tubes.successors import facets_by_products
+
+PRODUCTS = 4e6
+"""Columns cubed of all facets of a tube that get products, in all: some tens of seconds."""
+
+
+def sets_by_branching(
+    setting: Setting, X0: AbstractSet, box: Box, template: Template, horizon: int
+) -> Iterator[Reached]:
+    """The smallest sets that are proved within the setting's gap, nodes and time.
+
+    Args:
+        setting: what all steps have in common.
+        X0: the initial set.
+        box: around it.
+        template: what the sets look like.
+        horizon: how many steps there are.
+
+    Raises:
+        ValueError: states overflow.
+    """
+    fixed = jax.device_get(jax.lax.stop_gradient((setting.loop, X0, box)))
+    nodes = setting.relaxation.nodes or 0
+    ladder = Ladder(*fixed, setting.start, nodes, setting.gap, setting.deadline)
+    X, steps, work = X0, [], PRODUCTS
+    for k in range(1, horizon + 1):
+        began = time.perf_counter()
+        steps.append(Step(setting, X, k - 1, tuple(steps)))
+        directions = template.at(k).directions
+        rows = np.asarray(jax.lax.stop_gradient(directions))
+        ladder.advance()
+        climbed = ladder.climbed(rows, _simulated(setting, k, rows), (horizon - k) * len(rows))
+        if not np.isfinite(climbed.bounds).all():
+            raise ValueError(
+                f"the loop's states at t = {setting.start + k} overflow or are not numbers: check "
+                "the weights of loop.controller and the entries of loop.plant"
+            )
+        offsets = _offsets(setting, X0, box, directions, climbed, ladder, horizon, k)
+        opened = np.flatnonzero(climbed.gaps > setting.gap)
+        opened = opened[np.argsort(-climbed.gaps[opened], kind="stable")]
+        cost = float(climbed.columns.shape[1]) ** 3
+        opened = opened[: int(work // cost)] if not setting.late else opened[:0]
+        work -= len(opened) * cost
+        products = None
+        if len(opened):
+            offsets, products = _with_products(steps[-1], directions, offsets, opened)
+        X = Polytope(directions, offsets)
+        seconds = time.perf_counter() - began
+        yield Reached(
+            X, _certificate(climbed, offsets, products, opened, seconds), climbed.states, False
+        )
+        ladder.horizon.narrow(*_ends(rows, np.asarray(jax.lax.stop_gradient(offsets))))
+
+
+def _simulated(setting: Setting, k: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest values of directions that are simulated."""
+    if setting.simulations is None:
+        none = np.full(len(rows), np.inf)
+        return none, -none
+    return setting.simulations.values(k, rows)
+
+
+def _offsets(
+    setting: Setting,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[Array, "f n_x"],
+    climbed: Climbed,
+    ladder: Ladder,
+    horizon: int,
+    k: int,
+) -> Float[Array, " f"]:
+    """What is proved, with its derivative where it is asked for."""
+    proved = jnp.asarray(climbed.bounds)
+    if is_concrete(setting.loop, X0, directions):
+        return proved
+    held = Replay.of(ladder.horizon, climbed.columns, climbed.multipliers, horizon)
+    moving = replayed(setting.loop, X0, box, directions, held, k, setting.start)
+    return proved + (moving - jax.lax.stop_gradient(moving))
+
+
+def _with_products(
+    step: Step, directions: Float[Array, "f n_x"], offsets: Float[Array, " f"], opened: np.ndarray
+) -> tuple[Float[Array, " f"], Certificate]:
+    """The better of what is proved and what products prove of some facets."""
+    found, proof = facets_by_products(step, directions[opened])
+    better = found < offsets[opened]
+    return offsets.at[opened].set(jnp.where(better, found, offsets[opened])), proof
+
+
+def _ends(rows: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the state that facets along the axes are; infinite where there is none."""
+    n = rows.shape[1]
+    lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
+    for row, offset in zip(rows, offsets, strict=True):
+        (there,) = np.nonzero(row)
+        if len(there) == 1 and abs(row[there[0]]) == 1.0:
+            i = there[0]
+            if row[i] > 0:
+                upper[i] = min(upper[i], offset)
+            else:
+                lower[i] = max(lower[i], -offset)
+    return lower, upper
+
+
+def _certificate(
+    climbed: Climbed,
+    offsets: Float[Array, " f"],
+    products: Certificate | None,
+    opened: np.ndarray,
+    seconds: float,
+) -> BranchCertificate:
+    """The proof of all facets; witnesses are not known yet."""
+    facets, rungs = len(climbed.bounds), climbed.rungs.copy()
+    better = np.asarray(jax.lax.stop_gradient(offsets)) < climbed.bounds
+    rungs[better] = Rung.PRODUCTS
+    return BranchCertificate(
+        codes=np.full(facets, int(SolverStatus.SOLVED)),
+        bounds=offsets,
+        witnesses=np.full(facets, np.nan),
+        witness_states=np.full((facets, 0), np.nan),
+        seconds=np.full(facets, seconds / facets),
+        about=climbed.about,
+        branches=climbed.branches,
+        products=products,
+        by_products=opened,
+        rungs=rungs,
+        nodes=climbed.nodes,
+    )

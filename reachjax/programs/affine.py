@@ -148,7 +148,9 @@ class AffineForms:
         more = width - self.rows.shape[1] + 2
         if more <= 0:
             return self
-        return AffineForms(np.pad(self.rows, ((0, 0), (0, more))), self.radii)
+        rows = np.zeros((len(self.rows), width + 2))
+        rows[:, : self.rows.shape[1]] = self.rows
+        return AffineForms(rows, self.radii)
 
     def with_own(self, by: Float[Array, " k"], place: Place) -> tuple[AffineForms, Any]:
         """Each number with so much of a column of its own, and where that is, -1 where none is.

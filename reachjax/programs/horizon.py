@@ -79,13 +79,20 @@ class Horizon:
     def facts(self) -> AffineForms:
         """Rows `(m, n)` that are never negative: those of the initial set, then those of units."""
         width = max(part.columns.shape[1] for part in (self.state, *self._facts))
-        none = AffineForms(np.zeros((0, width + 2)), np.zeros((0, 2)))
-        return joined([none, *(part.widened(width) for part in self._facts)])
+        if len(self._facts) != 1 or self._facts[0].columns.shape[1] != width:
+            none = AffineForms(np.zeros((0, width + 2)), np.zeros((0, 2)))
+            self._facts = [joined([none, *(part.widened(width) for part in self._facts)])]
+        return self._facts[0]
 
     @property
     def zero(self) -> Int[np.ndarray, "p 2"]:
         """Pairs of facts, one of which is zero at each state."""
         return np.concatenate(self._zero)
+
+    @property
+    def varying(self) -> Int[np.ndarray, " v"]:
+        """Columns of the initial state and of units, without those of rounding errors."""
+        return np.concatenate([np.arange(self.start.spread.shape[1]), np.unique(self.columns)])
 
     def advance(self, multipliers: Multipliers | None = None) -> None:
         """One step more.
@@ -99,7 +106,7 @@ class Horizon:
         ) -> Ends:
             self._state_facts(found)
             switching = np.flatnonzero(~unit.lines(*ends).affine)
-            if multipliers is None or not (len(switching) and self._facts):
+            if multipliers is None or not (len(switching) and self._count):
                 return ends
             lower, upper = (end.copy() for end in ends)
             inputs = y[switching]

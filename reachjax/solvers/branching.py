@@ -79,7 +79,7 @@ def branched(
     horizon: Horizon,
     programs: LinearPrograms,
     forms: AffineForms,
-    attained: Callable[[Float[np.ndarray, " n"]], float],
+    attained: Callable[[list[Float[np.ndarray, " n"]]], float],
     enough: Callable[[float, float], bool],
     budget: int,
 ) -> Found | None:
@@ -89,7 +89,7 @@ def branched(
         horizon: whose facts hold.
         programs: over these.
         forms: `r` of them.
-        attained: the largest value that is known to be attained, given one more solution's columns.
+        attained: the largest value that is known to be attained, given columns of more solutions.
         enough: whether to stop, given the bound and what is attained.
         budget: how many linear programs may be solved.
 
@@ -122,7 +122,7 @@ def branched(
     count, serial = 1, itertools.count()
     heap: list[tuple[float, int, Node]] = [(-first.value, next(serial), Node({}, first))]
     empty: list[Node] = []
-    best = attained(first.columns) if len(first.columns) else -np.inf
+    best = attained([first.columns]) if len(first.columns) else -np.inf
     while heap and count < budget and not enough(-heap[0][0], best):
         bound, _, node = heap[0]
         pair = split_at(node)
@@ -137,9 +137,10 @@ def branched(
         if None in children:
             break
         heapq.heappop(heap)
+        if solutions := [each.vertex.columns for each in children if len(each.vertex.columns)]:
+            best = max(best, attained(solutions))
         for child in children:
             if len(child.vertex.columns):
-                best = max(best, attained(child.vertex.columns))
                 value = min(child.vertex.value, -bound)
                 heapq.heappush(heap, (-value, next(serial), child))
             else:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import highspy
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from reachjax.programs.affine import AffineForms
 
@@ -35,7 +35,7 @@ class Vertex(NamedTuple):
 
     Attributes:
         value: the largest value; minus infinity if no columns satisfy the facts.
-        columns: `(n,)`, where it is attained; empty if nowhere.
+        columns: `(n,)`, where it is attained, zero of those left out; empty if nowhere.
         multipliers: `(m,)` of the facts that bound it, or that show that there is nothing.
         weights: `(r,)` of the rows of which the least is largest, of sum 1.
         reduced: `(n,)`, by how much the bound rises with the range of each column.
@@ -71,17 +71,23 @@ class LinearPrograms:
         self._round, self._states = round, states
         self._model.addVar(0.0, 0.0)  # the least of several rows, where that is maximised
         self._add_columns(states, 1.0 if bounded else highspy.kHighsInf)
-        self._columns, self._held = states, np.zeros(0, dtype=int)
+        self._columns, self._width = np.arange(states), states
+        self._held: set[int] = set()
         self._rows = np.zeros(0, dtype=int)  # numbers of the facts among the model's rows
         self._size, self._constant = np.zeros(0), np.zeros(0)
         self._count = 0
 
-    def grow(self, facts: AffineForms) -> None:
-        """Add the columns and the facts that are new."""
-        width, old = facts.columns.shape[1], len(self._rows)
-        self._add_columns(width - self._columns, 1.0)
-        self._columns = max(width, self._columns)
-        constants, rows = facts.rows[old:, 0], facts.columns[old:]
+    def grow(self, facts: AffineForms, columns: Int[np.ndarray, " v"]) -> None:
+        """Add the columns and the facts that are new.
+
+        Args:
+            facts: all of them, the first ones as before.
+            columns: the numbers of those that matter, the first ones as before; remainders that
+                are left out are so small that they change no program.
+        """
+        self._add_columns(len(columns) - len(self._columns), 1.0)
+        self._columns, self._width, old = columns, facts.columns.shape[1], len(self._rows)
+        constants, rows = facts.rows[old:, 0], facts.columns[old:, columns]
         size = np.maximum(abs(rows).max(axis=1, initial=0.0), abs(constants))
         size = np.where((size > 0) & np.isfinite(size), size, 1.0)
         self._rows = np.append(self._rows, self._count + np.arange(len(rows)))
@@ -102,13 +108,16 @@ class LinearPrograms:
         """
         if not (np.isfinite(rows).all() and np.isfinite(constants).all()):
             return None
-        self._hold(np.array(sorted(zero), dtype=int))
+        self._hold({int(fact) for fact in zero})
+        given = np.zeros((len(rows), self._width))
+        given[:, : rows.shape[1]] = rows
+        rows = given[:, self._columns]
         size = abs(rows).max(initial=0.0) or 1.0
-        width = self._columns + 1
+        width = len(self._columns) + 1
         objective = np.zeros(width)
         extra = 0
         if len(rows) == 1:
-            objective[1 : 1 + rows.shape[1]] = rows[0] / size
+            objective[1:] = rows[0] / size
         else:
             objective[0], extra = 1.0, len(rows)
             self._model.changeColBounds(0, -highspy.kHighsInf, highspy.kHighsInf)
@@ -156,20 +165,26 @@ class LinearPrograms:
             weights = np.maximum(-duals[self._count - count :], 0.0)
             total = weights.sum()
             weights = weights / total if total > 0 else np.full(count, 1 / count)
-        value = (constants + rows @ columns[: rows.shape[1]]).min()
+        value = (constants + rows @ columns).min()
         return Vertex(
             float(value),
-            columns,
+            self._placed(columns),
             -size * duals[self._rows] / self._size,
             weights,
-            size * np.array(solution.col_dual)[1:],
+            self._placed(size * np.array(solution.col_dual)[1:]),
         )
 
-    def _hold(self, zero: np.ndarray) -> None:
+    def _placed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
+        """Values of the columns that matter among those of all."""
+        found = np.zeros(self._width)
+        found[self._columns] = values
+        return found
+
+    def _hold(self, zero: set[int]) -> None:
         """Hold these facts at zero, and no others."""
-        for fact in np.setdiff1d(self._held, zero):
+        for fact in self._held - zero:
             self._bound(fact, highspy.kHighsInf)
-        for fact in np.setdiff1d(zero, self._held):
+        for fact in zero - self._held:
             self._bound(fact, -self._constant[fact])
         self._held = zero
 

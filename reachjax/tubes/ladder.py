@@ -104,7 +104,7 @@ class Ladder:
     def _ranges(self, forms: AffineForms) -> Float[np.ndarray, "k m"]:
         """Multipliers that bound the inputs of units from both sides."""
         facts = self.horizon.facts
-        self._programs.grow(facts)
+        self._programs.grow(facts, self.horizon.varying)
         found = np.zeros((len(forms.rows), len(facts.rows)))
         for row, constant, multipliers in zip(forms.columns, forms.rows, found, strict=True):
             if self.late or self._work <= 0:
@@ -116,7 +116,12 @@ class Ladder:
         return found
 
     def _spend(self, programs: int) -> None:
-        self._work -= programs * sum(self.horizon.facts.rows.shape)
+        self._work -= programs * self._size
+
+    @property
+    def _size(self) -> int:
+        """Rows and columns of a linear program."""
+        return len(self.horizon.facts.rows) + len(self.horizon.varying)
 
     def climbed(
         self,
@@ -133,7 +138,7 @@ class Ladder:
         """
         horizon, start = self.horizon, self.horizon.start
         facts = horizon.facts
-        self._programs.grow(facts)
+        self._programs.grow(facts, horizon.varying)
         forms = (directions @ horizon.state).widened(facts.columns.shape[1])
         lower, upper = forms.ends(start)
         least, most = values
@@ -143,10 +148,11 @@ class Ladder:
         found: list[Found] = []
         for facet in range(len(directions)):
 
-            def attained(columns: np.ndarray, facet: int = facet) -> float:
-                states.append(self._initial(columns))
-                after = trajectories(self._loop, states[-1][None], len(horizon.steps), self._t)
-                best[facet] = np.fmax(best[facet], directions[facet] @ after[0, -1])
+            def attained(columns: list[np.ndarray], facet: int = facet) -> float:
+                begun = self._initial(np.array(columns))
+                states.extend(begun)
+                after = trajectories(self._loop, begun, len(horizon.steps), self._t)[:, -1]
+                best[facet] = np.fmax(best[facet], np.fmax.reduce(after @ directions[facet]))
                 return float(best[facet])
 
             def enough(bound: float, attained: float, facet: int = facet) -> bool:
@@ -168,9 +174,9 @@ class Ladder:
         affordable = int(2 * self._work / (facets * sum(self.horizon.facts.rows.shape)))
         return min(self._nodes, max(LEAST_NODES, affordable))
 
-    def _initial(self, columns: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n_x"]:
+    def _initial(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n_x"]:
         start = self.horizon.start
-        return start.center + start.spread @ columns[: start.spread.shape[1]]
+        return start.center + columns[:, : start.spread.shape[1]] @ start.spread.T
 
     def _judged(
         self,

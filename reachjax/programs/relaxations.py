@@ -260,7 +260,7 @@ class BranchAndCut(AbstractRelaxation):
     2018), with the products of Burer (2009) for cuts.
     """
 
-    nodes: int = 200
+    nodes: int = 2000
     products_by: CuttingPlanes = CuttingPlanes()
     remove_stable: bool = True
 

@@ -23,6 +23,9 @@ BLOCK = 1024
 PULL = 1 - 1e-12
 """How far a rounded point is brought towards the middle of the set."""
 
+PULLS = PULL, 1 - 1e-9, 1 - 1e-6
+"""The same of points that solvers of cones found, by turns until one is inside."""
+
 
 def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, "c n_x"]:
     """Corners of the set, in few dimensions, and `count` points drawn from it.
@@ -119,8 +122,9 @@ class Simulations:
         """Simulate these initial states too, those that are in the set or just outside."""
         if not len(states):
             return
-        inside = self._inside(states)[:, None]
-        states = np.where(inside, states, self._middle + PULL * (states - self._middle))
+        for pull in PULLS:
+            inside = self._inside(states)[:, None]
+            states = np.where(inside, states, self._middle + pull * (states - self._middle))
         found = self.simulated(states, self._horizon)
         kept = self._inside(states) & np.isfinite(found).all(axis=(1, 2))
         self._states = np.concatenate([self._states, states[kept]])

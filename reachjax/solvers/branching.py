@@ -144,21 +144,20 @@ def branched(
                 value = min(child.vertex.value, -bound)
                 heapq.heappush(heap, (-value, next(serial), child))
             else:
-                empty.append(_proved_empty(child, node, best, facts))
+                empty.append(_proved_empty(child, node, best, horizon))
     return _found([node for *_, node in heap] + empty, len(zero), count)
 
 
-def _proved_empty(child: Node, parent: Node, floor: float, facts: AffineForms) -> Node:
+def _proved_empty(child: Node, parent: Node, floor: float, horizon: Horizon) -> Node:
     """A branch without states, with multipliers that bound it by what is attained elsewhere.
 
     Those of its facts that show it to be empty are added to its parent's until they suffice.
     """
-    vertex, best = parent.vertex, (0.0, child.vertex.multipliers)
-    for ray in (child.vertex.multipliers, -child.vertex.multipliers):
-        value = ray @ facts.rows[:, 0] + abs(ray @ facts.columns).sum()
-        best = min(best, (value, ray), key=lambda each: each[0])
-    value, ray = best
-    if value >= 0:
+    vertex, rays = parent.vertex, np.outer([1.0, -1.0], child.vertex.multipliers)
+    nothing = AffineForms(np.zeros((2, 2)), np.zeros((2, 2)))
+    values = horizon.bounds(nothing, rays)
+    value, ray = values.min(), rays[values.argmin()]
+    if not value < 0:
         return Node(child.phases, vertex)
     rest = vertex.value - floor if np.isfinite(floor) else 1.0 + abs(vertex.value)
     multipliers = vertex.multipliers - 2 * rest / value * ray

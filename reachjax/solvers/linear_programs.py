@@ -9,6 +9,7 @@ makes of them.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -20,12 +21,6 @@ from reachjax.programs.affine import AffineForms
 
 TOLERANCE = 1e-9
 """Of feasibility, primal and dual, in rows of unit size."""
-
-TANGENTS = 8
-"""How often a round initial set is cut by a plane, at most, to solve one program."""
-
-OUTSIDE = 1e-6
-"""How far outside of its ball the initial state may be."""
 
 OPTIMAL, INFEASIBLE = highspy.HighsModelStatus.kOptimal, highspy.HighsModelStatus.kInfeasible
 
@@ -48,16 +43,41 @@ class Vertex(NamedTuple):
     reduced: Float[np.ndarray, " n"]
 
 
-class LinearPrograms:
-    """The model, which grows.
+class AbstractPrograms(abc.ABC):
+    """Programs over the columns and facts of a horizon, which grow."""
+
+    @abc.abstractmethod
+    def grow(self, facts: AffineForms, columns: Int[np.ndarray, " v"]) -> None:
+        """Add the columns and the facts that are new.
+
+        Args:
+            facts: all of them, the first ones as before.
+            columns: the numbers of those that matter, the first ones as before; remainders that
+                are left out are so small that they change no program.
+        """
+
+    @abc.abstractmethod
+    def largest(
+        self,
+        rows: Float[np.ndarray, "r n"],
+        constants: Float[np.ndarray, " r"],
+        zero: Iterable[int],
+    ) -> Vertex | None:
+        """The largest value of a row, or of the least of several, with some facts at zero.
+
+        None where there is no answer.
+        """
+
+
+class LinearPrograms(AbstractPrograms):
+    """Linear programs as one model.
 
     Args:
         states: how many columns are of the initial state.
-        round: whether these are in the unit ball.
-        bounded: whether the columns of the initial state are bounded by 1 each.
+        bounded: whether these are bounded by 1 each, or by the facts alone.
     """
 
-    def __init__(self, states: int, round: bool, bounded: bool):
+    def __init__(self, states: int, bounded: bool):
         self._model = highspy.Highs()
         for name, value in {
             "output_flag": False,
@@ -68,7 +88,6 @@ class LinearPrograms:
         }.items():
             self._model.setOptionValue(name, value)
         self._model.changeObjectiveSense(highspy.ObjSense.kMaximize)
-        self._round, self._states = round, states
         self._model.addVar(0.0, 0.0)  # the least of several rows, where that is maximised
         self._add_columns(states, 1.0 if bounded else highspy.kHighsInf)
         self._columns, self._width = np.arange(states), states
@@ -78,13 +97,7 @@ class LinearPrograms:
         self._count = 0
 
     def grow(self, facts: AffineForms, columns: Int[np.ndarray, " v"]) -> None:
-        """Add the columns and the facts that are new.
-
-        Args:
-            facts: all of them, the first ones as before.
-            columns: the numbers of those that matter, the first ones as before; remainders that
-                are left out are so small that they change no program.
-        """
+        """Add the columns and the facts that are new."""
         self._add_columns(len(columns) - len(self._columns), 1.0)
         self._columns, self._width, old = columns, facts.columns.shape[1], len(self._rows)
         constants, rows = facts.rows[old:, 0], facts.columns[old:, columns]
@@ -102,10 +115,7 @@ class LinearPrograms:
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
     ) -> Vertex | None:
-        """The largest value of a row, or of the least of several, with some facts at zero.
-
-        None where HiGHS has no answer.
-        """
+        """The largest value of a row, or of the least of several, with some facts at zero."""
         if not (np.isfinite(rows).all() and np.isfinite(constants).all()):
             return None
         self._hold({int(fact) for fact in zero})
@@ -135,20 +145,8 @@ class LinearPrograms:
     def _solved(
         self, rows: np.ndarray, constants: np.ndarray, size: float, extra: int
     ) -> Vertex | None:
-        for _ in range(TANGENTS):
-            self._model.run()
-            status = self._model.getModelStatus()
-            if status != OPTIMAL:
-                break
-            solution = self._model.getSolution()
-            columns = np.array(solution.col_value)[1:]
-            initial = columns[: self._states]
-            length = np.linalg.norm(initial)
-            if not self._round or extra or length <= 1 + OUTSIDE:
-                break
-            plane = np.zeros(self._states + 1)
-            plane[1:] = -initial / length
-            self._add_row(-1.0, highspy.kHighsInf, plane)
+        self._model.run()
+        status = self._model.getModelStatus()
         count = len(rows)
         if status == INFEASIBLE:
             _, there, ray = self._model.getDualRay()
@@ -159,7 +157,8 @@ class LinearPrograms:
             return Vertex(-np.inf, none, -multipliers, none, none)
         if status != OPTIMAL:
             return None
-        duals = np.array(solution.row_dual)
+        solution = self._model.getSolution()
+        columns, duals = np.array(solution.col_value)[1:], np.array(solution.row_dual)
         weights = np.ones(1)
         if extra:
             weights = np.maximum(-duals[self._count - count :], 0.0)

@@ -18,6 +18,7 @@ from reachjax.programs.horizon import Horizon
 from reachjax.proofs.branches import Branches, HorizonFacts, Rung, bounds_of, leaf_bounds
 from reachjax.sets import AbstractSet, Box
 from reachjax.solvers.branching import Found, affine_leaf, branched
+from reachjax.solvers.conic_programs import ConicPrograms
 from reachjax.solvers.linear_programs import LinearPrograms
 
 FLAT = 1e-6
@@ -89,8 +90,10 @@ class Ladder:
         self._work = WORK
         self.horizon = Horizon(loop, X0, box, t)
         start = self.horizon.start
-        bounded = start.cut is None or start.round
-        self._programs = LinearPrograms(start.spread.shape[1], start.round, bounded)
+        columns = start.spread.shape[1]
+        self._programs = (
+            ConicPrograms(columns) if start.round else LinearPrograms(columns, start.cut is None)
+        )
 
     @property
     def late(self) -> bool:

@@ -15,6 +15,7 @@ Everything here is numpy on the host.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -125,6 +126,19 @@ class Horizon:
             self.state, units = step_forms(self._loop, self.state, t, self.start, ranges=ranges)
             self._state_facts(units)
         self.steps.append(units)
+
+    def columns_at(self, state: Float[np.ndarray, " n_x"]) -> Float[np.ndarray, " n"]:
+        """The columns of the trajectory from an initial state."""
+        found = np.zeros(self.facts.columns.shape[1])
+        first = self.start.back @ (state - self.start.center)
+        found[: len(first)] = first
+        for layer in itertools.chain(*self.steps):
+            here = np.flatnonzero(layer.places >= 0)
+            inputs = layer.inputs[here]
+            y = inputs.rows[:, 0] + inputs.columns @ found[: inputs.columns.shape[1]]
+            rest = layer.unit(y) - layer.slope[here] * y - layer.offset[here]
+            found[layer.places[here]] = rest / layer.gap[here]
+        return found
 
     def narrow(self, lower: Float[np.ndarray, " n_x"], upper: Float[np.ndarray, " n_x"]) -> None:
         """Meet the state with bounds that surely hold it."""

@@ -4,8 +4,12 @@ A leaf bounds `(c + sum_i lambda_i p_i) . eta` over the columns `eta`. Where tha
 `eta*`, the row's derivative is the bound's, multipliers and `eta*` being held (the envelope
 theorem). A row's value at `eta*` needs no row: it is a run of the loop from the initial state that
 `eta*` holds, each unit's value being `slope y + offset` as `eta*` says, with what the facts are
-along the way. Slopes and gaps of units are held too; where a facet is proved exact, they do not
-matter, and this is the derivative of the worst trajectory.
+along the way.
+
+Where units are as they should be at `eta*`, the bound is the value of a trajectory. A unit is then
+its own line there, but where it is bent; so this is the derivative of the worst trajectory, which
+the multipliers of facts keep on the bends that it rests on. Elsewhere the lines that hold the unit
+count as given, though they depend on ranges, and these on the loop: the derivative lacks that part.
 """
 
 from __future__ import annotations
@@ -20,9 +24,13 @@ from jaxtyping import Array, Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.programs.affine_steps import UnitForms
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.initial import InitialColumns
 from reachjax.sets import AbstractSet, Box
+
+NEAR = 1e-6
+"""Values that differ by less, in parts of the range of a unit's input, are the same."""
 
 
 @pytree
@@ -31,14 +39,14 @@ class Replay(Replaceable):
 
     Attributes:
         initial: `(f, n_w)`, the columns of the initial state.
-        slopes: `(N, units)`.
+        slopes: `(f, N, units)`.
         offsets: `(f, N, units)`.
         multipliers: `(f, N, b, units)`, of the facts of each unit, of which there are `b`.
         of_set: `(f, r)`, those of the facets of the initial set.
     """
 
     initial: Float[Array | np.ndarray, "f n_w"]
-    slopes: Float[Array | np.ndarray, "N units"]
+    slopes: Float[Array | np.ndarray, "f N units"]
     offsets: Float[Array | np.ndarray, "f N units"]
     multipliers: Float[Array | np.ndarray, "f N b units"]
     of_set: Float[Array | np.ndarray, "f r"]
@@ -60,20 +68,35 @@ class Replay(Replaceable):
             steps: `N`, those of the horizon and more.
         """
         facets, units = len(columns), sum(len(layer.places) for layer in horizon.steps[0])
-        slopes, offsets = np.zeros((steps, units)), np.zeros((facets, steps, units))
+        slopes, offsets = (np.zeros((facets, steps, units)) for _ in range(2))
         for step, layers in enumerate(horizon.steps):
-            places, slope, offset, gap = (
-                np.concatenate([getattr(layer, name) for layer in layers] or [np.zeros(0)])
-                for name in ("places", "slope", "offset", "gap")
+            parts = [_lines(layer, columns) for layer in layers]
+            slopes[:, step], offsets[:, step] = (
+                np.concatenate([part[which] for part in parts] or [np.zeros((facets, 0))], axis=1)
+                for which in range(2)
             )
-            own = columns[:, places.astype(int)] * (places >= 0)
-            slopes[step], offsets[:, step] = slope, offset + gap * own
         step, unit, kind = horizon.origins.T
         of_units, of_set = step >= 0, step < 0
         found = np.zeros((facets, steps, kind.max(initial=0) + 1, units))
         found[:, step[of_units], kind[of_units], unit[of_units]] = multipliers[:, of_units]
         initial = columns[:, : horizon.start.spread.shape[1]]
         return cls(initial, slopes, offsets, found, multipliers[:, of_set])
+
+
+def _lines(
+    layer: UnitForms, columns: Float[np.ndarray, "f n"]
+) -> tuple[Float[np.ndarray, "f k"], Float[np.ndarray, "f k"]]:
+    """Slopes and offsets of units at these columns."""
+    width = layer.inputs.columns.shape[1]
+    y = columns[:, :width] @ layer.inputs.columns.T + layer.inputs.rows[:, 0]
+    own = columns[:, np.maximum(layer.places, 0)] * (layer.places >= 0)
+    z = layer.slope * y + layer.offset + layer.gap * own
+    near = NEAR * (layer.upper - layer.lower)
+    line = layer.unit.lines(y - near, y + near).above.slope
+    proper = layer.unit.lines(y - near, y + near).affine
+    proper &= abs(layer.unit(y) - z) <= near
+    slope = np.where(proper & (layer.places >= 0), line, layer.slope)
+    return slope, z - slope * y
 
 
 @partial(jax.jit, static_argnames="start")
@@ -89,10 +112,9 @@ def replayed(
     """Numbers `(f,)` whose derivatives in loop, set and directions are those of the bounds."""
     initial, (cut, ball) = InitialColumns.of(X0, box), X0.parts
     cornered = ball is None and replay.of_set.shape[1] > 0
-    slopes = jax.lax.stop_gradient(replay.slopes)
-    steps = len(slopes)
+    steps = replay.slopes.shape[1]
 
-    def of_facet(direction, columns, offsets, multipliers, of_set):
+    def of_facet(direction, columns, slopes, offsets, multipliers, of_set):
         x = initial.center + initial.spread @ columns
         if cornered:  # by facets alone
             x = jax.lax.stop_gradient(x)
@@ -123,5 +145,5 @@ def replayed(
         _, (states, totals) = jax.lax.scan(advance, (x, total), given)
         return direction @ states[k - 1] + totals[k - 1]
 
-    parts = replay.initial, replay.offsets, replay.multipliers, replay.of_set
+    parts = replay.initial, replay.slopes, replay.offsets, replay.multipliers, replay.of_set
     return jax.vmap(of_facet)(directions, *jax.lax.stop_gradient(parts))

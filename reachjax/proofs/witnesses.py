@@ -7,6 +7,8 @@ ascent finds from these and from the states that the dual of a semidefinite prog
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,6 +62,26 @@ def _brought_inside(
     return states, X0.contains(states)
 
 
+class Simulated(NamedTuple):
+    """Simulated values of directions.
+
+    Attributes:
+        least: `(f,)`, infinite where nothing is simulated.
+        most: `(f,)`, the same.
+        states: `(f, n_x)`, initial states that attain the largest.
+    """
+
+    least: Float[np.ndarray, " f"]
+    most: Float[np.ndarray, " f"]
+    states: Float[np.ndarray, "f n_x"]
+
+    @classmethod
+    def nothing(cls, state: Float[np.ndarray, " n_x"], facets: int) -> Simulated:
+        """Of so many directions, with some initial state."""
+        none = np.full(facets, np.inf)
+        return cls(none, -none, np.tile(state, (facets, 1)))
+
+
 class Simulations:
     """Trajectories from an initial set, and the largest values that they attain.
 
@@ -90,12 +112,10 @@ class Simulations:
         """Trajectories from these states."""
         return trajectories(self._on_host, states, steps, self._start)
 
-    def values(
-        self, k: int, directions: Float[np.ndarray, "f n_x"]
-    ) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]:
-        """The least and the largest values of directions after `k` steps."""
+    def values(self, k: int, directions: Float[np.ndarray, "f n_x"]) -> Simulated:
+        """What is known of directions after `k` steps."""
         found = self._trajectories[:, k] @ directions.T
-        return found.min(axis=0), found.max(axis=0)
+        return Simulated(found.min(axis=0), found.max(axis=0), self._states[found.argmax(axis=0)])
 
     def climb(
         self,

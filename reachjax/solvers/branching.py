@@ -18,13 +18,17 @@ from jaxtyping import Float, Int
 
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon
-from reachjax.solvers.linear_programs import LinearPrograms, Vertex
+from reachjax.solvers.linear_programs import AbstractPrograms, Vertex
 
 EXACT = 1e-9
 """A unit whose value is off by no more than this part of its gap is not split."""
 
 SHARE = 0.1
 """What a column's share of the objective counts, where its reduced cost counts 1."""
+
+
+BENT = 1e-6
+"""A fact of a unit that is no more than this part of its gap is zero."""
 
 
 class Node(NamedTuple):
@@ -77,7 +81,7 @@ def affine_leaf(form: AffineForms, horizon: Horizon) -> Found:
 
 def branched(
     horizon: Horizon,
-    programs: LinearPrograms,
+    programs: AbstractPrograms,
     forms: AffineForms,
     attained: Callable[[list[Float[np.ndarray, " n"]]], float],
     enough: Callable[[float, float], bool],
@@ -146,6 +150,46 @@ def branched(
             else:
                 empty.append(_proved_empty(child, node, best, horizon))
     return _found([node for *_, node in heap] + empty, len(zero), count)
+
+
+def settled(
+    horizon: Horizon,
+    programs: AbstractPrograms,
+    form: AffineForms,
+    columns: Float[np.ndarray, " n"],
+    leaves: Int[np.ndarray, "l p"],
+) -> Float[np.ndarray, " m"] | None:
+    """Multipliers of a bound that is attained, with nothing of the lines that hold units.
+
+    Every unit is held in the phase that it has where the bound is attained, but for those that
+    are at their bend. What is left is the loop itself around that state: its multipliers are what
+    a derivative needs.
+
+    Args:
+        horizon: whose facts hold.
+        programs: over these.
+        form: one.
+        columns: where it is attained.
+        leaves: phases of the pairs of facts in each leaf, in one of which it is.
+
+    Returns:
+        None where the bound is another one.
+    """
+    facts, zero = horizon.facts, horizon.zero
+    values = (facts.columns @ columns + facts.rows[:, 0])[zero] / horizon.gaps[:, None]
+    vanishing = values <= BENT
+    both, side = vanishing.all(axis=1), vanishing.argmax(axis=1)
+    row, constant = form.columns, form.rows[:, 0]
+    attained, size = constant[0] + row[0] @ columns[: row.shape[1]], abs(row).sum()
+    for phases in leaves:
+        if np.any((phases >= 0) & ~both & (phases != side)):
+            continue
+        there = np.where(both, phases, side)
+        held = (zero[i, there[i]] for i in np.flatnonzero(there >= 0))
+        vertex = programs.largest(row, constant, held, reach=2.0)
+        if vertex is not None and abs(vertex.value - attained) <= BENT * size:
+            return vertex.multipliers
+    return None
 
 
 def _proved_empty(child: Node, parent: Node, floor: float, horizon: Horizon) -> Node:

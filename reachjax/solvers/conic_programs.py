@@ -48,8 +48,9 @@ class ConicPrograms(AbstractPrograms):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
+        reach: float = 1.0,
     ) -> Vertex | None:
-        """The largest value of a row, or of the least of several, with some facts at zero."""
+        """The largest value of a row, or of the least of several; None where there is no answer."""
         given = np.zeros((len(rows), self._width))
         given[:, : rows.shape[1]] = rows
         rows, n = given[:, self._columns], len(self._columns)
@@ -68,8 +69,8 @@ class ConicPrograms(AbstractPrograms):
             self._constants[held],
             constants / size,
             self._constants[others],
-            np.ones(len(units)),
-            np.ones(len(units)),
+            np.full(len(units), reach),
+            np.full(len(units), reach),
             np.eye(1, self._states + 1)[0],
         )
         if not all(np.isfinite(part).all() for part in (*parts, *ends)):

@@ -62,10 +62,15 @@ class AbstractPrograms(abc.ABC):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
+        reach: float = 1.0,
     ) -> Vertex | None:
-        """The largest value of a row, or of the least of several, with some facts at zero.
+        """The largest value of a row, or of the least of several; None where there is no answer.
 
-        None where there is no answer.
+        Args:
+            rows: over the columns.
+            constants: of the rows.
+            zero: facts that are held at zero.
+            reach: what bounds the columns of units.
         """
 
 
@@ -90,6 +95,7 @@ class LinearPrograms(AbstractPrograms):
         self._model.changeObjectiveSense(highspy.ObjSense.kMaximize)
         self._model.addVar(0.0, 0.0)  # the least of several rows, where that is maximised
         self._add_columns(states, 1.0 if bounded else highspy.kHighsInf)
+        self._states = states
         self._columns, self._width = np.arange(states), states
         self._held: set[int] = set()
         self._rows = np.zeros(0, dtype=int)  # numbers of the facts among the model's rows
@@ -114,8 +120,9 @@ class LinearPrograms(AbstractPrograms):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
+        reach: float = 1.0,
     ) -> Vertex | None:
-        """The largest value of a row, or of the least of several, with some facts at zero."""
+        """The largest value of a row, or of the least of several; None where there is no answer."""
         if not (np.isfinite(rows).all() and np.isfinite(constants).all()):
             return None
         self._hold({int(fact) for fact in zero})
@@ -134,7 +141,11 @@ class LinearPrograms(AbstractPrograms):
             for row, constant in zip(rows / size, constants / size, strict=True):
                 self._add_row(-constant, highspy.kHighsInf, np.concatenate([[-1.0], row]))
         self._model.changeColsCost(width, np.arange(width, dtype=np.int32), objective)
+        if reach != 1.0:
+            self._bound_units(reach)
         found = self._solved(rows, constants, size, extra)
+        if reach != 1.0:
+            self._bound_units(1.0)
         if extra:
             last = np.arange(self._count - extra, self._count, dtype=np.int32)
             self._model.deleteRows(extra, last)
@@ -189,6 +200,10 @@ class LinearPrograms(AbstractPrograms):
 
     def _bound(self, fact: int, upper: float) -> None:
         self._model.changeRowBounds(int(self._rows[fact]), -self._constant[fact], upper)
+
+    def _bound_units(self, reach: float) -> None:
+        for column in range(1 + self._states, 1 + len(self._columns)):
+            self._model.changeColBounds(column, -reach, reach)
 
     def _add_columns(self, count: int, bound: float) -> None:
         if count > 0:

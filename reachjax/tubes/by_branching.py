@@ -20,6 +20,7 @@ from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.replayed import Replay, replayed
+from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box, Polytope, Template
 from reachjax.tubes.ladder import Climbed, Ladder
 from reachjax.tubes.steps import Reached, Setting, Step
@@ -27,6 +28,10 @@ from reachjax.tubes.successors import facets_by_products
 
 PRODUCTS = 4e6
 """Columns cubed of all facets of a tube that get products, in all: some tens of seconds."""
+
+
+EXACT = 1e-7
+"""Where derivatives are asked for, a facet climbs until its gap is a smaller part of its range."""
 
 
 def sets_by_branching(
@@ -46,7 +51,10 @@ def sets_by_branching(
     """
     fixed = jax.device_get(jax.lax.stop_gradient((setting.loop, X0, box)))
     nodes = setting.relaxation.nodes or 0
-    ladder = Ladder(*fixed, setting.start, nodes, setting.gap, setting.deadline)
+    gap = setting.gap
+    if not is_concrete(setting.loop, X0, template):  # a derivative is that of what is attained
+        gap = min(gap, EXACT)
+    ladder = Ladder(*fixed, setting.start, nodes, gap, setting.deadline)
     X, steps, work = X0, [], PRODUCTS
     for k in range(1, horizon + 1):
         began = time.perf_counter()
@@ -54,7 +62,10 @@ def sets_by_branching(
         directions = template.at(k).directions
         rows = np.asarray(jax.lax.stop_gradient(directions))
         ladder.advance()
-        climbed = ladder.climbed(rows, _simulated(setting, k, rows), (horizon - k) * len(rows))
+        simulated = Simulated.nothing(fixed[2].center, len(rows))
+        if setting.simulations is not None:
+            simulated = setting.simulations.values(k, rows)
+        climbed = ladder.climbed(rows, simulated, (horizon - k) * len(rows))
         if not np.isfinite(climbed.bounds).all():
             raise ValueError(
                 f"the loop's states at t = {setting.start + k} overflow or are not numbers: check "
@@ -77,14 +88,6 @@ def sets_by_branching(
         ladder.horizon.narrow(*_ends(rows, np.asarray(jax.lax.stop_gradient(offsets))))
 
 
-def _simulated(setting: Setting, k: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the largest values of directions that are simulated."""
-    if setting.simulations is None:
-        none = np.full(len(rows), np.inf)
-        return none, -none
-    return setting.simulations.values(k, rows)
-
-
 def _offsets(
     setting: Setting,
     X0: AbstractSet,
@@ -99,7 +102,7 @@ def _offsets(
     proved = jnp.asarray(climbed.bounds)
     if is_concrete(setting.loop, X0, directions):
         return proved
-    held = Replay.of(ladder.horizon, climbed.columns, climbed.multipliers, horizon)
+    held = Replay.of(ladder.horizon, *ladder.settled(climbed), horizon)
     moving = replayed(setting.loop, X0, box, directions, held, k, setting.start)
     return proved + (moving - jax.lax.stop_gradient(moving))
 

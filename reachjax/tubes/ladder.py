@@ -16,8 +16,9 @@ from reachjax.loops.batches import trajectories
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon
 from reachjax.proofs.branches import Branches, HorizonFacts, Rung, bounds_of, leaf_bounds
+from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box
-from reachjax.solvers.branching import Found, affine_leaf, branched
+from reachjax.solvers.branching import Found, affine_leaf, branched, settled
 from reachjax.solvers.conic_programs import ConicPrograms
 from reachjax.solvers.linear_programs import LinearPrograms
 
@@ -42,6 +43,7 @@ class Climbed(NamedTuple):
         gaps: `(f,)`, what is between them, as parts of the facets' ranges.
         columns: `(f, n)`, where the leaf that decides attains its bound.
         multipliers: `(f, m)`, of that leaf.
+        worst: `(f, n_x)`, the initial states of what is attained.
         rungs: `(f,)`, values of `Rung`.
         nodes: `(f,)`, how many linear programs were solved.
         states: `(c, n_x)`, initial states at which they ended.
@@ -54,6 +56,7 @@ class Climbed(NamedTuple):
     gaps: Float[np.ndarray, " f"]
     columns: Float[np.ndarray, "f n"]
     multipliers: Float[np.ndarray, "f m"]
+    worst: Float[np.ndarray, "f n_x"]
     rungs: Int[np.ndarray, " f"]
     nodes: Int[np.ndarray, " f"]
     states: Float[np.ndarray, "c n_x"]
@@ -129,14 +132,14 @@ class Ladder:
     def climbed(
         self,
         directions: Float[np.ndarray, "f n_x"],
-        values: tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]],
+        simulated: Simulated,
         left: int,
     ) -> Climbed:
         """Bounds of directions of the state after the steps so far.
 
         Args:
             directions: one row a facet.
-            values: the least and the largest ones of each that are simulated; infinite if none are.
+            simulated: what is known of their values.
             left: how many facets are to come in later steps.
         """
         horizon, start = self.horizon, self.horizon.start
@@ -144,10 +147,9 @@ class Ladder:
         self._programs.grow(facts, horizon.varying)
         forms = (directions @ horizon.state).widened(facts.columns.shape[1])
         lower, upper = forms.ends(start)
-        least, most = values
         floor = FLAT * (upper - lower) / 2
-        ranges = np.fmax((most - least) / 2, floor)
-        best, states = most.copy(), []
+        ranges = np.fmax((simulated.most - simulated.least) / 2, floor)
+        best, worst, states = simulated.most.copy(), simulated.states.copy(), []
         found: list[Found] = []
         for facet in range(len(directions)):
 
@@ -155,7 +157,9 @@ class Ladder:
                 begun = self._initial(np.array(columns))
                 states.extend(begun)
                 after = trajectories(self._loop, begun, len(horizon.steps), self._t)[:, -1]
-                best[facet] = np.fmax(best[facet], np.fmax.reduce(after @ directions[facet]))
+                values = after @ directions[facet]
+                if np.fmax.reduce(values) > best[facet]:
+                    best[facet], worst[facet] = np.nanmax(values), begun[np.nanargmax(values)]
                 return float(best[facet])
 
             def enough(bound: float, attained: float, facet: int = facet) -> bool:
@@ -168,7 +172,21 @@ class Ladder:
                 leaves = branched(horizon, self._programs, one, attained, enough, budget)
                 self._spend(leaves.nodes if leaves else 1)
             found.append(leaves or affine_leaf(one, horizon))
-        return self._judged(forms, upper, best, ranges, found, states)
+        return self._judged(forms, upper, (best, worst), ranges, found, states)
+
+    def settled(
+        self, climbed: Climbed
+    ) -> tuple[Float[np.ndarray, "f n"], Float[np.ndarray, "f m"]]:
+        """Columns and multipliers that derivatives of the bounds hold."""
+        found = climbed.multipliers.copy()
+        columns, leaves = climbed.columns.copy(), climbed.branches
+        for facet in range(len(found)):
+            form, mine = climbed.about.rows[facet : facet + 1], leaves.owner == facet
+            at = self.horizon.columns_at(climbed.worst[facet])
+            given = settled(self.horizon, self._programs, form, at, leaves.phases[mine])
+            if given is not None:
+                found[facet], columns[facet] = given, at
+        return columns, found
 
     def _budget(self, facets: int) -> int:
         """How many linear programs one of so many facets may take."""
@@ -185,13 +203,13 @@ class Ladder:
         self,
         forms: AffineForms,
         upper: np.ndarray,
-        best: np.ndarray,
+        attained: tuple[np.ndarray, np.ndarray],
         ranges: np.ndarray,
         found: list[Found],
         states: list[np.ndarray],
     ) -> Climbed:
         """What the leaves prove."""
-        horizon, facets = self.horizon, len(found)
+        (best, worst), horizon, facets = attained, self.horizon, len(found)
         owner = np.repeat(np.arange(facets), [len(each.phases) for each in found])
         leaves = Branches(
             owner=owner,
@@ -216,6 +234,7 @@ class Ladder:
             gaps=(bounds - best) / np.where(ranges > 0, ranges, 1.0),
             columns=np.concatenate([leaf.columns for leaf in found])[deciding],
             multipliers=leaves.multipliers[deciding],
+            worst=worst,
             rungs=rungs,
             nodes=nodes,
             states=np.array(states).reshape(-1, len(horizon.start.center)),

@@ -67,6 +67,7 @@ from reachjax.training import (
     unsolved,
     volume_penalty,
 )
+from reachjax.tubes.decisions import decide
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
 from reachjax.tubes.plotting import plot_set, plot_tube
 from reachjax.tubes.reach import ReachTube, reach, reach_step
@@ -128,6 +129,7 @@ __all__ = [
     "Verdict",
     "VerdictStatus",
     "change_of_basis",
+    "decide",
     "failures",
     "log_volume",
     "log_widths",

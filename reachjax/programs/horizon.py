@@ -52,6 +52,7 @@ class Horizon:
             of its facts it is; -1 of the initial set.
 
     Example:
+        >>> import jax
         >>> from reachjax import MLP, AffinePlant
         >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
         >>> loop, X0 = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net), Box([-1.0], [2.0])

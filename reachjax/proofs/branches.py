@@ -70,6 +70,8 @@ class HorizonFacts(Replaceable):
 class BranchCertificate(AbstractProof):
     """Proof of the offsets of one step, `directions x[t] <= bounds`, each by the cheapest way.
 
+    Or of one bound of the least of several rows, such as how deep states are in a set.
+
     A facet is proved by its affine form, by multipliers of the facts of the whole horizon, by these
     in each of some branches, or by products of facts: whatever is best. Ranges of units are those
     that the forms were made with; where sets of earlier steps bounded these, the proof is one given
@@ -134,8 +136,10 @@ class BranchCertificate(AbstractProof):
                     "them finite"
                 )
             branches = branches.replace(multipliers=given)
-        found = bounds_of(about, branches, len(self.bounds))
-        found = np.fmin(found, about.rows.ends(about.start)[1])
+        count, upper = len(self.bounds), about.rows.ends(about.start)[1]
+        # any of several rows bounds the least of them
+        upper = upper if len(upper) == count else upper.min(keepdims=True)
+        found = np.fmin(bounds_of(about, branches, count), upper)
         if self.products is not None:
             which = np.asarray(self.by_products)
             found[which] = np.fmin(found[which], self.products.recheck())

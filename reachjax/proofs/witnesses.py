@@ -106,6 +106,11 @@ class Simulations:
         self._states, self._middle = states, states.mean(axis=0)
         self._trajectories = self.simulated(states, horizon)
 
+    @property
+    def states(self) -> Float[np.ndarray, "c n_x"]:
+        """The initial states."""
+        return self._states
+
     def simulated(
         self, states: Float[np.ndarray, "c n_x"], steps: int
     ) -> Float[np.ndarray, "c steps+1 n_x"]:

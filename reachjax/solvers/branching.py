@@ -61,22 +61,25 @@ class Found(NamedTuple):
     nodes: int
 
 
-def affine_leaf(form: AffineForms, horizon: Horizon) -> Found:
-    """The leaf that takes nothing: a form is bounded by itself.
+def affine_leaf(forms: AffineForms, horizon: Horizon) -> Found:
+    """The leaf that takes nothing: the best bounded of some forms is bounded by itself.
 
     Args:
-        form: one.
+        forms: `r` of them.
         horizon: whose facts it does without.
     """
-    row, start = form.columns[0], horizon.start
+    start, facts = horizon.start, horizon.facts
+    best = forms.ends(start)[1].argmin()
+    row = forms.widened(facts.columns.shape[1]).columns[best]
     columns = np.sign(row)
     if start.round:
         first = row[: start.spread.shape[1]]
         length = np.linalg.norm(first)
         columns[: len(first)] = first / length if length > 0 else 0.0
-    none = np.zeros((1, len(horizon.facts.rows)))
+    none = np.zeros((1, len(facts.rows)))
     phases = np.full((1, len(horizon.zero)), -1, dtype=np.int8)
-    return Found(phases, none, np.ones((1, 1)), columns[None], nodes=0)
+    weights = np.eye(1, len(forms.rows), best)
+    return Found(phases, none, weights, columns[None], nodes=0)
 
 
 def branched(

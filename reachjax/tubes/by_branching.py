@@ -54,7 +54,7 @@ def sets_by_branching(
     gap = setting.gap
     if not is_concrete(setting.loop, X0, template):  # a derivative is that of what is attained
         gap = min(gap, EXACT)
-    ladder = Ladder(*fixed, setting.start, nodes, gap, setting.deadline)
+    ladder = Ladder(*fixed, setting.start, nodes, setting.deadline)
     X, steps, work = X0, [], PRODUCTS
     for k in range(1, horizon + 1):
         began = time.perf_counter()
@@ -65,15 +65,17 @@ def sets_by_branching(
         simulated = Simulated.nothing(fixed[2].center, len(rows))
         if setting.simulations is not None:
             simulated = setting.simulations.values(k, rows)
-        climbed = ladder.climbed(rows, simulated, (horizon - k) * len(rows))
+        target, ranges = ladder.facets(rows, simulated, gap)
+        climbed = ladder.climbed(target, (horizon - k) * len(rows))
         if not np.isfinite(climbed.bounds).all():
             raise ValueError(
                 f"the loop's states at t = {setting.start + k} overflow or are not numbers: check "
                 "the weights of loop.controller and the entries of loop.plant"
             )
         offsets = _offsets(setting, X0, box, directions, climbed, ladder, horizon, k)
-        opened = np.flatnonzero(climbed.gaps > setting.gap)
-        opened = opened[np.argsort(-climbed.gaps[opened], kind="stable")]
+        gaps = climbed.bounds - climbed.attained
+        opened = np.flatnonzero(gaps > setting.gap * ranges)
+        opened = opened[np.argsort(-gaps[opened], kind="stable")]
         cost = float(climbed.columns.shape[1]) ** 3
         opened = opened[: int(work // cost)] if not setting.late else opened[:0]
         work -= len(opened) * cost

@@ -6,15 +6,17 @@ Everything here is numpy on the host. It proposes leaves; what they prove, `proo
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.linalg import block_diag
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.batches import trajectories
 from reachjax.programs.affine import AffineForms
-from reachjax.programs.horizon import Horizon
+from reachjax.programs.horizon import Horizon, joined
 from reachjax.proofs.branches import Branches, HorizonFacts, Rung, bounds_of, leaf_bounds
 from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box
@@ -32,33 +34,47 @@ WORK = 3e6
 """Rows and columns of all linear programs of a tube, in all: some tens of seconds."""
 
 
+class Target(NamedTuple):
+    """What bounds are sought of one step, each of a form or of the least of several.
+
+    Attributes:
+        forms: of each bound.
+        values: `(c, n_x) -> (c, g)`, what states have of it.
+        enough: whether a bound will do, given its number, itself, and what is attained.
+        simulated: what is known of their values.
+    """
+
+    forms: Sequence[AffineForms]
+    values: Callable[[np.ndarray], np.ndarray]
+    enough: Callable[[int, float, float], bool]
+    simulated: Simulated
+
+
 class Climbed(NamedTuple):
-    """What the first three rungs prove of some facets of one step.
+    """What the first three rungs prove of some bounds of one step.
 
     Attributes:
         about: rows over the columns of the horizon.
         branches: the leaves.
-        bounds: `(f,)`, what they prove.
-        attained: `(f,)`, the largest values of trajectories that were met on the way.
-        gaps: `(f,)`, what is between them, as parts of the facets' ranges.
-        columns: `(f, n)`, where the leaf that decides attains its bound.
-        multipliers: `(f, m)`, of that leaf.
-        worst: `(f, n_x)`, the initial states of what is attained.
-        rungs: `(f,)`, values of `Rung`.
-        nodes: `(f,)`, how many linear programs were solved.
+        bounds: `(g,)`, what they prove.
+        attained: `(g,)`, the largest values that are known to be attained.
+        worst: `(g, n_x)`, the initial states of these.
+        columns: `(g, n)`, where the leaf that decides attains its bound.
+        multipliers: `(g, m)`, of that leaf.
+        rungs: `(g,)`, values of `Rung`.
+        nodes: `(g,)`, how many linear programs were solved.
         states: `(c, n_x)`, initial states at which they ended.
     """
 
     about: HorizonFacts
     branches: Branches
-    bounds: Float[np.ndarray, " f"]
-    attained: Float[np.ndarray, " f"]
-    gaps: Float[np.ndarray, " f"]
-    columns: Float[np.ndarray, "f n"]
-    multipliers: Float[np.ndarray, "f m"]
-    worst: Float[np.ndarray, "f n_x"]
-    rungs: Int[np.ndarray, " f"]
-    nodes: Int[np.ndarray, " f"]
+    bounds: Float[np.ndarray, " g"]
+    attained: Float[np.ndarray, " g"]
+    worst: Float[np.ndarray, "g n_x"]
+    columns: Float[np.ndarray, "g n"]
+    multipliers: Float[np.ndarray, "g m"]
+    rungs: Int[np.ndarray, " g"]
+    nodes: Int[np.ndarray, " g"]
     states: Float[np.ndarray, "c n_x"]
 
 
@@ -70,8 +86,7 @@ class Ladder:
         X0: the initial set, of numpy arrays.
         box: around it.
         t: the time of the initial set.
-        nodes: how many linear programs a facet may take.
-        gap: what may stay open of a facet, as a part of its range.
+        nodes: how many linear programs a bound may take.
         deadline: after which nothing is solved, as `time.monotonic` says it.
 
     Attributes:
@@ -79,17 +94,9 @@ class Ladder:
     """
 
     def __init__(
-        self,
-        loop: ClosedLoop,
-        X0: AbstractSet,
-        box: Box,
-        t: int,
-        nodes: int,
-        gap: float,
-        deadline: float,
+        self, loop: ClosedLoop, X0: AbstractSet, box: Box, t: int, nodes: int, deadline: float
     ):
-        self._loop, self._t = loop, t
-        self._nodes, self._gap, self._deadline = nodes, gap, deadline
+        self._loop, self._t, self._nodes, self._deadline = loop, t, nodes, deadline
         self._work = WORK
         self.horizon = Horizon(loop, X0, box, t)
         start = self.horizon.start
@@ -103,9 +110,13 @@ class Ladder:
         """Whether the time is over."""
         return time.monotonic() >= self._deadline
 
-    def advance(self) -> None:
-        """One step more, the ranges of units being bounded by linear programs."""
-        self.horizon.advance(self._ranges if self._nodes else None)
+    def advance(self, tighten: bool = True) -> None:
+        """One step more.
+
+        Args:
+            tighten: whether the ranges of units that switch are bounded by linear programs.
+        """
+        self.horizon.advance(self._ranges if tighten and self._nodes else None)
 
     def _ranges(self, forms: AffineForms) -> Float[np.ndarray, "k m"]:
         """Multipliers that bound the inputs of units from both sides."""
@@ -121,63 +132,125 @@ class Ladder:
                 multipliers[:] = np.maximum(vertex.multipliers, 0.0)
         return found
 
-    def _spend(self, programs: int) -> None:
-        self._work -= programs * self._size
-
     @property
     def _size(self) -> int:
         """Rows and columns of a linear program."""
         return len(self.horizon.facts.rows) + len(self.horizon.varying)
 
-    def climbed(
-        self,
-        directions: Float[np.ndarray, "f n_x"],
-        simulated: Simulated,
-        left: int,
-    ) -> Climbed:
-        """Bounds of directions of the state after the steps so far.
+    def _spend(self, programs: int) -> None:
+        self._work -= programs * self._size
+
+    def _budget(self, bounds: int) -> int:
+        """How many linear programs one of so many bounds may take."""
+        if self._work <= 0:
+            return 0
+        affordable = int(2 * self._work / (bounds * self._size))
+        return min(self._nodes, max(LEAST_NODES, affordable))
+
+    def facets(
+        self, directions: Float[np.ndarray, "f n_x"], simulated: Simulated, gap: float
+    ) -> tuple[Target, Float[np.ndarray, " f"]]:
+        """Bounds of directions that are attained but for a part of their ranges, and these.
 
         Args:
             directions: one row a facet.
             simulated: what is known of their values.
-            left: how many facets are to come in later steps.
+            gap: that part.
         """
-        horizon, start = self.horizon, self.horizon.start
-        facts = horizon.facts
-        self._programs.grow(facts, horizon.varying)
-        forms = (directions @ horizon.state).widened(facts.columns.shape[1])
-        lower, upper = forms.ends(start)
+        forms = directions @ self.horizon.state
+        lower, upper = forms.ends(self.horizon.start)
         floor = FLAT * (upper - lower) / 2
         ranges = np.fmax((simulated.most - simulated.least) / 2, floor)
-        best, worst, states = simulated.most.copy(), simulated.states.copy(), []
-        found: list[Found] = []
-        for facet in range(len(directions)):
 
-            def attained(columns: list[np.ndarray], facet: int = facet) -> float:
+        def enough(facet: int, bound: float, attained: float) -> bool:
+            return bound - attained <= gap * ranges[facet]
+
+        each = [forms[i : i + 1] for i in range(len(directions))]
+        return Target(each, lambda states: states @ directions.T, enough, simulated), ranges
+
+    def climbed(self, target: Target, left: int = 0) -> Climbed:
+        """Bounds of the state after the steps so far.
+
+        Args:
+            target: what is sought.
+            left: how many bounds are to be sought later.
+        """
+        horizon, facts = self.horizon, self.horizon.facts
+        self._programs.grow(facts, horizon.varying)
+        best, worst = target.simulated.most.copy(), target.simulated.states.copy()
+        states: list[np.ndarray] = []
+        found: list[Found] = []
+        for number, forms in enumerate(target.forms):
+
+            def attained(columns: list[np.ndarray], number: int = number) -> float:
                 begun = self._initial(np.array(columns))
                 states.extend(begun)
                 after = trajectories(self._loop, begun, len(horizon.steps), self._t)[:, -1]
-                values = after @ directions[facet]
-                if np.fmax.reduce(values) > best[facet]:
-                    best[facet], worst[facet] = np.nanmax(values), begun[np.nanargmax(values)]
-                return float(best[facet])
+                values = np.nan_to_num(target.values(after)[:, number], nan=-np.inf)
+                if values.max() > best[number]:
+                    best[number], worst[number] = values.max(), begun[values.argmax()]
+                return float(best[number])
 
-            def enough(bound: float, attained: float, facet: int = facet) -> bool:
-                return self.late or bound - attained <= self._gap * ranges[facet]
+            def enough(bound: float, attained: float, number: int = number) -> bool:
+                return self.late or target.enough(number, bound, attained)
 
-            one = forms[facet : facet + 1]
-            budget = self._budget(left + len(directions) - facet)
+            upper = forms.ends(horizon.start)[1].min()
+            budget = self._budget(left + len(target.forms) - number)
             leaves = None
-            if budget and np.isfinite(upper[facet]) and not enough(upper[facet], best[facet]):
-                leaves = branched(horizon, self._programs, one, attained, enough, budget)
+            if budget and np.isfinite(upper) and not enough(upper, best[number]):
+                programs = self._programs
+                leaves = branched(horizon, programs, forms, attained, enough, budget)
                 self._spend(leaves.nodes if leaves else 1)
-            found.append(leaves or affine_leaf(one, horizon))
-        return self._judged(forms, upper, (best, worst), ranges, found, states)
+            found.append(leaves or affine_leaf(forms, horizon))
+        return self._judged(target, best, worst, found, states)
+
+    def _initial(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n_x"]:
+        start = self.horizon.start
+        return start.center + columns[:, : start.spread.shape[1]] @ start.spread.T
+
+    def _judged(
+        self,
+        target: Target,
+        best: np.ndarray,
+        worst: np.ndarray,
+        found: list[Found],
+        states: list[np.ndarray],
+    ) -> Climbed:
+        """What the leaves prove."""
+        horizon, count = self.horizon, len(found)
+        width = horizon.facts.columns.shape[1]
+        owner = np.repeat(np.arange(count), [len(each.phases) for each in found])
+        leaves = Branches(
+            owner=owner,
+            phases=np.concatenate([each.phases for each in found]),
+            multipliers=np.concatenate([each.multipliers for each in found]),
+            weights=block_diag(*(each.weights for each in found)),
+        )
+        rows = joined([forms.widened(width) for forms in target.forms])
+        about = HorizonFacts(horizon.start, horizon.facts, horizon.zero, rows)
+        each = leaf_bounds(about, leaves)
+        uppers = [forms.ends(horizon.start)[1].min() for forms in target.forms]
+        mine = (np.flatnonzero(owner == number) for number in range(count))
+        deciding = np.array([leaf[each[leaf].argmax()] for leaf in mine])
+        nodes = np.array([leaf.nodes for leaf in found])
+        rungs = np.where(nodes > 1, Rung.PHASE_SPLITS, Rung.LINEAR_PROGRAM)
+        return Climbed(
+            about=about,
+            branches=leaves,
+            bounds=np.fmin(bounds_of(about, leaves, count), uppers),
+            attained=best,
+            worst=worst,
+            columns=np.concatenate([leaf.columns for leaf in found])[deciding],
+            multipliers=leaves.multipliers[deciding],
+            rungs=np.where(nodes == 0, Rung.AFFINE_FORM, rungs),
+            nodes=nodes,
+            states=np.array(states).reshape(-1, len(horizon.start.center)),
+        )
 
     def settled(
         self, climbed: Climbed
     ) -> tuple[Float[np.ndarray, "f n"], Float[np.ndarray, "f m"]]:
-        """Columns and multipliers that derivatives of the bounds hold."""
+        """Columns and multipliers that derivatives of facets' bounds hold."""
         found = climbed.multipliers.copy()
         columns, leaves = climbed.columns.copy(), climbed.branches
         for facet in range(len(found)):
@@ -187,55 +260,3 @@ class Ladder:
             if given is not None:
                 found[facet], columns[facet] = given, at
         return columns, found
-
-    def _budget(self, facets: int) -> int:
-        """How many linear programs one of so many facets may take."""
-        if self._work <= 0:
-            return 0
-        affordable = int(2 * self._work / (facets * sum(self.horizon.facts.rows.shape)))
-        return min(self._nodes, max(LEAST_NODES, affordable))
-
-    def _initial(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n_x"]:
-        start = self.horizon.start
-        return start.center + columns[:, : start.spread.shape[1]] @ start.spread.T
-
-    def _judged(
-        self,
-        forms: AffineForms,
-        upper: np.ndarray,
-        attained: tuple[np.ndarray, np.ndarray],
-        ranges: np.ndarray,
-        found: list[Found],
-        states: list[np.ndarray],
-    ) -> Climbed:
-        """What the leaves prove."""
-        (best, worst), horizon, facets = attained, self.horizon, len(found)
-        owner = np.repeat(np.arange(facets), [len(each.phases) for each in found])
-        leaves = Branches(
-            owner=owner,
-            phases=np.concatenate([each.phases for each in found]),
-            multipliers=np.concatenate([each.multipliers for each in found]),
-            weights=np.eye(facets)[owner],
-        )
-        about = HorizonFacts(horizon.start, horizon.facts, horizon.zero, forms)
-        each = leaf_bounds(about, leaves)
-        bounds = np.fmin(bounds_of(about, leaves, facets), upper)
-        deciding = np.array(
-            [np.flatnonzero(owner == k)[each[owner == k].argmax()] for k in range(facets)]
-        )
-        nodes = np.array([leaf.nodes for leaf in found])
-        rungs = np.where(nodes > 1, Rung.PHASE_SPLITS, Rung.LINEAR_PROGRAM)
-        rungs = np.where(nodes == 0, Rung.AFFINE_FORM, rungs)
-        return Climbed(
-            about=about,
-            branches=leaves,
-            bounds=bounds,
-            attained=best,
-            gaps=(bounds - best) / np.where(ranges > 0, ranges, 1.0),
-            columns=np.concatenate([leaf.columns for leaf in found])[deciding],
-            multipliers=leaves.multipliers[deciding],
-            worst=worst,
-            rungs=rungs,
-            nodes=nodes,
-            states=np.array(states).reshape(-1, len(horizon.start.center)),
-        )

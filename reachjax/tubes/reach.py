@@ -232,13 +232,14 @@ def reach(
         True
     """
     _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
-    deadline = _deadline(gap, time_limit)
+    real_number("gap", gap, 0.0)
+    deadline = deadline_of(time_limit)
     loop, X0, template = owned((loop, X0, template))
     box = boxed(X0, "X0")
     fixed = jax.lax.stop_gradient((loop, X0))
     simulations = None
     if is_concrete(fixed):
-        simulations = _simulations(*fixed, horizon, start, samples, seed)
+        simulations = simulations_from(*fixed, horizon, start, samples, seed)
     setting = Setting(
         loop=loop,
         start=start,
@@ -269,7 +270,7 @@ def reach(
     return ReachTube(*proved, start, seal_of(*proved, start=start))
 
 
-def _simulations(
+def simulations_from(
     loop: ClosedLoop, X0: AbstractSet, horizon: int, start: int, samples: int, seed: int
 ) -> Simulations | None:
     """Trajectories from the initial set; None if it is too thin for states to be drawn from it.
@@ -304,14 +305,13 @@ def _with_witnesses(steps: list[Reached], simulations: Simulations) -> list[Abst
     ]
 
 
-def _deadline(gap: float, time_limit: float | None) -> float:
+def deadline_of(time_limit: float | None) -> float:
     """When to stop, as `time.monotonic` says it.
 
     Raises:
-        TypeError: an argument is no number.
-        ValueError: an argument is negative.
+        TypeError: the limit is no number.
+        ValueError: it is negative.
     """
-    real_number("gap", gap, 0.0)
     if time_limit is None:
         return np.inf
     return time.monotonic() + real_number("time_limit", time_limit, 0.0)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import described, is_concrete, real_number, require_kind
-from reachjax.sets import PolyhedralSet
+from reachjax.sets import AbstractSet, PolyhedralSet
 from reachjax.tubes.reach import ReachTube
 
 AvoidSets = Sequence[PolyhedralSet] | Mapping[int, Sequence[PolyhedralSet]]
@@ -62,7 +62,10 @@ class Requirement:
 
     def compared(self, tube: ReachTube) -> Compared:
         """What every state surely does not exceed, and should not: of each facet, or of the set."""
-        reached = tube.sets[self.time]
+        return self.compared_with(tube.sets[self.time])
+
+    def compared_with(self, reached: AbstractSet) -> Compared:
+        """The same, of a set that holds every state at this time."""
         if self.inside:
             C, d, norms = self.region.facets_in_units(inner=True)
             return Compared(reached.support(C), d, norms)

@@ -14,18 +14,14 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.numerics.checks import is_concrete, whole_number
-from reachjax.numerics.rounding import TINY, gamma
-from reachjax.programs.bounds import successor_box
+from reachjax.numerics.rounding import TINY
 from reachjax.proofs.proposal import SolverStatus
-from reachjax.sets import AbstractSet, Box, PolyhedralSet
-from reachjax.sets.balance import balanced
+from reachjax.sets import AbstractSet, PolyhedralSet
 from reachjax.tubes.partitions import BESIDE, PartitionedTube
 from reachjax.tubes.reach import ReachTube
+from reachjax.tubes.refutations import counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Requirement, of_tube
-from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus, of_cells
-
-SUSPECTS = 5
-"""So many of the worst trajectories of each requirement are examined with their rounding."""
+from reachjax.tubes.verdicts import Verdict, VerdictStatus, of_cells
 
 
 def verify(
@@ -91,7 +87,7 @@ def _decided(
         trajectories = trajectories[np.asarray(X0.contains(trajectories[:, 0], BESIDE))]
     margins: dict[str, np.ndarray] = {}
     simulated: dict[str, np.ndarray] = {}
-    proved, suspects = True, []
+    proved, found = True, []
     for item in required:
         blank = np.full(tube.horizon + 1, np.nan)
         compared, rooms = item.compared(tube), item.simulated(trajectories)
@@ -101,14 +97,12 @@ def _decided(
         margins.setdefault(item.name, blank.copy())[item.time] = margin
         simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min(initial=np.inf)
         proved = proved and holds
-        worst = np.argsort(rooms)[:SUSPECTS]
-        suspects += [(rooms[k], item, trajectories[k]) for k in worst if rooms[k] <= 0]
-    for room, item, states in sorted(suspects, key=lambda suspect: suspect[0]):
-        if X0.surely_contains(states[0]) and _surely_broken(tube, item, states[0]):
-            if proved:
-                raise RuntimeError("a proved specification is broken: please report this defect")
-            example = _counterexample(tube, room, item, states)
-            return Verdict(VerdictStatus.REFUTED, margins, simulated, example, unsolved)
+        found += suspects(item, rooms, trajectories)
+    example = counterexample(tube.loop, X0, found, tube.start)
+    if example is not None:
+        if proved:
+            raise RuntimeError("a proved specification is broken: please report this defect")
+        return Verdict(VerdictStatus.REFUTED, margins, simulated, example, unsolved)
     status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
     return Verdict(status, margins, simulated, None, unsolved)
 
@@ -123,28 +117,3 @@ def _trajectories(tube: ReachTube, samples: int, seed: int) -> Float[np.ndarray,
         found.append(np.asarray(tube.simulate(samples, seed)))
     trajectories = np.concatenate(found)
     return trajectories[np.isfinite(trajectories).all(axis=(1, 2))]
-
-
-def _surely_broken(tube: ReachTube, item: Requirement, x0: np.ndarray) -> bool:
-    """Whether the exact trajectory from `x0` breaks a requirement, rounding accounted for."""
-    reached = Box(x0, x0)
-    for t in range(item.time):
-        reached = successor_box(tube.loop, reached, tube.start + t)
-    lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
-    C, d = balanced(*(np.asarray(part) for part in item.region.facets), inner=not item.inside)
-    ends = np.where(C > 0, lower, upper), np.where(C > 0, upper, lower)
-    with np.errstate(over="ignore", invalid="ignore"):
-        least, most = (np.sum(C * end, axis=1) for end in ends)
-        size = np.sum(abs(C) * np.maximum(abs(lower), abs(upper)), axis=1)
-        underflow = TINY * ((C != 0) @ ((lower != 0) | (upper != 0)))
-        error = gamma(len(lower)) * size + underflow
-        if item.inside:
-            return bool(np.any(least - error > d))
-        return bool(np.all(most + error <= d))
-
-
-def _counterexample(
-    tube: ReachTube, room: float, item: Requirement, states: np.ndarray
-) -> Counterexample:
-    inputs = [tube.loop.input(jnp.asarray(x), tube.start + t) for t, x in enumerate(states[:-1])]
-    return Counterexample(item.name, item.time, -float(room), states, np.stack(inputs))

@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
+
+from reachjax.proofs.certificates import AbstractProof
 
 
 class VerdictStatus(enum.Enum):
@@ -54,6 +57,8 @@ class Verdict:
         counterexample: the trajectory, when refuted.
         unsolved: how many of the tube's facets the solver did not solve to its tolerance: their
             bounds hold, but may be loose.
+        certificates: of a verdict without a tube, what each requirement that is proved rests on,
+            by its name and its time.
     """
 
     status: VerdictStatus
@@ -61,6 +66,7 @@ class Verdict:
     simulated: dict[str, Float[np.ndarray, " h+1"]]
     counterexample: Counterexample | None = None
     unsolved: int = 0
+    certificates: Mapping[tuple[str, int], AbstractProof] = dataclasses.field(default_factory=dict)
 
     def __bool__(self) -> bool:
         raise TypeError("a verdict has three values: compare verdict.status with VerdictStatus")

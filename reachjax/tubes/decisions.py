@@ -1,0 +1,273 @@
+"""Verdicts without a tube: only what a decision needs is bounded, and no further.
+
+The directions of the requirements themselves, at the times that they speak of. A trajectory that
+breaks one is looked for first: among samples, then where each linear program is largest. To be
+inside, the excess over each facet must be below zero; to be outside, the depth in the set must be,
+which is the least room to its facets. Each climbs the ladder of `BranchAndCut`, but for products,
+until it is decided.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from reachjax.loops import ClosedLoop
+from reachjax.numerics.checks import (
+    is_concrete,
+    owned,
+    require_double_precision,
+    require_kind,
+    same_size,
+    whole_number,
+)
+from reachjax.numerics.rounding import TINY
+from reachjax.programs.relaxations import BranchAndCut
+from reachjax.proofs.branches import BranchCertificate
+from reachjax.proofs.proposal import SolverStatus
+from reachjax.proofs.witnesses import Simulated, Simulations
+from reachjax.sets import AbstractSet, PolyhedralSet
+from reachjax.tubes.ladder import Climbed, Ladder, Target
+from reachjax.tubes.reach import EXAMPLES, deadline_of, simulations_from
+from reachjax.tubes.refutations import Suspect, counterexample, suspects
+from reachjax.tubes.requirements import AvoidSets, Requirement, requirements
+from reachjax.tubes.steps import boxed
+from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
+
+FEW = 50
+"""Linear programs that each bound may take at first, while ranges are those of affine forms."""
+
+BELOW = 1e-9
+"""How far below zero a linear program should be, as a part of its form's range, to prove that."""
+
+
+def decide(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    horizon: int,
+    goal: PolyhedralSet | None = None,
+    safe: PolyhedralSet | None = None,
+    avoid: AvoidSets | None = None,
+    *,
+    relaxation: BranchAndCut = BranchAndCut(),  # noqa: B008  (immutable)
+    start: int = 0,
+    samples: int = 1000,
+    seed: int = 0,
+    time_limit: float | None = None,
+) -> Verdict:
+    """Decide a reach-avoid specification without a tube.
+
+    Args:
+        loop: the closed loop.
+        X0: the set of initial states.
+        horizon: the number `N` of steps.
+        goal: where every state must be at the horizon.
+        safe: where every state must be at all times (its complement is avoided).
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
+            time to a sequence.
+        relaxation: how many linear programs a bound may take.
+        start: the time of `X0`, for time-varying loops.
+        samples: how many trajectories are simulated in search of a counterexample, besides those
+            from corners.
+        seed: of the samples.
+        time_limit: seconds, after which nothing is solved any more. None: until all is decided or
+            budgets are used up.
+
+    Returns:
+        The verdict, with a certificate of each requirement that is proved after the first time.
+
+    Raises:
+        RuntimeError: JAX's 64-bit floats are off.
+        TypeError: an argument is of another kind, or a set is of a kind without facets.
+        ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, `X0` is
+            empty or unbounded, or numbers are traced inside `jax.jit`.
+
+    Source: equations (reach_avoid) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant, Box
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> X0 = Box([1.0], [2.0])
+        >>> decide(loop, X0, 3, goal=Box([0.0], [0.5]), safe=Box([0.0], [2.0])).status.name
+        'PROVED'
+        >>> decide(loop, X0, 3, avoid=[Box([0.4], [0.43])]).status.name
+        'REFUTED'
+    """
+    for name, value, kind in (("loop", loop, ClosedLoop), ("X0", X0, AbstractSet)):
+        require_kind(name, value, kind, EXAMPLES[kind])
+    require_kind("relaxation", relaxation, BranchAndCut, "a BranchAndCut")
+    require_double_precision(loop=loop, X0=X0)
+    same_size(
+        "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)
+    )
+    loop.check_horizon(horizon, start)
+    whole_number("samples", samples, 1)
+    whole_number("seed", seed, 0)
+    deadline, fixed = deadline_of(time_limit), jax.lax.stop_gradient((loop, X0))
+    if not is_concrete(fixed):
+        raise ValueError(
+            "loop or X0 holds traced numbers, and a verdict is decided on known ones: call decide "
+            "outside of jax.jit"
+        )
+    required = requirements(loop.states, horizon, goal, avoid, safe)
+    loop, X0 = owned(fixed)
+    simulations = simulations_from(loop, X0, horizon, start, samples, seed)
+    decision = _Decision(loop, X0, horizon, start, required, simulations)
+    ladder = jax.device_get((loop, X0, boxed(X0, "X0"))), start
+    decision.at_first()
+    for nodes in dict.fromkeys((min(FEW, relaxation.nodes), relaxation.nodes)):
+        if decision.ended:
+            break
+        decision.climb(Ladder(*ladder[0], start, nodes, deadline), tighten=nodes > FEW)
+    return decision.verdict()
+
+
+class _Decision:
+    """What is known of each requirement so far.
+
+    Args:
+        loop: the closed loop.
+        X0: the initial set.
+        horizon: the number of steps.
+        start: the time of the initial set.
+        required: the requirements.
+        simulations: trajectories from the set; None if it is too thin for any.
+    """
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        X0: AbstractSet,
+        horizon: int,
+        start: int,
+        required: list[Requirement],
+        simulations: Simulations | None,
+    ):
+        self._loop, self._X0, self._start = loop, X0, start
+        self._horizon = horizon
+        self._open = {(item.name, item.time): item for item in required}
+        self._margins = {item.name: np.full(horizon + 1, np.nan) for item in required}
+        self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
+        self._certificates: dict[tuple[str, int], BranchCertificate] = {}
+        self._example: Counterexample | None = None
+        self._simulations = simulations
+        states = np.zeros((0, loop.states))
+        found = states if simulations is None else simulations.states
+        self._tried(list(self._open.values()), found)
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing is left to be decided."""
+        return self._example is not None or not self._open
+
+    def verdict(self) -> Verdict:
+        """All of it."""
+        status = VerdictStatus.UNKNOWN if self._open else VerdictStatus.PROVED
+        if self._example is not None:
+            status = VerdictStatus.REFUTED
+        certificates = self._certificates
+        return Verdict(
+            status, self._margins, self._simulated, self._example, certificates=certificates
+        )
+
+    def at_first(self) -> None:
+        """Decide what is required of the initial set itself."""
+        for key, item in list(self._open.items()):
+            if item.time == 0:
+                compared = item.compared_with(self._X0)
+                holds, margin = item.proved(compared), float(compared.margins.min())
+                self._note(key, holds, margin if holds else min(margin, -TINY))
+
+    def climb(self, ladder: Ladder, tighten: bool) -> None:
+        """Climb until all is decided, or nothing more can be.
+
+        Args:
+            ladder: at the initial set.
+            tighten: whether the ranges of units are bounded by linear programs.
+        """
+        last = max(time for _, time in self._open)
+        for k in range(1, last + 1):
+            ladder.advance(tighten)
+            for key, item in list(self._open.items()):
+                if item.time == k and not self.ended:
+                    self._decided(key, item, ladder)
+            if self.ended:
+                return
+
+    def _decided(self, key: tuple[str, int], item: Requirement, ladder: Ladder) -> None:
+        """Bound one requirement at the time that the ladder has come to."""
+        target, units = _target(item, ladder, self._loop.states)
+        climbed = ladder.climbed(target)
+        right = climbed.bounds <= 0 if item.inside else climbed.bounds < 0
+        margin = float(np.min(-climbed.bounds / units))
+        self._note(key, bool(np.all(right)), margin, climbed)
+        if not np.all(right):
+            self._tried([item], climbed.worst[climbed.attained > 0])
+
+    def _note(
+        self, key: tuple[str, int], holds: bool, margin: float, climbed: Climbed | None = None
+    ) -> None:
+        name, k = key
+        self._margins[name][k] = np.fmax(self._margins[name][k], margin)
+        if holds:
+            del self._open[key]
+            if climbed is not None:
+                self._certificates[key] = _certificate(climbed)
+
+    def _tried(self, items: list[Requirement], states: np.ndarray) -> None:
+        """Simulate initial states in search of a counterexample."""
+        if not len(states):
+            return
+        found: list[Suspect] = []
+        trajectories = np.asarray(self._loop.simulate(states, self._horizon, self._start))
+        trajectories = trajectories[np.isfinite(trajectories).all(axis=(1, 2))]
+        for item in items:
+            rooms = item.simulated(trajectories)
+            row = self._simulated[item.name]
+            row[item.time] = np.fmin(row[item.time], rooms.min(initial=np.inf))
+            found += suspects(item, rooms, trajectories)
+        self._example = counterexample(self._loop, self._X0, found, self._start)
+
+
+def _target(item: Requirement, ladder: Ladder, states: int) -> tuple[Target, np.ndarray]:
+    """What must be below zero: the excess over each facet, or the depth in the set."""
+    parts = item.region.facets_in_units(inner=item.inside)
+    C, d, norms = (np.asarray(part) for part in parts)
+    state, start = ladder.horizon.state, ladder.horizon.start
+    if item.inside:
+        excess = C @ state + (-d)
+        forms = [excess[i : i + 1] for i in range(len(d))]
+    else:
+        forms = [(1 / norms) * (d - C @ state)]
+
+    def values(after: np.ndarray) -> np.ndarray:
+        excess = after @ C.T - d
+        return excess if item.inside else (-excess / norms).min(axis=1, keepdims=True)
+
+    sizes = [np.subtract(*form.ends(start)[::-1]).max() for form in forms]
+
+    def enough(number: int, bound: float, attained: float) -> bool:
+        return bound <= -BELOW * sizes[number] or attained > 0
+
+    blank = Simulated.nothing(np.zeros(states), len(forms))
+    return Target(forms, values, enough, blank), norms if item.inside else np.ones(1)
+
+
+def _certificate(climbed: Climbed) -> BranchCertificate:
+    """The proof of a requirement."""
+    count = len(climbed.bounds)
+    return BranchCertificate(
+        codes=np.full(count, int(SolverStatus.SOLVED)),
+        bounds=jnp.asarray(climbed.bounds),
+        witnesses=climbed.attained,
+        witness_states=climbed.worst,
+        seconds=np.full(count, np.nan),
+        about=climbed.about,
+        branches=climbed.branches,
+        products=None,
+        by_products=np.zeros(0, dtype=int),
+        rungs=climbed.rungs,
+        nodes=climbed.nodes,
+    )

@@ -75,10 +75,10 @@ class PolyhedralSet(AbstractSet):
         """
         C, d = self.facets
         if is_concrete(C, d):
-            C, d = (jnp.asarray(part) for part in balanced(np.asarray(C), np.asarray(d), inner))
-        else:
-            by = exponents(C)
-            C, d = shifted(C, -by[:, None]), shifted(d, -by)
+            C, d = balanced(np.asarray(C), np.asarray(d), inner)
+            return jnp.asarray(C), jnp.asarray(d), jnp.asarray(np.linalg.norm(C, axis=1))
+        by = exponents(C)
+        C, d = shifted(C, -by[:, None]), shifted(d, -by)
         return C, d, lengths(C)
 
     def separation(self, other: PolyhedralSet) -> Float[Array, ""]:

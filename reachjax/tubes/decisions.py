@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.batches import trajectories
 from reachjax.numerics.checks import (
     is_concrete,
     owned,
@@ -115,12 +116,11 @@ def decide(
     loop, X0 = owned(fixed)
     simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     decision = _Decision(loop, X0, horizon, start, required, simulations)
-    ladder = jax.device_get((loop, X0, boxed(X0, "X0"))), start
     decision.at_first()
+    begin = *jax.device_get((loop, X0, boxed(X0, "X0"))), start
     for nodes in dict.fromkeys((min(FEW, relaxation.nodes), relaxation.nodes)):
-        if decision.ended:
-            break
-        decision.climb(Ladder(*ladder[0], start, nodes, deadline), tighten=nodes > FEW)
+        if not decision.ended:
+            decision.climb(Ladder(*begin, nodes, deadline), tighten=nodes > FEW)
     return decision.verdict()
 
 
@@ -146,7 +146,7 @@ class _Decision:
         simulations: Simulations | None,
     ):
         self._loop, self._X0, self._start = loop, X0, start
-        self._horizon = horizon
+        self._horizon, self._on_host = horizon, jax.device_get(loop)
         self._open = {(item.name, item.time): item for item in required}
         self._margins = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
@@ -221,13 +221,13 @@ class _Decision:
         if not len(states):
             return
         found: list[Suspect] = []
-        trajectories = np.asarray(self._loop.simulate(states, self._horizon, self._start))
-        trajectories = trajectories[np.isfinite(trajectories).all(axis=(1, 2))]
+        runs = trajectories(self._on_host, states, self._horizon, self._start)
+        runs = runs[np.isfinite(runs).all(axis=(1, 2))]
         for item in items:
-            rooms = item.simulated(trajectories)
+            rooms = item.simulated(runs)
             row = self._simulated[item.name]
             row[item.time] = np.fmin(row[item.time], rooms.min(initial=np.inf))
-            found += suspects(item, rooms, trajectories)
+            found += suspects(item, rooms, runs)
         self._example = counterexample(self._loop, self._X0, found, self._start)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from reachjax.loops import ClosedLoop
@@ -46,7 +46,8 @@ def counterexample(
     """The worst suspect that surely begins in the set and breaks its requirement; None if none."""
     for room, item, states in sorted(found, key=lambda suspect: suspect.room):
         if X0.surely_contains(states[0]) and surely_broken(loop, item, states[0], start):
-            inputs = [loop.input(jnp.asarray(x), start + t) for t, x in enumerate(states[:-1])]
+            on_host = jax.device_get(loop)
+            inputs = [on_host.input(x, start + t) for t, x in enumerate(states[:-1])]
             return Counterexample(item.name, item.time, -room, states, np.stack(inputs))
     return None
 

@@ -4,7 +4,7 @@ An unrolled loop of ReLUs is a mixed-integer linear program (Tjeng, Xiao, Tedrak
 Robustness of Neural Networks with Mixed Integer Programming, ICLR 2019). Written from the
 definition of the loop, weights, plant and sets, and with nothing of what certifies it, this says
 how tight a certificate is. It takes seconds for some tens of units that switch, and may take
-forever for hundreds. Tolerances of HiGHS are absolute: it is for sets and weights of order one.
+forever for hundreds.
 """
 
 import contextlib
@@ -32,23 +32,28 @@ class Maxima(NamedTuple):
         values: `(k, m)`, which are simulated; NaN where time ran out.
         states: `(k, m, n_x)`, the initial states that attain them.
         bounds: `(k, m)`, which no value exceeds, up to HiGHS's tolerances; NaN where time ran out.
-        sharp: `(k, m)`, whether no other state has a larger value by more than `SHARP` times the
-            range of the direction.
+        spreads: `(k, m)`, ranges that the directions are surely within; NaN where time ran out.
     """
 
     values: Float[ndarray, "k m"]
     states: Float[ndarray, "k m n_x"]
     bounds: Float[ndarray, "k m"]
-    sharp: Bool[ndarray, "k m"]
+    spreads: Float[ndarray, "k m"]
+
+    def within(self, part: float) -> Bool[ndarray, "k m"]:
+        """Whether no other state has a larger value by more than this part of the range."""
+        # a single point has no range, but rounding
+        allowed = part * np.maximum(self.spreads, SPARE * (1 + abs(self.values)))
+        return abs(self.bounds - self.values) <= allowed
 
     def require_sharp(self) -> None:
-        """Raise an error unless all are.
+        """Raise an error unless all are within `SHARP`.
 
         Raises:
             RuntimeError: HiGHS did not find a maximum.
         """
-        if not self.sharp.all():
-            values, bounds = self.values[~self.sharp], self.bounds[~self.sharp]
+        if np.any(apart := ~self.within(SHARP)):
+            values, bounds = self.values[apart], self.bounds[apart]
             raise RuntimeError(
                 f"HiGHS is not sharp: {values} are attained, but {bounds} not excluded"
             )
@@ -207,6 +212,4 @@ def _simulated(
         ends = loop.simulate(jnp.asarray(states[k, i]), max(found), start)
         steps = np.array(list(found))[k]
         values[k, i] = np.sum(rows[i] * np.asarray(ends)[np.arange(len(k)), steps], axis=1)
-    # a single point has no range, but rounding
-    allowed = SHARP * np.maximum(spreads, SPARE * (1 + abs(values)))
-    return Maxima(values, states, bounds, abs(bounds - values) <= allowed)
+    return Maxima(values, states, bounds, spreads)

@@ -5,9 +5,11 @@ A unit `z = max(y, 0)` whose input can have either sign is
     z >= 0,   z >= y,   z <= u d,   z - y <= -l (1 - d),   d in {0, 1},   l <= y <= u,
 
 and the others are affine: `y` and every state are rows over the initial state and the `z` and `d`
-of earlier units.
+of earlier units. Tolerances of HiGHS are absolute, so variables, constraints and objectives are
+scaled to ranges of order one.
 """
 
+import contextlib
 import time
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -21,10 +23,10 @@ from scipy.sparse import csc_array, vstack
 import reachjax as rj
 
 SPARE = 1e-6
-"""By which part of its size the range of a unit's input is enlarged: ten times what a linear
-program may be off by."""
+"""By which part the range of a unit's input is enlarged: ten times what a linear program may be
+off by."""
 
-OPTIMAL, OUT_OF_TIME, INFEASIBLE, UNBOUNDED = range(4)
+OPTIMAL, OUT_OF_TIME = 0, 1
 """What HiGHS says of a program, in scipy's numbers."""
 
 
@@ -84,20 +86,21 @@ class Program:
     """
 
     def __init__(self, X0: rj.PolyhedralSet, limits: Limits):
+        try:
+            box = X0.bounding_box()
+        except ValueError as error:
+            raise ValueError(f"X0 cannot be used: {error}") from None
         A, b = map(np.asarray, X0.facets)
         n = X0.dimension
-        self._limits, self._states, self._whole = limits, n, np.zeros(n, dtype=bool)
-        self._lower, self._upper = np.full(n, -np.inf), np.full(n, np.inf)
-        self._G, self._h = csc_array(A), b
-        if isinstance(X0, rj.Box):
-            self._lower, self._upper = np.array(X0.lower), np.array(X0.upper)
-        else:
-            ends = [self._relaxed(row) for row in self.state()]
-            self._lower, self._upper = np.array([_with_spare(*pair) for pair in ends]).T
+        center, radii = np.asarray(box.center), np.asarray(box.widths) / 2
+        self._limits, self._first = limits, np.hstack([center[:, None], np.diag(radii)])
+        self._whole, self._lower, self._upper = np.zeros(n, bool), -np.ones(n), np.ones(n)
+        within = np.zeros(0, int) if isinstance(X0, rj.Box) else np.arange(len(b))
+        self._G, self._h = csc_array((A * radii)[within]), (b - A @ center)[within]
 
     def state(self) -> Float[ndarray, "n_x size"]:
-        """Rows of the first variables."""
-        return np.eye(self._states, 1 + self._states, k=1)
+        """Rows of the initial state."""
+        return self._first
 
     def relu(self, inputs: Float[ndarray, "k size"]) -> Float[ndarray, "k grown"]:
         """Rows of the outputs of a layer of units, given those of its inputs."""
@@ -123,14 +126,13 @@ class Program:
         if (proved := found.get("mip_dual_bound", found.fun)) is not None:
             bound = min(most, row[0] - proved / scale)
         if found.x is None:
-            return Largest(np.full(self._states, np.nan), bound, spread)
+            return Largest(np.full(len(self._first), np.nan), bound, spread)
         held = np.where(self._whole, np.round(found.x), np.nan)
-        try:
+        with contextlib.suppress(RuntimeError, TimeoutError):  # rounding has left no state, or time
             again = self._solved(-scale * row[1:], np.zeros_like(self._whole), held)
             found = again if again.status == OPTIMAL else found
-        except (ValueError, TimeoutError):  # rounding has left no state, or no time is left
-            pass
-        return Largest(found.x[: self._states], bound, spread)
+        center, spans = self._first[:, 0], self._first[:, 1:]
+        return Largest(center + spans @ found.x[: len(center)], bound, spread)
 
     def padded(self, rows: Float[ndarray, "k size"]) -> Float[ndarray, "k grown"]:
         """Rows over all variables that there are by now."""
@@ -144,31 +146,42 @@ class Program:
         constant = np.eye(1, size).repeat(k, axis=0)
         y, one = (np.hstack([rows, none, none]) for rows in (y, constant))
         z, d = (np.eye(k, size + 2 * k, k=first) for first in (size, size + k))
+        z *= (size_of := (upper - lower)[:, None])
         new = np.vstack([y - z, z - upper[:, None] * d, z - y + lower[:, None] * (one - d)])
+        new /= np.vstack([size_of] * 3)
         self._G.resize((len(self._h), len(self._whole) + 2 * k))
         self._G = vstack([self._G, csc_array(new[:, 1:])], format="csc")
         self._h = np.append(self._h, -new[:, 0])
         self._lower = np.append(self._lower, np.zeros(2 * k))
-        self._upper = np.concatenate([self._upper, upper, np.ones(k)])
+        self._upper = np.concatenate([self._upper, upper / (upper - lower), np.ones(k)])
         self._whole = np.append(self._whole, np.repeat([False, True], k))
         return z
 
     def _range(self, y: Float[ndarray, " size"]) -> tuple[float, float]:
         """Bounds of a row: by intervals of the variables, and by programs if these leave the sign
-        open.
+        open; somewhat enlarged.
         """
-        ends = y[1:, None] * np.stack([self._lower, self._upper], axis=1)
-        lower, upper = y[0] + ends.min(axis=1).sum(), y[0] + ends.max(axis=1).sum()
+        lower, upper = self._interval(y)
+        spare = SPARE * (upper - lower)
         if lower < 0 < upper:
             lower, upper = self._relaxed(y)
-        return _with_spare(lower, upper)
+        return lower - spare, upper + spare
+
+    def _interval(self, row: Float[ndarray, " size"]) -> tuple[float, float]:
+        """Bounds of a row by intervals of the variables."""
+        ends = row[1:, None] * np.stack([self._lower, self._upper], axis=1)
+        return row[0] + ends.min(axis=1).sum(), row[0] + ends.max(axis=1).sum()
 
     def _relaxed(self, row: Float[ndarray, " size"]) -> tuple[float, float]:
         """The smallest and the largest value of a row where no variable need be whole."""
-        least, most = (self._solved(sign * row[1:], np.zeros_like(self._whole)) for sign in (1, -1))
+        lower, upper = self._interval(row)
+        scale = (upper - lower) or 1.0
+        least, most = (
+            self._solved(sign * row[1:] / scale, np.zeros_like(self._whole)) for sign in (1, -1)
+        )
         if not least.status == most.status == OPTIMAL:
             raise TimeoutError(f"a linear program took {self._limits.program} seconds")
-        return row[0] + least.fun, row[0] - most.fun
+        return row[0] + scale * least.fun, row[0] - scale * most.fun
 
     def _solved(
         self,
@@ -191,14 +204,6 @@ class Program:
             constraints=(self._G, -np.inf, self._h),
             options={"mip_rel_gap": 0.0} | limit,
         )
-        if found.status in (INFEASIBLE, UNBOUNDED):
-            raise ValueError(f"X0 must be neither empty nor unbounded, but HiGHS: {found.message}")
         if found.status != OPTIMAL and not (found.status == OUT_OF_TIME and limit):
             raise RuntimeError(f"HiGHS did not find the maximum: {found.message}")
         return found
-
-
-def _with_spare(lower: float, upper: float) -> tuple[float, float]:
-    """A range somewhat larger."""
-    spare = SPARE * (1 + max(abs(lower), abs(upper)))
-    return lower - spare, upper + spare

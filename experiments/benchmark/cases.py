@@ -22,13 +22,14 @@ RANDOM_BOX = np.array([[0.25, -0.25], [0.75, 0.25]])  # the size of the paper's 
 
 @dataclass(frozen=True)
 class Settings:
-    """Time Reach-SDP: cvxpy rebuilt for every facet against this library.
+    """Time Reach-SDP: cvxpy rebuilt for every facet, and other rivals, against this library.
 
     Trained weights and results are kept under `output`.
     """
 
-    study: tyro.conf.Positional[Literal["steps", "growth", "loops"]] = "steps"
-    """One step of several networks; one facet as networks grow; tubes and training steps."""
+    study: tyro.conf.Positional[Literal["steps", "growth", "loops", "rivals"]] = "steps"
+    """One step of several networks; one facet as networks grow; tubes and training steps; tubes
+    beside those of what a user would pick instead."""
 
     widths: tuple[int, ...] = (10, 20, 32)
     """`steps`: neurons in each of the two hidden layers, one network a width."""
@@ -40,10 +41,17 @@ class Settings:
     """`growth`: cvxpy and Clarabel are timed up to this width."""
     reference_facets: int = 8
     """At most so many are timed with cvxpy rebuilt; fewer are scaled up to 8."""
+    loops: tuple[str, ...] = ()
+    """`rivals`: names of loops as the table has them; all without any."""
+    methods: tuple[str, ...] = ()
+    """`rivals`: names of methods as the table has them; all without any."""
+    simulations: int = 20_000
+    """`rivals`: trajectories whose largest values bounds are compared with."""
     repetitions: int = 3
     """Warm calls of which the median is taken."""
-    patience: float = 40.0
-    """Seconds after which a method is not called again, and cvxpy rebuilt for no more facets."""
+    patience: float = 60.0
+    """Seconds after which a method is not called again, and cvxpy rebuilt for no more facets;
+    `rivals`: after which a call is ended."""
     clock: Literal["wall", "cpu"] = "wall"
     """What a second is; with one thread, the processor's own are immune to other jobs."""
     samples: int = 500
@@ -56,7 +64,7 @@ class Settings:
     """Where everything is written."""
 
     def __post_init__(self):
-        counts = ("widths", "growth", "reference_facets", "training_steps")
+        counts = ("widths", "growth", "reference_facets", "training_steps", "simulations")
         sizes = ("repetitions", "patience", "reference_width", "seed")
         require_options(self, **dict.fromkeys(counts, 1), samples=2, **dict.fromkeys(sizes, 0))
         if not self.networks:

@@ -4,9 +4,10 @@
 networks with two hidden layers: some trained on the MPC and started from the paper's small initial
 set, some with random weights and a set of the same size where most of their neurons switch.
 `growth`: one facet of the paper's program as random networks grow. `loops`: six-step tubes of the
-trained 2-10-5-1 network, and training steps. All methods run one after the other, with one BLAS
-thread and one thread for Clarabel (XLA takes what cores there are), so their ratios mean more than
-their seconds.
+trained 2-10-5-1 network, and training steps. `rivals`: tubes of ever larger loops beside HiGHS's
+mixed-integer programs, affine forms in plain numpy, and the paper's programs by cvxpy. All methods
+run one after the other, with one BLAS thread and one thread for Clarabel (XLA takes what cores
+there are), so their ratios mean more than their seconds.
 """
 
 import dataclasses
@@ -36,6 +37,10 @@ from experiments.benchmark.loops import (
     tube_rows,
     tube_table,
 )
+from experiments.benchmark.rivals.comparison import Run, rows, unsound
+from experiments.benchmark.rivals.methods import chosen
+from experiments.benchmark.rivals.table import NOTE, table
+from experiments.benchmark.rivals.tasks import tasks
 from experiments.benchmark.steps import STEPS_NOTE, measured, methods, steps_table
 from experiments.command import bar, require_folder
 
@@ -94,9 +99,34 @@ def loops(settings: Settings) -> None:
     write(settings, tubes=tubes, training=named)
 
 
+def rivals(settings: Settings) -> None:
+    """Every method on every loop, each in a process of its own.
+
+    Raises:
+        SystemExit: a certified bound is below a value that is attained.
+    """
+    results, todo = [], tasks(settings)
+    methods = {name: chosen(task, settings) for name, task in todo.items()}
+    with bar() as shown:
+        progress = shown.add_task("", total=sum(map(len, methods.values())))
+        for name, task in todo.items():
+            runs = []
+            for method in methods[name]:
+                shown.update(progress, description=f"{name}: {method}")
+                runs.append(Run.of(task, method, settings))
+                shown.advance(progress)
+            results += rows(name, task, runs, settings)
+            write(settings, rows=results)
+    rich.print(table(results))
+    rich.print(NOTE)
+    if wrong := unsound(results):
+        raise SystemExit(f"error: bounds are below values that are attained: {', '.join(wrong)}")
+
+
 def write(settings: Settings, **results: list[dict]) -> None:
     """Settings, threads and every row of each table."""
     threads = {name: os.environ.get(name) for name in THREADS} | {"cores": os.cpu_count()}
+    results |= {"compilations": jax.config.values["jax_compilation_cache_dir"]}
     path = settings.output / f"{settings.study}.json"
     report.write(path, settings, threads=threads, **results)
 
@@ -105,5 +135,6 @@ def main(settings: Settings) -> None:
     """One study: its tables are printed, and its rows written."""
     require_folder(settings.output)
     jax.config.update("jax_enable_x64", True)
-    {"steps": steps, "growth": growth, "loops": loops}[settings.study](settings)
+    studies = {"steps": steps, "growth": growth, "loops": loops, "rivals": rivals}
+    studies[settings.study](settings)
     rich.print(f"written: {settings.output / settings.study}.json")

@@ -1,9 +1,9 @@
 """Seconds of a call: of the first one, which compiles, and of warm ones."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -37,6 +37,12 @@ class Timing:
     calls: list[float]
     result: Any
 
+    @classmethod
+    def of(cls, calls: Iterable[tuple[float, Any]]) -> Self:
+        """Seconds and results of calls, one after the other; at least one."""
+        seconds, results = zip(*calls, strict=True)
+        return cls(seconds[0], list(seconds[1:]), results[-1])
+
     @property
     def seconds(self) -> float:
         """The median of warm calls; of the first one if there are none."""
@@ -55,11 +61,17 @@ def cells(row: dict[str, Any]) -> tuple[str, str]:
 
 def repeated(call: Callable[[], Any], settings: Patience) -> Timing:
     """The first call, and as many warm ones as patience allows."""
-    clock, seconds, result = CLOCKS[settings.clock], [], None
+    return Timing.of(each_call(call, settings))
+
+
+def each_call(call: Callable[[], Any], settings: Patience) -> Iterator[tuple[float, Any]]:
+    """Seconds and result of the first call and of each warm one, as they are there."""
+    clock, spent = CLOCKS[settings.clock], 0.0
     for number in range(1 + settings.repetitions):
-        if number and sum(seconds) >= settings.patience:
-            break
+        if number and spent >= settings.patience:
+            return
         began = clock()
         result = call()
-        seconds.append(clock() - began)
-    return Timing(seconds[0], seconds[1:], result)
+        seconds = clock() - began
+        spent += seconds
+        yield seconds, result

@@ -1,33 +1,62 @@
 """What a loop can exactly reach: the largest value of a direction, by mixed-integer programming.
 
 An unrolled loop of ReLUs is a mixed-integer linear program (Tjeng, Xiao, Tedrake, Evaluating
-Robustness of Neural Networks with Mixed Integer Programming, ICLR 2019): a unit `z = max(y, 0)`
-whose input can have either sign is
-
-    z >= 0,   z >= y,   z <= u d,   z - y <= -l (1 - d),   d in {0, 1},   l <= y <= u,
-
-and the others are affine. Written from the definition of the loop, weights, plant and sets, and
-with nothing of what certifies it, this says how tight a certificate is. It takes seconds for some
-tens of units that switch, and may take forever for hundreds. Tolerances of HiGHS are absolute: it
-is for sets and weights of order one.
+Robustness of Neural Networks with Mixed Integer Programming, ICLR 2019). Written from the
+definition of the loop, weights, plant and sets, and with nothing of what certifies it, this says
+how tight a certificate is. It takes seconds for some tens of units that switch, and may take
+forever for hundreds.
 """
+
+import contextlib
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Bool, Float
 from numpy import ndarray
-from scipy.optimize import OptimizeResult, linprog, milp
 
 import reachjax as rj
+from experiments.tightness.program import SPARE, Largest, Limits, Program
 
 SHARP = 1e-5
 """How far apart the value and HiGHS's bound of it may be, as a part of the direction's range.
 
 HiGHS takes 1e-6 from a whole number for a whole number, in each unit."""
 
-SPARE = 1e-6
-"""By which part of its size the range of a unit's input is enlarged: ten times what a linear
-program may be off by."""
+
+class Maxima(NamedTuple):
+    """The largest values of directions after each of several steps, as far as they were found.
+
+    Attributes:
+        values: `(k, m)`, which are simulated; NaN where time ran out.
+        states: `(k, m, n_x)`, the initial states that attain them.
+        bounds: `(k, m)`, which no value exceeds, up to HiGHS's tolerances; NaN where time ran out.
+        spreads: `(k, m)`, ranges that the directions are surely within; NaN where time ran out.
+    """
+
+    values: Float[ndarray, "k m"]
+    states: Float[ndarray, "k m n_x"]
+    bounds: Float[ndarray, "k m"]
+    spreads: Float[ndarray, "k m"]
+
+    def within(self, part: float) -> Bool[ndarray, "k m"]:
+        """Whether no other state has a larger value by more than this part of the range."""
+        # a single point has no range, but rounding
+        allowed = part * np.maximum(self.spreads, SPARE * (1 + abs(self.values)))
+        return abs(self.bounds - self.values) <= allowed
+
+    def require_sharp(self) -> None:
+        """Raise an error unless all are within `SHARP`.
+
+        Raises:
+            RuntimeError: HiGHS did not find a maximum.
+        """
+        if np.any(apart := ~self.within(SHARP)):
+            values, bounds = self.values[apart], self.bounds[apart]
+            raise RuntimeError(
+                f"HiGHS is not sharp: {values} are attained, but {bounds} not excluded"
+            )
 
 
 def exact_maximum(
@@ -71,6 +100,43 @@ def exact_maxima(
 
     The loop is unrolled once for all of them.
     """
+    rows = _checked(loop, X0, k, directions, start)
+    *_, (program, state) = _unrolled(loop, X0, k, start, Limits())
+    last = [program.largest(row) for row in rows @ state]
+    found = _simulated(loop, X0, rows, {k: last}, start)
+    found.require_sharp()
+    return found.values[0], found.states[0]
+
+
+def exact_tube(
+    loop: rj.ClosedLoop,
+    X0: rj.Box | rj.Polytope,
+    horizon: int,
+    directions: ArrayLike,
+    start: int = 0,
+    limits: Limits | None = None,
+) -> Maxima:
+    """The largest values of directions `(m, n_x)` after each of `horizon` steps.
+
+    The loop is unrolled once for all steps and directions. With limits of time, what was found by
+    then is returned. Arguments and errors are as in `exact_maximum`, but sharpness is left to
+    `Maxima.require_sharp`.
+    """
+    rows = _checked(loop, X0, horizon, directions, start)
+    unknown = Largest(np.full(loop.states, np.nan), np.nan, np.nan)
+    found = {k: [unknown] * len(rows) for k in range(1, horizon + 1)}
+    with contextlib.suppress(TimeoutError):
+        steps = _unrolled(loop, X0, horizon, start, limits or Limits())
+        for k, (program, state) in enumerate(steps, start=1):
+            for i, row in enumerate(rows @ state):
+                found[k][i] = program.largest(row)
+    return _simulated(loop, X0, rows, found, start)
+
+
+def _checked(
+    loop: rj.ClosedLoop, X0: rj.AbstractSet, horizon: int, directions: ArrayLike, start: int
+) -> Float[ndarray, "m n_x"]:
+    """The directions, if all arguments are such as they must be."""
     if not isinstance(X0, rj.PolyhedralSet):
         raise TypeError(f"X0 must be a Box or a Polytope, but {type(X0).__name__} arrived")
     activation = getattr(loop.controller, "activation", None)
@@ -79,40 +145,28 @@ def exact_maxima(
         raise TypeError(
             f"loop.controller must be an MLP, a network of ReLUs, but is {kind} of {activation}"
         )
-    loop.check_horizon(k, start)
+    loop.check_horizon(horizon, start)
     rows = np.asarray(directions, float)
     if rows.ndim != 2 or not loop.states == X0.dimension == rows.shape[1]:
         raise ValueError(
             f"X0 and directions must be of the loop's {loop.states} states, but a set of dimension "
             f"{X0.dimension} and directions of shape {rows.shape} arrived"
         )
-    program = _Program(X0, loop.units * k)
+    return rows
+
+
+def _unrolled(
+    loop: rj.ClosedLoop, X0: rj.PolyhedralSet, horizon: int, start: int, limits: Limits
+) -> Iterator[tuple[Program, Float[ndarray, "n_x size"]]]:
+    """The program of the first steps, and rows of the state after them, for each of `horizon`."""
+    program = Program(X0, limits)
     state = program.state()
-    for t in range(start, start + k):
+    for t in range(start, start + horizon):
         state = _successor(loop, program, state, t)
-    found = [program.largest(row) for row in rows @ state]
-    states, bounds, ranges = map(np.array, zip(*found, strict=True))
-    if isinstance(X0, rj.Box):
-        states = np.clip(states, X0.lower, X0.upper)
-    ends = np.asarray(loop.simulate(jnp.asarray(states), k, start))[:, -1]
-    values = np.einsum("ij,ij->i", rows, ends)
-    # a single point has no range, but rounding
-    allowed = SHARP * np.maximum(ranges, SPARE * (1 + abs(values)))
-    if np.any(apart := abs(bounds - values) > allowed):
-        raise RuntimeError(
-            f"HiGHS is not sharp: {values[apart]} are attained, but {bounds[apart]} not excluded"
-        )
-    return values, states
+        yield program, state
 
 
-def _affine(W: ArrayLike, rows: Float[ndarray, "n size"], b: ArrayLike) -> ndarray:
-    """`W x + b`, the last column being that of the constant."""
-    result = np.asarray(W) @ rows
-    result[:, -1] += np.asarray(b)
-    return result
-
-
-def _successor(loop: rj.ClosedLoop, program: "_Program", state: ndarray, t: int) -> ndarray:
+def _successor(loop: rj.ClosedLoop, program: Program, state: ndarray, t: int) -> ndarray:
     """Rows of the state one step later."""
     net = loop.controller
     assert isinstance(net, rj.MLP)
@@ -127,90 +181,35 @@ def _successor(loop: rj.ClosedLoop, program: "_Program", state: ndarray, t: int)
         below = program.relu(_affine(-eye, above, box.upper - box.lower))
         u = _affine(-eye, below, box.upper)
     A, B, c = loop.plant.at(t)
-    return _affine(A, state, c) + _affine(B, u, np.zeros(len(state)))
+    driven = _affine(B, u, c)
+    return driven + _affine(A, program.padded(state), np.zeros(len(state)))
 
 
-class _Program:
-    """Variables, and what is known of them: `G v <= h`, intervals, and which are whole numbers.
-
-    Rows over the variables have a last entry for the constant.
-
-    Args:
-        X0: what the first variables are in.
-        units: how many there may be.
-    """
-
-    def __init__(self, X0: rj.PolyhedralSet, units: int):
-        A, b = map(np.asarray, X0.facets)
-        n = X0.dimension
-        self._states, self._taken, self._size = n, n, n + 2 * units + 1
-        self._G = np.hstack([A, np.zeros((len(A), self._size - n))])
-        self._G[:, -1] = -b
-        self._lower, self._upper = np.full(self._size - 1, -np.inf), np.full(self._size - 1, np.inf)
-        self._whole = np.zeros(self._size - 1, dtype=bool)
-
-    def state(self) -> Float[ndarray, "n_x size"]:
-        """Rows of the first variables."""
-        return np.eye(self._states, self._size)
-
-    def relu(self, rows: Float[ndarray, "k size"]) -> Float[ndarray, "k size"]:
-        """Rows of the outputs of units, given those of their inputs."""
-        return np.array([self._unit(row) for row in rows]).reshape(-1, self._size)
-
-    def _unit(self, y: Float[ndarray, " size"]) -> Float[ndarray, " size"]:
-        lower, upper = -self._relaxed(-y), self._relaxed(y)
-        spare = SPARE * (1 + max(abs(lower), abs(upper)))
-        lower, upper = lower - spare, upper + spare
-        if lower >= 0:
-            return y
-        if upper <= 0:
-            return np.zeros_like(y)
-        z, d, one = np.eye(self._size)[[self._taken, self._taken + 1, -1]]
-        self._G = np.vstack([self._G, y - z, z - upper * d, z - y + lower * (one - d)])
-        here = slice(self._taken, self._taken + 2)
-        self._lower[here], self._upper[here] = 0.0, [upper, 1.0]
-        self._whole[self._taken + 1] = True
-        self._taken += 2
-        return z
-
-    def _parts(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """`G`, `h` and intervals, of the variables that there are."""
-        here = slice(0, self._taken)
-        return self._G[:, here], -self._G[:, -1], self._lower[here], self._upper[here]
-
-    def _relaxed(self, row: Float[ndarray, " size"]) -> float:
-        """The largest value of a row where no variable need be whole."""
-        G, h, lower, upper = self._parts()
-        found = linprog(-row[: self._taken], G, h, bounds=np.stack([lower, upper], axis=1))
-        if found.status in (2, 3):
-            raise ValueError(f"X0 must be neither empty nor unbounded, but HiGHS: {found.message}")
-        _require_optimal(found)
-        return row[-1] - found.fun
-
-    def largest(self, row: ndarray) -> tuple[Float[ndarray, " n_x"], float, float]:
-        """The first variables where a row is largest, a bound of it, and the range it is within.
-
-        Solved again with whole numbers held fast, as the first solution may be off by 1e-6.
-        """
-        G, h, lower, upper = self._parts()
-        spread = self._relaxed(row) + self._relaxed(-row)
-        scale = 1 / spread if spread > 0 else 1.0  # HiGHS's tolerances are absolute
-        objective, whole = -scale * row[: self._taken], self._whole[: self._taken]
-        found = milp(
-            objective,
-            integrality=whole,
-            bounds=(lower, upper),
-            constraints=(G, np.full(len(h), -np.inf), h),
-            options={"mip_rel_gap": 0.0},
-        )
-        _require_optimal(found)
-        bound = found.fun if found.mip_dual_bound is None else found.mip_dual_bound
-        held = np.stack([np.where(whole, np.round(found.x), end) for end in (lower, upper)], axis=1)
-        again = linprog(objective, G, h, bounds=held)
-        state = (again if again.status == 0 else found).x[: self._states]
-        return state, row[-1] - bound / scale, spread
+def _affine(W: ArrayLike, rows: Float[ndarray, "n size"], b: ArrayLike) -> Float[ndarray, "k size"]:
+    """`W x + b`, the first column being that of the constant."""
+    result = np.asarray(W) @ rows
+    result[:, 0] += np.asarray(b)
+    return result
 
 
-def _require_optimal(found: OptimizeResult) -> None:
-    if found.status != 0:
-        raise RuntimeError(f"HiGHS did not find the maximum: {found.message}")
+def _simulated(
+    loop: rj.ClosedLoop,
+    X0: rj.PolyhedralSet,
+    rows: Float[ndarray, "m n_x"],
+    found: dict[int, list[Largest]],
+    start: int,
+) -> Maxima:
+    """What was found after some numbers of steps, with the values that are attained."""
+    states, bounds, spreads = (
+        np.array([[getattr(each, name) for each in facets] for facets in found.values()])
+        for name in Largest._fields
+    )
+    if isinstance(X0, rj.Box):
+        states = np.clip(states, X0.lower, X0.upper)
+    values = np.full(bounds.shape, np.nan)
+    if len(there := np.argwhere(~np.isnan(states).any(axis=-1))):
+        k, i = there.T
+        ends = loop.simulate(jnp.asarray(states[k, i]), max(found), start)
+        steps = np.array(list(found))[k]
+        values[k, i] = np.sum(rows[i] * np.asarray(ends)[np.arange(len(k)), steps], axis=1)
+    return Maxima(values, states, bounds, spreads)

@@ -15,7 +15,7 @@ from numpy import ndarray
 import reachjax as rj
 from experiments import stored
 from experiments.tightness.cases import Group, Settings
-from experiments.tightness.exact import exact_maxima
+from experiments.tightness.exact import exact_tube
 from experiments.tightness.methods import Measurement, fingerprint
 
 TOLERANCE = 1e-9
@@ -101,6 +101,7 @@ def _attained(loop: rj.ClosedLoop, group: Group, settings: Settings) -> Float[nd
 
 def _maxima(loop: rj.ClosedLoop, group: Group) -> Float[ndarray, "horizon m"]:
     """By mixed-integer programming."""
-    directions, steps = np.asarray(group.template.directions), range(1, group.horizon + 1)
     assert isinstance(group.X0, rj.Box)
-    return np.array([exact_maxima(loop, group.X0, k, directions)[0] for k in steps])
+    found = exact_tube(loop, group.X0, group.horizon, group.template.directions)
+    found.require_sharp()
+    return found.values

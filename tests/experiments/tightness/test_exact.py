@@ -12,8 +12,9 @@ import pytest
 from scipy.optimize import OptimizeResult
 
 import reachjax as rj
-from experiments.tightness import exact
-from experiments.tightness.exact import SHARP, exact_maxima, exact_maximum
+from experiments.tightness import exact, program
+from experiments.tightness.exact import SHARP, exact_maxima, exact_maximum, exact_tube
+from experiments.tightness.program import Limits
 from tests.closed_loops import closed_loop, random_loop, recursion
 from tests.networks import (
     LoopData,
@@ -145,6 +146,64 @@ def test_a_single_point_goes_where_it_is_simulated():
     assert value == pytest.approx(simulate(data, point[None], 3)[-1, 0, 1], abs=ROUNDING)
 
 
+@pytest.mark.parametrize("n_x", [1, 3])
+def test_a_tube_unrolled_once_has_the_maxima_of_each_step(n_x):
+    data, region = random_loop(n_x, steps=5), box_region(n_x, seed=0)
+    loop, rows = closed_loop(data), np.vstack([np.eye(n_x), -np.ones(n_x)])
+    for X0 in (box_of(region), rj.Polytope(region.A, region.b)):
+        tube = exact_tube(loop, X0, 3, rows, start=2)
+        tube.require_sharp()
+        for k, (values, states) in enumerate(zip(tube.values, tube.states, strict=True), start=1):
+            expected, attained_by = exact_maxima(loop, X0, k, rows, start=2)
+            np.testing.assert_allclose(values, expected, rtol=0, atol=1e-6)
+            assert states.shape == attained_by.shape
+        assert np.all(tube.bounds >= tube.values - SHARP)
+
+
+@pytest.fixture
+def small():
+    """A loop with units that switch, a box, three steps, and two directions."""
+    loop, X0 = closed_loop(random_loop(2)), rj.Box([-1.0, -1.0], [1.0, 1.0])
+    return loop, X0, 3, np.eye(2)
+
+
+def test_when_time_is_over_the_rest_is_not_a_number(small, monkeypatch):
+    seconds, programs = Limits.seconds, []
+
+    def few(self):
+        programs.append(1)
+        if len(programs) > 80:
+            raise TimeoutError
+        return seconds(self)
+
+    whole = exact_tube(*small)
+    monkeypatch.setattr(Limits, "seconds", few)
+    part = exact_tube(*small)
+    known = ~np.isnan(part.values)
+    assert 0 < known.sum() < known.size
+    np.testing.assert_allclose(part.values[known], whole.values[known], atol=SHARP)
+    assert known[part.within(SHARP)].all()
+    assert np.isnan(part.bounds[~known]).all()
+    with pytest.raises(RuntimeError, match="not sharp"):
+        part.require_sharp()
+
+
+def test_a_program_that_is_not_finished_in_time_still_has_a_bound(small, monkeypatch):
+    milp, whole = program.milp, exact_tube(*small)
+
+    def unfinished(objective, integrality, **options):
+        if not integrality.any():
+            return milp(objective, integrality=integrality, **options)
+        assert options["options"]["time_limit"] <= 100
+        return OptimizeResult(status=1, x=None, fun=None, mip_dual_bound=None, message="Time")
+
+    monkeypatch.setattr(program, "milp", unfinished)
+    part = exact_tube(*small, limits=Limits(program=100))
+    assert not part.within(SHARP).any()
+    assert np.isnan(part.values).all()
+    assert np.all(part.bounds >= whole.values - SHARP)
+
+
 class Absolute(rj.AbstractUnit):
     """`|y|`, of which the program knows nothing."""
 
@@ -162,14 +221,14 @@ def test_only_relus_are_taken():
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "words"),
+    ("module", "name", "value", "words"),
     [
-        ("milp", lambda *_, **__: OptimizeResult(status=1, message="Time limit"), "Time limit"),
-        ("SHARP", -1.0, "not sharp"),
+        (program, "milp", lambda *_, **__: OptimizeResult(status=1, message="Time"), "Time"),
+        (exact, "SHARP", -1.0, "not sharp"),
     ],
 )
-def test_what_is_not_proved_to_be_largest_is_an_error(monkeypatch, name, value, words):
-    monkeypatch.setattr(exact, name, value)
+def test_what_is_not_proved_to_be_largest_is_an_error(monkeypatch, module, name, value, words):
+    monkeypatch.setattr(module, name, value)
     loop, X0 = closed_loop(random_loop(2, hidden=(2,))), rj.Box([0.0, 0.0], [1.0, 1.0])
     with pytest.raises(RuntimeError, match=words):
         exact_maximum(loop, X0, 1, [1.0, 0.0])

@@ -1,0 +1,1 @@
+"""The library beside what a user would pick instead, loop by loop."""

@@ -1,0 +1,64 @@
+"""A generator that is run in a process of its own, and ended when it takes too long."""
+
+import multiprocessing
+import os
+import pickle
+import sys
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from typing import Any
+
+import jax
+
+
+class Stopped(Exception):  # noqa: N818
+    """A process took too long, or ended by itself before it was done."""
+
+
+def from_process(
+    function: Callable[..., Iterator[Any]], *arguments: Any, patience: float
+) -> Iterator[Any]:
+    """What a generator yields in a new process; imports and arguments there take no patience.
+
+    Args:
+        function: of a module's top level.
+        arguments: what can be pickled; arrays keep their 64 bits.
+        patience: seconds between two results, after which the process is ended.
+
+    Raises:
+        Stopped: it was, or it failed; what it yielded until then has arrived.
+    """
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    packed = pickle.dumps((function, arguments))
+    process = context.Process(target=_run, args=(theirs, packed), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        waiting = None  # until all is there
+        while ours.poll(waiting):
+            more, result = ours.recv()
+            if not more:
+                return
+            if waiting is not None:
+                yield result
+            waiting = patience
+    except EOFError:
+        process.join()
+        raise Stopped(f"it ended with exit code {process.exitcode}") from None
+    finally:
+        process.kill()
+        process.join()
+    raise Stopped(f"it took more than {patience} seconds")
+
+
+def _run(connection: Connection, packed: bytes) -> None:
+    """Send all that a generator yields, after a first word."""
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())  # where HiGHS writes what it thinks
+    jax.config.update("jax_enable_x64", True)  # before there are arrays
+    function, arguments = pickle.loads(packed)
+    connection.send((True, None))
+    for result in function(*arguments):
+        connection.send((True, result))
+    connection.send((False, None))

@@ -30,8 +30,11 @@ FLAT = 1e-6
 LEAST_NODES = 8
 """What each facet may take, whatever the others took."""
 
-WORK = 3e6
-"""Rows and columns of all linear programs of a tube, in all: some tens of seconds."""
+WORK = 1e9
+"""Rows and columns, squared, of all linear programs of a tube: half a minute where measured."""
+
+ROUNDED = 1e-10
+"""Gaps below this part of a bound are of rounding."""
 
 
 class Target(NamedTuple):
@@ -138,13 +141,13 @@ class Ladder:
         return len(self.horizon.facts.rows) + len(self.horizon.varying)
 
     def _spend(self, programs: int) -> None:
-        self._work -= programs * self._size
+        self._work -= programs * self._size**2
 
     def _budget(self, bounds: int) -> int:
         """How many linear programs one of so many bounds may take."""
         if self._work <= 0:
             return 0
-        affordable = int(2 * self._work / (bounds * self._size))
+        affordable = int(2 * self._work / (bounds * self._size**2))
         return min(self._nodes, max(LEAST_NODES, affordable))
 
     def facets(
@@ -165,6 +168,7 @@ class Ladder:
         def enough(facet: int, bound: float, attained: float) -> bool:
             return bound - attained <= gap * ranges[facet]
 
+        ranges = np.fmax(ranges, ROUNDED / gap * np.fmax(abs(lower), abs(upper)) if gap else 0.0)
         each = [forms[i : i + 1] for i in range(len(directions))]
         return Target(each, lambda states: states @ directions.T, enough, simulated), ranges
 

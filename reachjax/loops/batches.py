@@ -47,7 +47,8 @@ class Batch:
 
 
 def _evaluated(unit: AbstractUnit, y: Batch) -> Batch:
-    return Batch(unit(y.values))
+    values: Any = y.values
+    return Batch(np.asarray(unit(values)))
 
 
 def trajectories(

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -136,7 +137,7 @@ class Horizon:
         for layer in itertools.chain(*self.steps):
             here = np.flatnonzero(layer.places >= 0)
             inputs = layer.inputs[here]
-            y = inputs.rows[:, 0] + inputs.columns @ found[: inputs.columns.shape[1]]
+            y: Any = inputs.rows[:, 0] + inputs.columns @ found[: inputs.columns.shape[1]]
             rest = layer.unit(y) - layer.slope[here] * y - layer.offset[here]
             found[layer.places[here]] = rest / layer.gap[here]
         return found
@@ -166,8 +167,8 @@ class Horizon:
     def _add_units(self, layer: UnitForms, switching: np.ndarray, before: int) -> None:
         width = layer.outputs.columns.shape[1]
         y, z = layer.inputs[switching].widened(width), layer.outputs[switching]
-        lower, upper = layer.lower[switching], layer.upper[switching]
-        facts = layer.unit.facts(y, z, lower, upper)
+        ends: Any = layer.lower[switching], layer.upper[switching]
+        facts = layer.unit.facts(y, z, *ends)
         first = {}
         sectors = (block for block in facts.blocks if block.mark is Mark.SECTOR)
         for which, block in enumerate(sectors):

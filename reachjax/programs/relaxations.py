@@ -57,14 +57,11 @@ class AbstractRelaxation(abc.ABC):
         linear_bounds: whether the pre-activation bounds are those of supports and linear
             relaxations, where they are better than those of intervals.
         by_forms: whether there are no programs at all, and sets are bounded by affine forms.
-        nodes: how many linear programs a facet may take before it gets products; None where there
-            are products only.
     """
 
     remove_stable: bool
     linear_bounds: ClassVar[bool] = False
     by_forms: ClassVar[bool] = False
-    nodes: int | None = None
 
     @property
     def cuts(self) -> CuttingPlanes | None:

@@ -104,6 +104,11 @@ class BranchCertificate(AbstractProof):
         """By what each facet is proved."""
         return tuple(Rung(int(rung)) for rung in self.rungs)
 
+    @property
+    def multipliers(self) -> Float[Array | np.ndarray, "l m"]:
+        """Of the facts of the horizon, one row for each leaf."""
+        return self.branches.multipliers
+
     def recheck(
         self, multipliers: Float[np.ndarray, "l m"] | None = None
     ) -> Float[np.ndarray, " f"]:
@@ -121,7 +126,7 @@ class BranchCertificate(AbstractProof):
             >>> proof = reach(loop, Box([-1.0], [2.0]), 1, Template.box(1)).proof(1)
             >>> proof.recheck().round(6).tolist()
             [1.2, 1.4]
-            >>> garbage = -proof.branches.multipliers
+            >>> garbage = -proof.multipliers
             >>> bool((proof.recheck(garbage) >= [1.2, 1.4]).all())
             True
         """

@@ -15,6 +15,7 @@ count as given, though they depend on ranges, and these on the loop: the derivat
 from __future__ import annotations
 
 from functools import partial
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -87,16 +88,16 @@ def _lines(
     layer: UnitForms, columns: Float[np.ndarray, "f n"]
 ) -> tuple[Float[np.ndarray, "f k"], Float[np.ndarray, "f k"]]:
     """Slopes and offsets of units at these columns."""
-    width = layer.inputs.columns.shape[1]
+    width, unit = layer.inputs.columns.shape[1], cast(Any, layer.unit)
     y = columns[:, :width] @ layer.inputs.columns.T + layer.inputs.rows[:, 0]
-    own = columns[:, np.maximum(layer.places, 0)] * (layer.places >= 0)
+    switching = layer.places >= 0
+    own = np.where(switching, columns[:, np.maximum(layer.places, 0)], 0.0)
     z = layer.slope * y + layer.offset + layer.gap * own
     near = NEAR * (layer.upper - layer.lower)
-    line = layer.unit.lines(y - near, y + near).above.slope
-    proper = layer.unit.lines(y - near, y + near).affine
-    proper &= abs(layer.unit(y) - z) <= near
-    slope = np.where(proper & (layer.places >= 0), line, layer.slope)
-    return slope, z - slope * y
+    lines = unit.lines(y - near, y + near)
+    its_own = switching & lines.affine & (abs(unit(y) - z) <= near)
+    slope = np.where(its_own, lines.above.slope, layer.slope)
+    return slope, np.asarray(z - slope * y)
 
 
 @partial(jax.jit, static_argnames="start")
@@ -110,7 +111,7 @@ def replayed(
     start: int = 0,
 ) -> Float[Array, " f"]:
     """Numbers `(f,)` whose derivatives in loop, set and directions are those of the bounds."""
-    initial, (cut, ball) = InitialColumns.of(X0, box), X0.parts
+    initial, (_, ball) = InitialColumns.of(X0, box), X0.parts
     cornered = ball is None and replay.of_set.shape[1] > 0
     steps = replay.slopes.shape[1]
 
@@ -120,7 +121,7 @@ def replayed(
             x = jax.lax.stop_gradient(x)
         total = jnp.zeros(())
         if len(of_set):
-            A, b = cut.facets
+            A, b = X0.facets
             total += of_set @ (b - A @ x)
 
         def advance(carry, given):

@@ -105,7 +105,7 @@ def branched(
     """
     zero, facts = horizon.zero, horizon.facts
     forms = forms.widened(facts.columns.shape[1])
-    rows, constants = forms.columns, forms.rows[:, 0]
+    rows, constants = np.asarray(forms.columns), np.asarray(forms.rows[:, 0])
     size = abs(rows).max(initial=0.0)
 
     def solved(phases: dict[int, int]) -> Vertex | None:
@@ -182,7 +182,7 @@ def settled(
     values = (facts.columns @ columns + facts.rows[:, 0])[zero] / horizon.gaps[:, None]
     vanishing = values <= BENT
     both, side = vanishing.all(axis=1), vanishing.argmax(axis=1)
-    row, constant = form.columns, form.rows[:, 0]
+    row, constant = np.asarray(form.columns), np.asarray(form.rows[:, 0])
     attained, size = constant[0] + row[0] @ columns[: row.shape[1]], abs(row).sum()
     for phases in leaves:
         if np.any((phases >= 0) & ~both & (phases != side)):

@@ -6,9 +6,10 @@ second-order cone.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterable
+from typing import Any
 
-import clarabel
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
@@ -16,8 +17,8 @@ from jaxtyping import Float, Int
 from reachjax.programs.affine import AffineForms
 from reachjax.solvers.linear_programs import AbstractPrograms, Vertex
 
-ANSWERS = clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved
-EMPTY = clarabel.SolverStatus.PrimalInfeasible, clarabel.SolverStatus.AlmostPrimalInfeasible
+ANSWERS = "Solved", "AlmostSolved"
+EMPTY = "PrimalInfeasible", "AlmostPrimalInfeasible"
 
 
 class ConicPrograms(AbstractPrograms):
@@ -28,7 +29,8 @@ class ConicPrograms(AbstractPrograms):
     """
 
     def __init__(self, states: int):
-        self._states, self._settings = states, clarabel.DefaultSettings()
+        self._clarabel: Any = importlib.import_module("clarabel")  # only where it is needed
+        self._states, self._settings = states, self._clarabel.DefaultSettings()
         self._settings.verbose = False
         self._settings.presolve_enable = False
         self._facts, self._constants = np.zeros((0, states)), np.zeros(0)
@@ -76,11 +78,11 @@ class ConicPrograms(AbstractPrograms):
         if not all(np.isfinite(part).all() for part in (*parts, *ends)):
             return None
         cones = [
-            clarabel.ZeroConeT(len(fixed)),
-            clarabel.NonnegativeConeT(sum(map(len, parts[1:-1]))),
-            clarabel.SecondOrderConeT(len(ball)),
+            self._clarabel.ZeroConeT(len(fixed)),
+            self._clarabel.NonnegativeConeT(sum(map(len, parts[1:-1]))),
+            self._clarabel.SecondOrderConeT(len(ball)),
         ]
-        solver = clarabel.DefaultSolver(
+        solver = self._clarabel.DefaultSolver(
             sp.csc_array((n + 1, n + 1)),
             -np.eye(1, n + 1, n)[0],
             sp.csc_array(-np.vstack(parts)),
@@ -93,9 +95,9 @@ class ConicPrograms(AbstractPrograms):
         of_fixed, weights, of_signed, of_upper, of_lower, _ = duals
         multipliers = np.zeros(len(self._facts))
         multipliers[held], multipliers[others] = of_fixed, of_signed
-        if found.status in EMPTY:
+        if str(found.status) in EMPTY:
             return Vertex(-np.inf, np.zeros(0), multipliers / self._size, np.zeros(0), np.zeros(0))
-        if found.status not in ANSWERS:
+        if str(found.status) not in ANSWERS:
             return None
         columns = np.array(found.x)[:-1]
         reduced = np.zeros(n)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import highspy
 import numpy as np
@@ -83,7 +83,7 @@ class LinearPrograms(AbstractPrograms):
     """
 
     def __init__(self, states: int, bounded: bool):
-        self._model = highspy.Highs()
+        self._model: Any = highspy.Highs()
         for name, value in {
             "output_flag": False,
             "presolve": "off",

@@ -35,12 +35,13 @@ EXACT = 1e-7
 
 
 def sets_by_branching(
-    setting: Setting, X0: AbstractSet, box: Box, template: Template, horizon: int
+    setting: Setting, nodes: int, X0: AbstractSet, box: Box, template: Template, horizon: int
 ) -> Iterator[Reached]:
     """The smallest sets that are proved within the setting's gap, nodes and time.
 
     Args:
         setting: what all steps have in common.
+        nodes: how many linear programs a facet may take.
         X0: the initial set.
         box: around it.
         template: what the sets look like.
@@ -49,12 +50,11 @@ def sets_by_branching(
     Raises:
         ValueError: states overflow.
     """
-    fixed = jax.device_get(jax.lax.stop_gradient((setting.loop, X0, box)))
-    nodes = setting.relaxation.nodes or 0
+    loop, begun, around = jax.device_get(jax.lax.stop_gradient((setting.loop, X0, box)))
     gap = setting.gap
     if not is_concrete(setting.loop, X0, template):  # a derivative is that of what is attained
         gap = min(gap, EXACT)
-    ladder = Ladder(*fixed, setting.start, nodes, setting.deadline)
+    ladder = Ladder(loop, begun, around, setting.start, nodes, setting.deadline)
     X, steps, work = X0, [], PRODUCTS
     for k in range(1, horizon + 1):
         began = time.perf_counter()
@@ -62,7 +62,7 @@ def sets_by_branching(
         directions = template.at(k).directions
         rows = np.asarray(jax.lax.stop_gradient(directions))
         ladder.advance()
-        simulated = Simulated.nothing(fixed[2].center, len(rows))
+        simulated = Simulated.nothing(around.center, len(rows))
         if setting.simulations is not None:
             simulated = setting.simulations.values(k, rows)
         target, ranges = ladder.facets(rows, simulated, gap)

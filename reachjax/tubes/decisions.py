@@ -117,10 +117,11 @@ def decide(
     simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     decision = _Decision(loop, X0, horizon, start, required, simulations)
     decision.at_first()
-    begin = *jax.device_get((loop, X0, boxed(X0, "X0"))), start
+    on_host, begun, around = jax.device_get((loop, X0, boxed(X0, "X0")))
     for nodes in dict.fromkeys((min(FEW, relaxation.nodes), relaxation.nodes)):
         if not decision.ended:
-            decision.climb(Ladder(*begin, nodes, deadline), tighten=nodes > FEW)
+            ladder = Ladder(on_host, begun, around, start, nodes, deadline)
+            decision.climb(ladder, tighten=nodes > FEW)
     return decision.verdict()
 
 

@@ -210,7 +210,8 @@ class Ladder:
 
     def _initial(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n_x"]:
         start = self.horizon.start
-        return start.center + columns[:, : start.spread.shape[1]] @ start.spread.T
+        spread = np.asarray(start.spread)
+        return np.asarray(start.center) + columns[:, : spread.shape[1]] @ spread.T
 
     def _judged(
         self,
@@ -224,11 +225,12 @@ class Ladder:
         horizon, count = self.horizon, len(found)
         width = horizon.facts.columns.shape[1]
         owner = np.repeat(np.arange(count), [len(each.phases) for each in found])
+        multipliers = np.concatenate([each.multipliers for each in found])
         leaves = Branches(
             owner=owner,
             phases=np.concatenate([each.phases for each in found]),
-            multipliers=np.concatenate([each.multipliers for each in found]),
-            weights=block_diag(*(each.weights for each in found)),
+            multipliers=multipliers,
+            weights=np.asarray(block_diag(*(each.weights for each in found))),
         )
         rows = joined([forms.widened(width) for forms in target.forms])
         about = HorizonFacts(horizon.start, horizon.facts, horizon.zero, rows)
@@ -245,7 +247,7 @@ class Ladder:
             attained=best,
             worst=worst,
             columns=np.concatenate([leaf.columns for leaf in found])[deciding],
-            multipliers=leaves.multipliers[deciding],
+            multipliers=multipliers[deciding],
             rungs=np.where(nodes == 0, Rung.AFFINE_FORM, rungs),
             nodes=nodes,
             states=np.array(states).reshape(-1, len(horizon.start.center)),
@@ -256,11 +258,12 @@ class Ladder:
     ) -> tuple[Float[np.ndarray, "f n"], Float[np.ndarray, "f m"]]:
         """Columns and multipliers that derivatives of facets' bounds hold."""
         found = climbed.multipliers.copy()
-        columns, leaves = climbed.columns.copy(), climbed.branches
+        columns, owner = climbed.columns.copy(), climbed.branches.owner
+        phases = np.asarray(climbed.branches.phases)
         for facet in range(len(found)):
-            form, mine = climbed.about.rows[facet : facet + 1], leaves.owner == facet
+            form = climbed.about.rows[facet : facet + 1]
             at = self.horizon.columns_at(climbed.worst[facet])
-            given = settled(self.horizon, self._programs, form, at, leaves.phases[mine])
+            given = settled(self.horizon, self._programs, form, at, phases[owner == facet])
             if given is not None:
                 found[facet], columns[facet] = given, at
         return columns, found

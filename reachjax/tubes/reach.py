@@ -253,8 +253,8 @@ def reach(
     )
     if relaxation.by_forms:
         following = sets_by_forms(loop, X0, box, template, horizon, start)
-    elif relaxation.nodes is not None and window is None and isinstance(template, Template):
-        following = sets_by_branching(setting, X0, box, template, horizon)
+    elif window is None and isinstance(relaxation, BranchAndCut) and isinstance(template, Template):
+        following = sets_by_branching(setting, relaxation.nodes, X0, box, template, horizon)
     else:
         following = sets_by_programs(setting, X0, template, horizon, window)
     steps = [step for _, step in zip(wrapped(progress, range(horizon)), following, strict=False)]

@@ -76,8 +76,8 @@ class Setting:
     limit: int | None
     drop_columns: bool
     simulations: Simulations | None
-    gap: float
-    deadline: float
+    gap: float = 1e-4
+    deadline: float = np.inf
 
     @property
     def late(self) -> bool:

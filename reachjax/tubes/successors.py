@@ -67,7 +67,9 @@ def facets_by_products(
     Raises:
         ValueError: the set of states is empty or unbounded, or states overflow.
     """
-    region, proof = _proved(step, Facets(directions), _finite(step, step.program(directions)))
+    program = _finite(step, step.program(directions))
+    region, proof = _proved(step, Facets(directions), program)
+    assert isinstance(proof, Certificate)  # as facets have it
     return region.facets[1], proof
 
 

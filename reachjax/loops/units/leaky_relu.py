@@ -29,6 +29,7 @@ class LeakyReLU(AbstractUnit):
         ValueError: it is negative, or not below 1.
 
     Example:
+        >>> import jax.numpy as jnp
         >>> LeakyReLU(0.1)(jnp.array([-1.0, 2.0])).tolist()
         [-0.1, 2.0]
     """

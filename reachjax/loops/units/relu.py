@@ -53,7 +53,8 @@ class ReLU(AbstractUnit):
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`max(y, 0)`, with derivative 0 at 0."""
-        return np.maximum(y, 0.0) if namespace(y) is np else jax.nn.relu(y)
+        on_host: Any = np.maximum  # of numpy, where nothing is compiled
+        return on_host(y, 0.0) if namespace(y) is np else jax.nn.relu(y)
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """A monotone function maps bounds to bounds."""

@@ -121,11 +121,9 @@ def _certificates(trial: Trial, proofs, sets, found: Found, rng) -> None:
 
 def _multipliers(proof) -> np.ndarray:
     """What `recheck` takes others of."""
-    return (
-        proof.branches.multipliers
-        if isinstance(proof, rj.BranchCertificate)
-        else (proof.multipliers)
-    )
+    if isinstance(proof, rj.BranchCertificate):
+        return proof.branches.multipliers
+    return proof.slopes if isinstance(proof, rj.LinearCertificate) else proof.multipliers
 
 
 def _spoilt(held: np.ndarray, rng) -> np.ndarray:

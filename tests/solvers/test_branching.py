@@ -31,5 +31,5 @@ def test_no_leaves_rest_on_a_first_program_without_columns(programs):
     loop, X0 = jax.device_get((ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net), Box([-1.0], [2.0])))
     horizon = Horizon(loop, X0, X0)
     horizon.advance()
-    parts = lambda columns: 0.0, lambda bound, attained: False  # noqa: E731
+    parts = lambda columns: 0.0, lambda bound, attained: False
     assert branched(horizon, programs, horizon.state, *parts, 100) is None

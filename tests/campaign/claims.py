@@ -139,7 +139,7 @@ def _spoilt(held: np.ndarray, rng) -> np.ndarray:
         return -held
     if kind == "scaled":
         return held * (1 + 10 ** rng.uniform(-9, 1) * rng.normal(size=held.shape))
-    return rng.permutation(held.ravel()).reshape(held.shape)
+    return held.ravel()[rng.permutation(held.size)].reshape(held.shape)
 
 
 def _garbage(trial: Trial, proof, region: Region, found: Found, rng, t: int) -> None:

@@ -124,7 +124,7 @@ def branched(
         return int(np.where(off > EXACT, off * weight[horizon.columns], -1.0).argmax())
 
     first = solved({})
-    if first is None:
+    if first is None or not len(first.columns):  # or facts of thin sets seem to hold nowhere
         return None
     count, serial = 1, itertools.count()
     heap: list[tuple[float, int, Node]] = [(-first.value, next(serial), Node({}, first))]

@@ -31,6 +31,27 @@ INTERIOR = {
 FAULTY = 0.2
 """The part of cases whose solver fails."""
 
+BRANCHED = {
+    "rj.BranchAndCut()": 0.4,
+    "rj.BranchAndCut(nodes=0)": 0.12,
+    "rj.BranchAndCut(nodes=3)": 0.2,
+    "rj.BranchAndCut(products_by=rj.CuttingPlanes(rounds=0))": 0.2,
+    "rj.BranchAndCut(remove_stable=False)": 0.08,
+}
+OPTIONS = {
+    "": 0.5,
+    ", gap=0.0": 0.1,
+    ", gap=1e-2": 0.2,
+    ", time_limit=0.0": 0.1,
+    ", time_limit=0.01": 0.05,
+    ", gap=0.0, time_limit=0.1": 0.05,
+}
+OF_BRANCHES, OF_FORMS = 0.42, 0.06
+"""The parts of cases with `BranchAndCut` and with `LinearBounds`, whatever their architecture."""
+
+ROUND_FACETS = 0.1
+"""The part of those cases in which a template with ellipsoids stays."""
+
 
 @dataclass(frozen=True)
 class Case:
@@ -48,6 +69,7 @@ class Case:
         window: of the tube.
         fault: of the solver; None if it is a real one.
         every: each so many-th answer is spoilt.
+        options: further arguments of `reach`, in Python.
     """
 
     number: int
@@ -61,6 +83,12 @@ class Case:
     window: int | None
     fault: str | None
     every: int = 1
+    options: str = ""
+
+    @property
+    def branched(self) -> bool:
+        """Whether its relaxation is `BranchAndCut`."""
+        return "BranchAndCut" in self.parts["relaxation"]
 
     @property
     def rng(self) -> np.random.Generator:
@@ -72,7 +100,7 @@ class Case:
         """Python that computes the tube."""
         return (
             f"rj.reach(loop, X0, {self.shapes.horizon}, template, relaxation, {self.window}, "
-            f"solver, start={self.loop.start}, samples={SAMPLES})"
+            f"solver, start={self.loop.start}, samples={SAMPLES}{self.options})"
         )
 
     @property
@@ -117,6 +145,32 @@ def drawn(number: int, seed: int = 0) -> Case:
         "solver": solver,
     }
     window = shapes.windows[rng.integers(len(shapes.windows))]
+    window, options = _horizon_wide(np.random.default_rng([seed, number, 2]), parts, window)
+    units = tuple(units)
     return Case(
-        number, seed, shapes, loop, initial, scales, tuple(units), parts, window, fault, every
+        number, seed, shapes, loop, initial, scales, units, parts, window, fault, every, options
     )
+
+
+def _horizon_wide(
+    rng: np.random.Generator, parts: dict[str, str], window: int | None
+) -> tuple[int | None, str]:
+    """In a part of the cases a relaxation over the whole horizon, with facets; else nothing new.
+
+    Returns:
+        The window, and further arguments of `reach`.
+    """
+    chance = rng.random()
+    if chance >= OF_BRANCHES + OF_FORMS:
+        return window, ""
+    drawn, options = (
+        str(rng.choice(list(some), p=list(some.values()))) for some in (BRANCHED, OPTIONS)
+    )
+    by_forms = chance >= OF_BRANCHES
+    if "Ellipsoid" in parts["template"] or "Mixed" in parts["template"]:
+        if not by_forms and rng.random() < ROUND_FACETS:
+            parts["relaxation"] = drawn
+            return 1, ""
+        parts["template"] = "rj.Template.box(X0.dimension)"
+    parts["relaxation"] = "rj.LinearBounds()" if by_forms else drawn
+    return None, "" if by_forms else options

@@ -18,6 +18,10 @@ from tests.campaign.trial import Trial
 from tests.campaign.verdicts import judged, question
 
 QUESTIONS = 2
+DECIDED, DECIDED_ELSE = 0.5, 0.1
+"""The parts of questions that are decided without a tube too: of `BranchAndCut`, of others."""
+
+DECISIONS = (", relaxation=relaxation", ", relaxation=rj.BranchAndCut(nodes=3)", ", time_limit=0.0")
 ROUNDING = 1e-9
 
 
@@ -43,8 +47,10 @@ def checked(trial: Trial) -> None:
         statuses = trial.attempt("statuses", "proof.statuses", {"proof": proof}, *lines)
         ends = Counter(status.name for status in statuses or ())
         trial.outcome.statuses += ends
+        if isinstance(proof, rj.BranchCertificate):
+            trial.outcome.counts.update(f"rung: {way.name}" for way in proof.ways)
         useless = case.fault in USELESS and case.every == 1 and type(proof) is rj.Certificate
-        spoilt = case.fault not in OF_NUMBERS or np.size(proof.multipliers) > 0
+        spoilt = case.fault not in OF_NUMBERS or np.size(_multipliers(proof)) > 0
         if useless and spoilt and set(ends) - {"FAILED"}:
             said = f"useless answers ({case.fault}) are reported as {dict(ends)}"
             trial.fails("a useless answer does not count as failed", said, *lines)
@@ -67,7 +73,7 @@ def checked(trial: Trial) -> None:
     if case.initial.inner is not None:
         for _ in range(QUESTIONS):
             _verdict(trial, names, found, steps, rng)
-    if case.shapes.gradients:
+    if case.shapes.gradients and "LocalBounds" in case.parts["relaxation"]:
         _gradient(trial, names, rng)
 
 
@@ -113,10 +119,33 @@ def _certificates(trial: Trial, proofs, sets, found: Found, rng) -> None:
             _garbage(trial, proof, region, found, rng, t)
 
 
+def _multipliers(proof) -> np.ndarray:
+    """What `recheck` takes others of."""
+    if isinstance(proof, rj.BranchCertificate):
+        return proof.branches.multipliers
+    return proof.slopes if isinstance(proof, rj.LinearCertificate) else proof.multipliers
+
+
+def _spoilt(held: np.ndarray, rng) -> np.ndarray:
+    """Multipliers that nothing was optimised for, or that were for something else."""
+    kind = rng.choice(
+        ["random", "huge", "flipped", "scaled", "shuffled"], p=[0.5, 0.1, 0.15, 0.15, 0.1]
+    )
+    if kind == "random":
+        return rng.normal(size=held.shape) * 10 ** rng.uniform(-6, 6)
+    if kind == "huge":
+        return rng.choice([-1.0, 1.0], held.shape) * 10 ** rng.uniform(100, 305)
+    if kind == "flipped":
+        return -held
+    if kind == "scaled":
+        return held * (1 + 10 ** rng.uniform(-9, 1) * rng.normal(size=held.shape))
+    return held.ravel()[rng.permutation(held.size)].reshape(held.shape)
+
+
 def _garbage(trial: Trial, proof, region: Region, found: Found, rng, t: int) -> None:
     """What random multipliers prove holds too."""
-    shape = proof.multipliers.shape
-    multipliers = rng.normal(size=shape) * 10 ** rng.uniform(-6, 6)
+    held = np.asarray(_multipliers(proof))
+    multipliers = _spoilt(held, rng)
     names = {"proof": proof, "multipliers": multipliers}
     lines = [f"tube = {trial.case.reach}", f"proof = tube.proof({t})"]
     lines.append(f"multipliers = np.array({multipliers.tolist()})")
@@ -137,19 +166,45 @@ def _verdict(trial: Trial, names: dict, found: Found, steps, rng) -> None:
     asked = question(trial.case, found, steps, rng)
     if asked is None:
         return
-    lines = [f"tube = {trial.case.reach}"]
     sizes = abs(asked.rows).max(axis=1)
     extreme = " (rows of extreme length)" if abs(np.log10(sizes)).max() > 150 else ""
-    verdict = trial.attempt(f"verify{extreme}", asked.expression, names, *lines)
-    if verdict is None:
-        return
+    chance = DECIDED if trial.case.branched else DECIDED_ELSE
+    own = np.random.default_rng(
+        [trial.case.seed, trial.case.number, len(trial.outcome.verdicts), 3]
+    )
+    calls = {"verify": asked.expression}
+    if own.random() < chance:
+        first = 0 if trial.case.branched else 1
+        calls["decide"] = asked.decided(trial.case, DECISIONS[own.integers(first, len(DECISIONS))])
+    said = {}
+    for call, expression in calls.items():
+        lines = [f"tube = {trial.case.reach}"] if call == "verify" else []
+        verdict = trial.attempt(f"{call}{extreme}", expression, names, *lines)
+        if verdict is not None:
+            said[call] = verdict.status.name
+            _judged(trial, asked, call, verdict, extreme, *lines, f"print({expression})")
+    if {*said.values()} >= {"PROVED", "REFUTED"}:
+        sentence = f"verify and decide contradict each other: {said}"
+        lines = [f"tube = {trial.case.reach}", *(f"print({each})" for each in calls.values())]
+        trial.fails("verify and decide contradict each other", sentence, *lines)
+
+
+def _judged(trial: Trial, asked, call: str, verdict, extreme: str, *lines: str) -> None:
+    """Count a verdict, and compare it with what is known."""
     status = verdict.status.name
     known = "violated" if asked.violated else "satisfied" if asked.satisfied else "not known"
-    trial.outcome.verdicts[f"{asked.kind}, {known}: {status}"] += 1
+    prefix = "" if call == "verify" else f"{call}: "
+    trial.outcome.verdicts[f"{prefix}{asked.kind}, {known}: {status}"] += 1
     wrong = judged(trial.case, asked, status, verdict.counterexample)
     if wrong is not None:
-        family = wrong.split(",")[0][:60] + extreme
-        trial.fails(family, wrong, *lines, f"print({asked.expression})")
+        trial.fails(prefix + wrong.split(",")[0][:60] + extreme, wrong, *lines)
+    for (name, t), proof in verdict.certificates.items():
+        trial.outcome.counts["rechecks of decisions"] += 1
+        names = {"proof": proof, "np": np}
+        held = trial.attempt("recheck", "proof.recheck()", names, *lines)
+        if held is not None and np.any(held > 0):
+            said = f"recheck gives {held.tolist()} for {name} at t = {t}, which is proved"
+            trial.fails("recheck does not repeat a decision", said, *lines)
 
 
 def _gradient(trial: Trial, names: dict, rng) -> None:

@@ -10,7 +10,7 @@ PACKAGE = str(Path(rj.__file__).parent)
 
 ARGUMENTS = (
     r"X0|loop|plant|controller|input_box|template|relaxation|window|solver|horizon|start|samples|"
-    r"seed|progress|tube|goal|safe|avoid|Box|Polytope|Ellipsoid|Intersection|Template|"
+    r"seed|progress|gap|time_limit|tube|goal|safe|avoid|Box|Polytope|Ellipsoid|Intersection|Template|"
     r"EllipsoidTemplate|MixedTemplate|AffinePlant|MLP|ClosedLoop"
 )
 NAMES = re.compile(rf"\b({ARGUMENTS})\b")

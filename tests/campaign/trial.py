@@ -33,6 +33,7 @@ class Trial:
                 "template": case.parts["template"].split("([[")[0].split("(loop")[0],
                 "relaxation": case.parts["relaxation"],
                 "window": str(case.window),
+                "options": case.options.removeprefix(", ") or "none",
                 "solver": case.parts["solver"] if case.fault is None else "faulty",
                 "fault": str(case.fault),
                 "scales": case.scales.kind,

@@ -27,7 +27,7 @@ class Question:
     """A specification of two rows.
 
     Attributes:
-        expression: Python of the call of `verify`.
+        region: Python of the requirement, a keyword argument.
         kind: `goal`, `safe` or `avoid`.
         rows: `(2, n)`.
         limits: `(2,)`.
@@ -35,12 +35,24 @@ class Question:
         satisfied: whether it surely is.
     """
 
-    expression: str
+    region: str
     kind: str
     rows: np.ndarray
     limits: np.ndarray
     violated: bool
     satisfied: bool
+
+    @property
+    def expression(self) -> str:
+        """Python of the call of `verify`."""
+        return f"rj.verify(tube, {self.region}, samples={SAMPLES})"
+
+    def decided(self, case: Case, options: str) -> str:
+        """Python of the call of `decide`, with further arguments."""
+        return (
+            f"rj.decide(loop, X0, {case.shapes.horizon}, {self.region}, "
+            f"start={case.loop.start}, samples={SAMPLES}{options})"
+        )
 
 
 def question(
@@ -70,8 +82,7 @@ def question(
         pairs = zip(attained, d, strict=True)
         satisfied = all(high is not None and high <= limit for (_, high), limit in pairs)
         region = f"{kind}=rj.Polytope({literal(rows)}, {literal(limits)})"
-    text = f"rj.verify(tube, {region}, samples={SAMPLES})"
-    return Question(text, kind, rows, limits, violated, satisfied)
+    return Question(region, kind, rows, limits, violated, satisfied)
 
 
 def _row(case: Case, found: Found, rng: np.random.Generator) -> np.ndarray:

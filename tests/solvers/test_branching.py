@@ -305,7 +305,7 @@ def test_the_affine_leaf_is_bounded_by_its_form(case):
 @pytest.fixture(scope="module")
 def small():
     """A horizon of few units that switch, with all patterns of their phases."""
-    loop, X0 = switching_loop(2, hidden=(4,), seed=5, boxed=False), initial_set("box", 2, seed=5)
+    loop, X0 = switching_loop(2, hidden=(5,), seed=10), initial_set("box", 2, seed=10)
     horizon = horizon_of(loop, X0)
     assert 3 <= len(horizon.zero) <= 8
     return loop, X0, horizon, list(itertools.product((0, 1), repeat=len(horizon.zero)))

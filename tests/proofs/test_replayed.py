@@ -26,18 +26,13 @@ UNITS = {
 }
 
 CASES = [
-    (1, "box", "ReLU"),
     (1, "box", "HardTanh"),
     (2, "box", "ReLU"),
-    (2, "box", "LeakyReLU"),
     (2, "box", "time-varying"),
-    (2, "polytope", "ReLU"),
+    (2, "polytope", "LeakyReLU"),
     (2, "polytope", "HardTanh"),
-    (2, "simplex", "LeakyReLU"),
-    (3, "box", "HardTanh"),
     (3, "box", "residual"),
     (3, "polytope", "no input box"),
-    (3, "simplex", "ReLU"),
 ]
 
 

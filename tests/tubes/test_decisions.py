@@ -56,10 +56,6 @@ KNOWN = {
         {"safe": rj.Box([0, 0], [2, 2]), "goal": half_space([1, 1], 0.4)},
         REFUTED,
     ),
-        BOX,
-        {"safe": rj.Box([0, 0], [2, 2]), "goal": half_space([1, 1], 0.4)},
-        REFUTED,
-    ),
 }
 
 

@@ -88,9 +88,8 @@ def test_what_is_known_is_decided(X0, required, status):
 
 def broken(states, horizon, goal=None, safe=None, avoid=()):
     """Whether a trajectory breaks what is required."""
-    everywhere = (
-        avoid.items() if isinstance(avoid, dict) else [(t, avoid) for t in range(horizon + 1)]
-    )
+    if not isinstance(avoid, dict):
+        avoid = dict.fromkeys(range(horizon + 1), avoid)
     return (
         (goal is not None and not goal.contains(states[horizon]))
         or (safe is not None and not all(safe.contains(x) for x in states))

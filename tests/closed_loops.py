@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 import reachjax as rj
@@ -67,6 +68,26 @@ def initial_set(kind: str, n_x: int, seed: int = 0) -> Any:
             around.replace(lower=around.lower.at[0].set(far)), ball
         ),
     }[kind]
+
+
+def switching_loop(
+    n_x: int,
+    activation: Any = rj.ReLU(),  # noqa: B008  (immutable)
+    seed: int = 0,
+    hidden: Sequence[int] = (5, 4),
+    residual: bool = False,
+    **options: Any,
+) -> rj.ClosedLoop:
+    """The loop of `random_loop`, with units of this kind."""
+    loop = closed_loop(random_loop(n_x, hidden, seed, **options))
+    net = loop.controller.replace(activation=activation)
+    skip = 0.3 * np.ones((net.outputs, n_x))
+    return loop.replace(controller=rj.Residual(net, skip) if residual else net)
+
+
+def on_host(loop: rj.ClosedLoop, X0: rj.AbstractSet) -> tuple[Any, Any, Any]:
+    """The loop, the set and the box around it as numpy arrays."""
+    return jax.device_get((loop, X0, X0.bounding_box()))
 
 
 def recursion(

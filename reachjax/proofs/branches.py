@@ -142,6 +142,8 @@ class BranchCertificate(AbstractProof):
                 )
             branches = branches.replace(multipliers=given)
         count, upper = len(self.bounds), about.rows.ends(about.start)[1]
+        if len(upper) == count:  # each bound is of a row of its own
+            branches = branches.replace(weights=np.eye(count)[np.asarray(branches.owner)])
         # any of several rows bounds the least of them
         upper = upper if len(upper) == count else upper.min(keepdims=True)
         found = np.fmin(bounds_of(about, branches, count), upper)

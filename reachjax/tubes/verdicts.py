@@ -74,8 +74,11 @@ class Verdict:
     def __str__(self) -> str:
         lines = [self.status.name]
         for name, margins in self.margins.items():
-            t = int(np.nanargmin(margins))
             simulated = float(np.nanmin(self.simulated[name]))
+            if np.isnan(margins).all():  # refuted before anything was bounded
+                lines.append(f"  {name}: simulated margin {simulated:+.4g}")
+                continue
+            t = int(np.nanargmin(margins))
             lines.append(
                 f"  {name}: certified margin {margins[t]:+.4g} (smallest, at t = {t}), "
                 f"simulated margin {simulated:+.4g}"

@@ -1,0 +1,210 @@
+"""Claims about the default's tubes: sound whatever they may spend, and tight where they may."""
+
+import pickle
+import time
+
+import jax
+import numpy as np
+import pytest
+
+import reachjax as rj
+from reachjax.proofs.branches import BranchCertificate, Rung
+from tests.closed_loops import initial_set, switching_loop
+
+HORIZON = 3
+
+CASES = [
+    (1, "box", {"activation": rj.HardTanh()}, 0),
+    (2, "polytope", {}, 0),
+    (2, "ellipsoid", {"activation": rj.LeakyReLU(0.1)}, 0),
+    (3, "box", {"residual": True}, 0),
+    (2, "box", {"steps": HORIZON + 2}, 2),
+    (6, "box", {}, 0),
+]
+
+
+def made(n_x, kind, options):
+    loop = switching_loop(n_x, seed=n_x + 20, hidden=(4, 3), **options)
+    return loop, initial_set(kind, n_x, seed=n_x)
+
+
+def above_samples(tube, samples=3000):
+    """The least that an offset is above what is sampled, over all times."""
+    runs = np.asarray(tube.simulate(samples, seed=7))
+    rows = np.asarray(tube.template.directions)
+    return min(
+        float(np.min(X.b - (runs[:, k] @ rows.T).max(axis=0)))
+        for k, X in enumerate(tube.sets[1:], start=1)
+    )
+
+
+@pytest.fixture(scope="module", params=CASES, ids=lambda case: f"{case[0]}-{case[1]}-{case[3]}")
+def case(request):
+    """(loop, X0, start, tube)."""
+    n_x, kind, options, start = request.param
+    loop, X0 = made(n_x, kind, options)
+    return loop, X0, start, rj.reach(loop, X0, HORIZON, rj.Template.box(n_x), start=start)
+
+
+def test_sampled_states_are_inside(case):
+    assert above_samples(case[-1]) >= -1e-12
+
+
+def test_gaps_are_closed_and_not_negative(case):
+    *_, tube = case
+    runs = np.asarray(tube.simulate(3000, seed=7))
+    for k in range(1, HORIZON + 1):
+        gaps = np.asarray(tube.proof(k).gaps)
+        ranges = np.ptp(runs[:, k] @ np.asarray(tube.template.directions).T, axis=0) / 2
+        assert gaps.min() >= -1e-12
+        assert np.all(gaps <= 2e-3 * ranges)
+
+
+def test_proofs_recheck_to_the_offsets_of_the_sets(case):
+    *_, tube = case
+    for k in range(1, HORIZON + 1):
+        proof = tube.proof(k)
+        assert isinstance(proof, BranchCertificate)
+        np.testing.assert_array_equal(proof.bounds, tube.sets[k].b)
+        np.testing.assert_allclose(proof.recheck(), proof.bounds, atol=1e-12)
+
+
+def test_witnesses_are_states_of_the_set_that_attain_their_values(case):
+    loop, X0, start, tube = case
+    rows = np.asarray(tube.template.directions)
+    for k in range(1, HORIZON + 1):
+        proof = tube.proof(k)
+        states = np.asarray(proof.witness_states)
+        assert all(X0.contains(state) for state in states)
+        after = np.asarray(loop.simulate(states, k, start))[:, -1]
+        np.testing.assert_allclose(np.sum(rows * after, axis=1), proof.witnesses, atol=1e-12)
+
+
+def test_nodes_are_none_where_affine_forms_suffice(case):
+    *_, tube = case
+    for k in range(1, HORIZON + 1):
+        proof = tube.proof(k)
+        nodes = np.asarray(proof.nodes)
+        for way, count in zip(proof.ways, nodes, strict=True):
+            if way is not Rung.PRODUCTS:
+                expected = Rung.AFFINE_FORM, Rung.LINEAR_PROGRAM, Rung.PHASE_SPLITS
+                assert way is expected[min(count, 2)]
+
+
+def test_without_nodes_the_tube_is_that_of_affine_forms(case):
+    loop, X0, start, tube = case
+    cheap = rj.BranchAndCut(nodes=0)
+    template = rj.Template.box(loop.states)
+    loose = rj.reach(loop, X0, HORIZON, template, cheap, start=start, gap=1e9)
+    assert above_samples(loose) >= -1e-12
+    for k in range(1, HORIZON + 1):
+        assert set(loose.proof(k).ways) == {Rung.AFFINE_FORM}
+        assert not np.asarray(loose.proof(k).nodes).any()
+        assert np.all(loose.sets[k].b >= np.asarray(tube.sets[k].b) - 1e-9)
+    assert np.max(loose.sets[HORIZON].b - tube.sets[HORIZON].b) > 1e-3
+
+
+@pytest.mark.parametrize("limit", [0, 1e-9])
+def test_without_time_the_tube_holds_and_shows_its_gaps(case, limit):
+    loop, X0, start, _ = case
+    template = rj.Template.box(loop.states)
+    began = time.monotonic()
+    tube = rj.reach(loop, X0, HORIZON, template, start=start, time_limit=limit)
+    assert time.monotonic() - began < 10
+    assert above_samples(tube) >= -1e-12
+    for k in range(1, HORIZON + 1):
+        assert set(tube.proof(k).ways) == {Rung.AFFINE_FORM}
+        assert np.asarray(tube.proof(k).gaps).min() >= -1e-12
+    assert np.asarray(tube.proof(HORIZON).gaps).max() > 1e-3
+
+
+def test_a_larger_gap_leaves_no_more_than_that_open(case):
+    loop, X0, start, tube = case
+    template = rj.Template.box(loop.states)
+    loose = rj.reach(loop, X0, HORIZON, template, start=start, gap=0.3)
+    runs = np.asarray(tube.simulate(3000, seed=7))
+    for k in range(1, HORIZON + 1):
+        ranges = np.ptp(runs[:, k] @ np.asarray(tube.template.directions).T, axis=0) / 2
+        assert np.all(np.asarray(loose.proof(k).gaps) <= 0.31 * ranges)
+        assert np.all(loose.sets[k].b >= np.asarray(tube.sets[k].b) - 2e-4 * ranges)
+        assert np.sum(loose.proof(k).nodes) <= np.sum(tube.proof(k).nodes)
+    assert above_samples(loose) >= -1e-12
+
+
+@pytest.fixture(scope="module")
+def small():
+    """(loop, X0, tube) of two states."""
+    loop, X0 = made(2, "box", {})
+    return loop, X0, rj.reach(loop, X0, 2, rj.Template.box(2), samples=100)
+
+
+def test_it_is_as_tight_as_products_alone(small):
+    loop, X0, tube = small
+    other = rj.reach(loop, X0, 2, rj.Template.box(2), rj.CuttingPlanes(), samples=100)
+    for ours, theirs in zip(tube.sets[1:], other.sets[1:], strict=True):
+        ranges = np.asarray(ours.bounding_box().widths).max()
+        assert np.all(np.asarray(ours.b) <= np.asarray(theirs.b) + 1e-4 * ranges)
+        assert np.all(abs(np.asarray(ours.b) - np.asarray(theirs.b)) <= 1e-2 * ranges)
+
+
+def test_any_directions_are_bounded(small):
+    loop, X0, _ = small
+    template = rj.Template(np.random.default_rng(0).normal(size=(5, 2)))
+    tube = rj.reach(loop, X0, 2, template, samples=100)
+    assert above_samples(tube) >= -1e-12
+    assert np.asarray(tube.proof(2).gaps).max() <= 1e-3
+
+
+def test_the_same_call_gives_the_same_tube(small):
+    loop, X0, tube = small
+    again = rj.reach(loop, X0, 2, rj.Template.box(2), samples=100)
+    for one, other in zip(tube.sets, again.sets, strict=True):
+        jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_tubes_are_pickled_with_their_proofs(small):
+    *_, tube = small
+    again = pickle.loads(pickle.dumps(tube))
+    np.testing.assert_array_equal(again.proof(2).recheck(), tube.proof(2).recheck())
+    assert repr(again.proof(2)) == repr(tube.proof(2))
+    assert repr(again) == "ReachTube(horizon=2, facets=4, states=2)"
+
+
+def test_proofs_cannot_be_exchanged(small):
+    loop, X0, tube = small
+    other = rj.reach(loop, X0, 2, rj.Template.box(2), samples=100, time_limit=0)
+    for changes in ({"certificates": other.certificates}, {"sets": other.sets}):
+        with pytest.raises(ValueError, match="not those that were computed together"):
+            tube.replace(**changes)
+
+
+@pytest.mark.parametrize("name", ["gap", "time_limit"])
+@pytest.mark.parametrize(
+    ("value", "kind"),
+    [("1", TypeError), ([1.0], TypeError), (True, TypeError)]
+    + [(bad, ValueError) for bad in (-1.0, np.nan, np.inf)],
+)
+def test_limits_that_are_none_are_named(small, name, value, kind):
+    loop, X0, _ = small
+    with pytest.raises(kind, match=name):
+        rj.reach(loop, X0, 2, rj.Template.box(2), **{name: value})
+
+
+def test_a_gap_of_nothing_at_all_is_named(small):
+    loop, X0, _ = small
+    with pytest.raises(TypeError, match="gap"):
+        rj.reach(loop, X0, 2, rj.Template.box(2), gap=None)
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "name"),
+    [
+        ({"nodes": -1}, ValueError, "nodes"),
+        ({"nodes": 1.5}, TypeError, "nodes"),
+        ({"nodes": None}, TypeError, "nodes"),
+        ({"products_by": rj.PaperQC()}, TypeError, "products_by"),
+    ],
+)
+def test_budgets_that_are_none_are_named(options, kind, name):
+    with pytest.raises(kind, match=f"BranchAndCut.{name}"):
+        rj.BranchAndCut(**options)

@@ -29,7 +29,6 @@ from reachjax.tubes.successors import facets_by_products
 PRODUCTS = 4e6
 """Columns cubed of all facets of a tube that get products, in all: some tens of seconds."""
 
-
 EXACT = 1e-7
 """Where derivatives are asked for, a facet climbs until its gap is a smaller part of its range."""
 
@@ -84,9 +83,8 @@ def sets_by_branching(
             offsets, products = _with_products(steps[-1], directions, offsets, opened)
         X = Polytope(directions, offsets)
         seconds = time.perf_counter() - began
-        yield Reached(
-            X, _certificate(climbed, offsets, products, opened, seconds), climbed.states, False
-        )
+        proof = _certificate(climbed, offsets, products, opened, seconds)
+        yield Reached(X, proof, climbed.states, climb=False)
         ladder.horizon.narrow(*_ends(rows, np.asarray(jax.lax.stop_gradient(offsets))))
 
 
@@ -106,6 +104,7 @@ def _offsets(
         return proved
     held = Replay.of(ladder.horizon, *ladder.settled(climbed), horizon)
     moving = replayed(setting.loop, X0, box, directions, held, k, setting.start)
+    moving = jnp.where(jnp.isfinite(moving), moving, 0.0)  # what overflows has no derivative
     return proved + (moving - jax.lax.stop_gradient(moving))
 
 

@@ -39,6 +39,9 @@ from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
 FEW = 50
 """Linear programs that each bound may take at first, while ranges are those of affine forms."""
 
+PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
+"""How far an initial state is brought towards the middle of the set, so that it surely is in it."""
+
 BELOW = 1e-9
 """How far below zero a linear program should be, as a part of its form's range, to prove that."""
 
@@ -148,6 +151,7 @@ class _Decision:
     ):
         self._loop, self._X0, self._start = loop, X0, start
         self._horizon, self._on_host = horizon, jax.device_get(loop)
+        self._middle = np.asarray(boxed(X0, "X0").center)
         self._open = {(item.name, item.time): item for item in required}
         self._margins = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
@@ -205,7 +209,8 @@ class _Decision:
         margin = float(np.min(-climbed.bounds / units))
         self._note(key, bool(np.all(right)), margin, climbed)
         if not np.all(right):
-            self._tried([item], climbed.worst[climbed.attained > 0])
+            worst, middle = climbed.worst[climbed.attained > 0], self._middle
+            self._tried([item], np.concatenate([middle + p * (worst - middle) for p in PULLS]))
 
     def _note(
         self, key: tuple[str, int], holds: bool, margin: float, climbed: Climbed | None = None

@@ -27,7 +27,7 @@ from reachjax.numerics.checks import (
     wrapped,
 )
 from reachjax.numerics.pytrees import Replaceable, pytree
-from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
+from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.sets import AbstractSet, Template
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.cells import grid, halves
@@ -114,7 +114,7 @@ def reach_partitioned(
     X0: AbstractSet,
     horizon: int,
     template: Template,
-    relaxation: AbstractRelaxation = CuttingPlanes(),  # noqa: B008  (immutable)
+    relaxation: AbstractRelaxation = BranchAndCut(),  # noqa: B008  (immutable)
     window: int | None = None,
     solver: AbstractSolver = Auto(),  # noqa: B008
     *,

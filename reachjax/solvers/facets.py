@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, Self
@@ -20,7 +21,7 @@ from reachjax.proofs.reported import Judged, judged_offsets
 from reachjax.proofs.slopes import Held
 from reachjax.sets import Polytope
 from reachjax.solvers.base import AbstractSolver
-from reachjax.solvers.cut_pool import CutPool, joint
+from reachjax.solvers.cut_pool import NONE, CutPool, joint
 from reachjax.solvers.faults import proposed
 from reachjax.solvers.goals import AbstractGoal
 from reachjax.solvers.rounds import Rounds, Shown, idle, in_rounds
@@ -65,7 +66,10 @@ class Facets(AbstractGoal):
         for facet in range(len(program.objective.mid)):
             one = program.with_objective(slice(facet, facet + 1))
             attained = None if rounds.witness is None else partial(rounds.witness, facet)
-            found.append(_facet(one, pool, solver, rounds, attained, used))
+            if time.monotonic() < rounds.deadline:
+                found.append(_facet(one, pool, solver, rounds, attained, used))
+            else:
+                found.append(_unsolved(one, pool))
             used = found[-1].in_use
         return _joined(program, pool, found)
 
@@ -150,6 +154,12 @@ def _facet(
     seconds = np.sum([each.solution.seconds for each in found], axis=0)
     spent = best.judged._replace(proposal=best.solution._replace(seconds=seconds))
     return best._replace(judged=spent)
+
+
+def _unsolved(program: Program, pool: CutPool) -> _Round:
+    """What is proved of a facet without a solver, when the time is over."""
+    given = program.replace(products=joint(pool.core, NONE))
+    return _Round(NONE, judged_offsets(given, Solution.blank_for(given)))
 
 
 def _joined(program: Program, pool: CutPool, found: list[_Round]) -> tuple[Products, Judged]:

@@ -140,9 +140,13 @@ def _ends(cut: PolyhedralSet, directions: Rows) -> Ends:
         values = directions @ Ball.between(cut.lower, cut.upper)
         return values.lower, values.upper
     A, b = (np.asarray(part) for part in cut.facets)
-    count = len(directions)
-    try:
-        found, *_ = support(A, b, np.concatenate([-directions, directions]))
-    except RuntimeError:  # linear programs too hard for the solver: the norms do
-        return np.full(count, -np.inf), np.full(count, np.inf)
-    return -found[:count], found[count:]
+    lower, upper = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)
+    known = np.isfinite(directions).all(axis=1)
+    some, count = directions[known], int(known.sum())
+    if count:
+        try:
+            found, *_ = support(A, b, np.concatenate([-some, some]))
+        except RuntimeError:  # linear programs too hard for the solver: the norms do
+            return lower, upper
+        lower[known], upper[known] = -found[:count], found[count:]
+    return lower, upper

@@ -47,7 +47,7 @@ class LinearCertificate(AbstractProof):
         """Prove the offsets anew, step by step from the initial set, with these or other slopes.
 
         Sound for any slopes: where two lines of this slope must lie to hold a unit between them is
-        found again on the intervals that are proved on the way.
+        found again on the intervals that are proved on the way. Infinite where they overflow.
 
         Raises:
             ValueError: the slopes contain NaN or infinity, or have another shape.
@@ -74,4 +74,4 @@ class LinearCertificate(AbstractProof):
         directions = np.broadcast_to(self.directions, (self.k, *self.directions.shape))
         box = self.X0.bounding_box()
         *_, last = unrolled(self.loop, self.X0, box, directions, self.start, chosen)
-        return np.asarray(last.offsets)
+        return np.where(np.isnan(last.offsets), np.inf, last.offsets)

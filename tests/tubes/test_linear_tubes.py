@@ -96,6 +96,16 @@ def test_a_recheck_gives_the_same_bounds_and_holds_for_any_slopes():
         proof.recheck(slopes * np.nan)
 
 
+@pytest.mark.parametrize("kind", ["box", "polytope"])
+def test_slopes_that_overflow_prove_nothing(kind):
+    """Nor do they end in the linear programs of a polytope."""
+    loop = closed_loop(random_loop(2, hidden=(6, 4), seed=3))
+    proof = rj.reach(loop, initial_set(kind, 2), 2, rj.Template.box(2), rj.LinearBounds()).proof(2)
+    for size in (1e150, 1e300):
+        found = proof.recheck(np.full(proof.slopes.shape, size))
+        assert np.all(found >= proof.witnesses)
+
+
 def test_a_certificate_says_what_every_other_says():
     loop, X0 = closed_loop(random_loop(2)), initial_set("box", 2)
     tube = tube_of(loop, X0, rj.Template.octagonal(2))

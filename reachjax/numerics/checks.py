@@ -26,24 +26,29 @@ def owned(tree: Any) -> Any:
     copied once.
     """
     leaves, structure = jax.tree.flatten(tree)
-    copies = {id(leaf): leaf for leaf in leaves}
-    copies = {key: _own(leaf) for key, leaf in copies.items()}
-    return jax.tree.unflatten(structure, [copies[id(leaf)] for leaf in leaves])
+    known = {id(leaf): leaf for leaf in leaves if not isinstance(leaf, Tracer)}
+    origins = list(known.values())
+    copies = dict(zip(known, _placed([np.array(leaf) for leaf in origins], origins), strict=True))
+    return jax.tree.unflatten(structure, [copies.get(id(leaf), leaf) for leaf in leaves])
 
 
-def _own(leaf: Any) -> Any:
-    if isinstance(leaf, Tracer):
-        return leaf
+def _placed(arrays: list[np.ndarray], origins: list[Any]) -> list[jax.Array]:
+    """Arrays of JAX's that own their numbers, each on the device that its origin was put on.
+
+    `jnp.array` and `jnp.asarray` compile a copy for each shape; this compiles nothing.
+    """
+    devices = [_device(origin) for origin in origins]
     with jax.ensure_compile_time_eval():  # a constant stays one inside jax.jit
-        return jnp.array(_gathered(leaf))
+        if not any(devices):  # all in one call, for each takes its time
+            return jax.device_put(arrays)
+        return [jax.device_put(*pair) for pair in zip(arrays, devices, strict=True)]
 
 
-def _gathered(value: Any) -> Any:
-    """A concrete array that is laid out over a mesh on the host; anything else as it is."""
+def _device(origin: Any) -> jax.sharding.Sharding | None:
+    """Where an array was put; None of one that is nowhere in particular, or on several devices."""
     single = jax.sharding.SingleDeviceSharding
-    if isinstance(value, jax.Array) and not isinstance(value.sharding, single):
-        return np.asarray(value)
-    return value
+    stays = isinstance(origin, jax.Array) and isinstance(origin.sharding, single)
+    return origin.sharding if stays and origin.committed else None
 
 
 EXACT = 2**53
@@ -98,12 +103,19 @@ def as_floats(value: Any, name: str) -> jax.Array:
         _require_one_device(value, name)
         return jnp.asarray(value, dtype=float)
     try:
-        if isinstance(value, jax.Array):
-            with jax.ensure_compile_time_eval():  # a constant stays one inside jax.jit
-                return jnp.array(_gathered(value), dtype=float)
+        if is_concrete(value) and (isinstance(value, jax.Array) or not _inside_jit()):
+            array = np.array(value)
+            if array.dtype.kind in "biuf":
+                floats = array.astype(jax.dtypes.canonicalize_dtype(float))
+                return _placed([floats], [value])[0]
         return jnp.array(value, dtype=float)
     except ValueError as error:
         raise TypeError(str(error)) from None
+
+
+def _inside_jit() -> bool:
+    """Whether operations on numbers are traced here."""
+    return not is_concrete(jnp.asarray(0.0))
 
 
 def require_exact(value: Any, name: str) -> None:

@@ -160,9 +160,13 @@ class Simulations:
         return np.asarray(self._X0.contains(_padded(states)))[: len(states)]
 
     def _values(self, k: int, region: AbstractSet) -> Float[np.ndarray, "c m"]:
-        """What a set bounds, at each trajectory after `k` steps."""
+        """What a set bounds, at each trajectory after `k` steps: facets in numpy."""
         points = self._trajectories[:, k]
-        return np.asarray(region.bounded_values(_padded(points)))[: len(points)]
+        flat, curved = region.parts
+        values = [] if flat is None else [points @ np.asarray(flat.facets[0]).T]
+        if curved is not None:
+            values.append(np.asarray(curved.bounded_values(_padded(points)))[: len(points)])
+        return np.concatenate(values, axis=1)
 
     def attained(
         self, k: int, region: AbstractSet

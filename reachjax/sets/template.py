@@ -83,9 +83,10 @@ class Template(AbstractTemplate):
 
     def __post_init__(self):
         if is_concrete(self.directions):
-            for rows in self.directions.reshape(-1, *self.directions.shape[-2:]):
+            directions = np.asarray(self.directions)
+            for rows in directions.reshape(-1, *directions.shape[-2:]):
                 try:
-                    Polytope(rows, jnp.ones(len(rows))).bounding_box()
+                    Polytope(rows, np.ones(len(rows))).bounding_box()
                 except ValueError as error:
                     raise ValueError(f"Template.directions do not bound a set: {error}") from None
 

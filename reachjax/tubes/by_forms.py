@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.checks import is_concrete
+from reachjax.numerics.checks import is_concrete, owned
 from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
 from reachjax.proofs.linear import LinearCertificate
 from reachjax.proofs.proposal import SolverStatus
@@ -63,7 +63,7 @@ def sets_by_forms(
             k=k,
             start=start,
         )
-        region = shaped.polytope(jnp.asarray(step.offsets))
+        region = shaped.polytope(owned(step.offsets))
         states = np.asarray(step.corners) if is_concrete(step.corners) else np.zeros((0, 0))
         yield Reached(region, proof, states, climb=False)
 

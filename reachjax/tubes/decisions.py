@@ -10,7 +10,6 @@ until it is decided.
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops import ClosedLoop
@@ -266,7 +265,7 @@ def _certificate(climbed: Climbed) -> BranchCertificate:
     count = len(climbed.bounds)
     return BranchCertificate(
         codes=np.full(count, int(SolverStatus.SOLVED)),
-        bounds=jnp.asarray(climbed.bounds),
+        bounds=owned(climbed.bounds),
         witnesses=climbed.attained,
         witness_states=climbed.worst,
         seconds=np.full(count, np.nan),

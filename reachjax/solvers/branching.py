@@ -11,7 +11,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -108,8 +108,9 @@ def branched(
     rows, constants = np.asarray(forms.columns), np.asarray(forms.rows[:, 0])
     size = abs(rows).max(initial=0.0)
 
-    def solved(phases: dict[int, int]) -> Vertex | None:
-        return programs.largest(rows, constants, (zero[i, side] for i, side in phases.items()))
+    def solved(phases: dict[int, int], basis: Any = None) -> Vertex | None:
+        held = (zero[i, side] for i, side in phases.items())
+        return programs.largest(rows, constants, held, basis=basis)
 
     def split_at(node: Node) -> int | None:
         """The pair to be split; None if all that is not held is as it should be."""
@@ -138,7 +139,7 @@ def branched(
         children = []
         for side in (0, 1):
             phases = node.phases | {pair: side}
-            vertex = solved(phases)
+            vertex = solved(phases, node.vertex.basis)
             count += 1
             children.append(None if vertex is None else Node(phases, vertex))
         if None in children:

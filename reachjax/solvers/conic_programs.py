@@ -51,6 +51,7 @@ class ConicPrograms(AbstractPrograms):
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
         reach: float = 1.0,
+        basis: Any = None,
     ) -> Vertex | None:
         """The largest value of a row, or of the least of several; None where there is no answer."""
         given = np.zeros((len(rows), self._width))

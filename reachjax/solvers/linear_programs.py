@@ -22,6 +22,9 @@ from reachjax.programs.affine import AffineForms
 TOLERANCE = 1e-9
 """Of feasibility, primal and dual, in rows of unit size."""
 
+DANTZIG, OFF = 0, 0
+"""Few pivots lead from a node to its branches: weights of edges and scales take longer."""
+
 OPTIMAL, INFEASIBLE = highspy.HighsModelStatus.kOptimal, highspy.HighsModelStatus.kInfeasible
 
 
@@ -34,6 +37,7 @@ class Vertex(NamedTuple):
         multipliers: `(m,)` of the facts that bound it, or that show that there is nothing.
         weights: `(r,)` of the rows of which the least is largest, of sum 1.
         reduced: `(n,)`, by how much the bound rises with the range of each column.
+        basis: from which a program with a few facts more is solved soon.
     """
 
     value: float
@@ -41,6 +45,7 @@ class Vertex(NamedTuple):
     multipliers: Float[np.ndarray, " m"]
     weights: Float[np.ndarray, " r"]
     reduced: Float[np.ndarray, " n"]
+    basis: Any = None
 
 
 class AbstractPrograms(abc.ABC):
@@ -63,6 +68,7 @@ class AbstractPrograms(abc.ABC):
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
         reach: float = 1.0,
+        basis: Any = None,
     ) -> Vertex | None:
         """The largest value of a row, or of the least of several; None where there is no answer.
 
@@ -71,6 +77,7 @@ class AbstractPrograms(abc.ABC):
             constants: of the rows.
             zero: facts that are held at zero.
             reach: what bounds the columns of units.
+            basis: where the search begins; None where the last one ended.
         """
 
 
@@ -88,6 +95,8 @@ class LinearPrograms(AbstractPrograms):
             "output_flag": False,
             "presolve": "off",
             "threads": 1,
+            "simplex_dual_edge_weight_strategy": DANTZIG,
+            "simplex_scale_strategy": OFF,
             "primal_feasibility_tolerance": TOLERANCE,
             "dual_feasibility_tolerance": TOLERANCE,
         }.items():
@@ -121,6 +130,7 @@ class LinearPrograms(AbstractPrograms):
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
         reach: float = 1.0,
+        basis: Any = None,
     ) -> Vertex | None:
         """The largest value of a row, or of the least of several; None where there is no answer."""
         if not (np.isfinite(rows).all() and np.isfinite(constants).all()):
@@ -143,6 +153,8 @@ class LinearPrograms(AbstractPrograms):
         self._model.changeColsCost(width, np.arange(width, dtype=np.int32), objective)
         if reach != 1.0:
             self._bound_units(reach)
+        if basis is not None:
+            self._model.setBasis(basis)
         found = self._solved(rows, constants, size, extra)
         if reach != 1.0:
             self._bound_units(1.0)
@@ -182,6 +194,7 @@ class LinearPrograms(AbstractPrograms):
             -size * duals[self._rows] / self._size,
             weights,
             self._placed(size * np.array(solution.col_dual)[1:]),
+            self._model.getBasis(),
         )
 
     def _placed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:

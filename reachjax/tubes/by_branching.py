@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.numerics.checks import is_concrete
+from reachjax.numerics.checks import is_concrete, owned
 from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import SolverStatus
@@ -26,8 +26,8 @@ from reachjax.tubes.ladder import Climbed, Ladder
 from reachjax.tubes.steps import Reached, Setting, Step
 from reachjax.tubes.successors import facets_by_products
 
-PRODUCTS = 4e6
-"""Columns cubed of all facets of a tube that get products, in all: some tens of seconds."""
+PRODUCTS = 5e7
+"""The fourth power of the columns of all facets that get products, in all: some tens of seconds."""
 
 EXACT = 1e-7
 """Where derivatives are asked for, a facet climbs until its gap is a smaller part of its range."""
@@ -75,7 +75,7 @@ def sets_by_branching(
         gaps = climbed.bounds - climbed.attained
         opened = np.flatnonzero(gaps > setting.gap * ranges)
         opened = opened[np.argsort(-gaps[opened], kind="stable")]
-        cost = float(climbed.columns.shape[1]) ** 3
+        cost = float(climbed.columns.shape[1]) ** 4
         opened = opened[: int(work // cost)] if not setting.late else opened[:0]
         work -= len(opened) * cost
         products = None
@@ -99,7 +99,7 @@ def _offsets(
     k: int,
 ) -> Float[Array, " f"]:
     """What is proved, with its derivative where it is asked for."""
-    proved = jnp.asarray(climbed.bounds)
+    proved = owned(climbed.bounds)
     if is_concrete(setting.loop, X0, directions):
         return proved
     held = Replay.of(ladder.horizon, *ladder.settled(climbed), horizon)

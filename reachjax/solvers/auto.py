@@ -10,7 +10,7 @@ from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver
-from reachjax.solvers.cvxpy_solvers import Clarabel
+from reachjax.solvers.clarabel import Clarabel
 from reachjax.solvers.faults import proposed_enclosure
 from reachjax.solvers.interior_point import InteriorPoint
 

@@ -1,4 +1,4 @@
-"""Conic solvers by name: Clarabel, and any other that cvxpy knows."""
+"""Conic solvers by name: SCS, and any other that cvxpy knows."""
 
 from __future__ import annotations
 
@@ -8,41 +8,6 @@ from typing import Any
 
 from reachjax.solvers.base import require_positive
 from reachjax.solvers.conic import AbstractConicSolver
-
-
-@dataclasses.dataclass(frozen=True)
-class Clarabel(AbstractConicSolver):
-    """The interior-point code Clarabel, which `Auto` takes for small programs.
-
-    Args:
-        tolerance: of feasibility and of the gap, relative and absolute.
-        max_iterations: a facet that needs more is reported with status `LIMIT`.
-        time_limit: seconds for each facet.
-    """
-
-    tolerance: float = 1e-9
-    max_iterations: int = 200
-    time_limit: float = float("inf")
-
-    def __post_init__(self):
-        require_positive(self)
-
-    def settings(self) -> tuple[str, dict[str, Any]]:
-        """Clarabel's own names; a stalled run still returns its last iterate, as inaccurate.
-
-        Chordal decomposition stays off: with it, programs whose dual has no interior (dead neurons,
-        the paper's constraints without `lambda_ij`) stalled at two digits; without it, at nine.
-        """
-        tight = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
-        loose = ("reduced_tol_gap_abs", "reduced_tol_gap_rel", "reduced_tol_feas")
-        return "CLARABEL", {
-            **dict.fromkeys(tight, self.tolerance),
-            **dict.fromkeys(loose, max(1e-3, self.tolerance)),
-            "max_iter": self.max_iterations,
-            "time_limit": self.time_limit,
-            "accept_unknown": True,
-            "chordal_decomposition_enable": False,
-        }
 
 
 @dataclasses.dataclass(frozen=True)

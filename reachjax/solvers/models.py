@@ -8,9 +8,18 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
+from jaxtyping import Float
 
 from reachjax.programs.presolve import THINNEST, NormalProgram
 from reachjax.sets import NormalForm
+
+
+def unit_generators(program: NormalProgram) -> tuple[sp.csc_array, Float[np.ndarray, " K"]]:
+    """The flattened generators `(n * n, K)` at unit size, and the sizes that they had."""
+    generators = program.generators.columns()
+    sizes = np.sqrt(np.asarray(generators.multiply(generators).sum(axis=0)).ravel())
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    return sp.csc_array(generators @ sp.diags_array(1 / sizes)), sizes
 
 
 class Multipliers:
@@ -19,10 +28,7 @@ class Multipliers:
     def __init__(self, program: NormalProgram):
         import cvxpy as cp
 
-        generators = program.generators.columns()
-        sizes = np.sqrt(np.asarray(generators.multiply(generators).sum(axis=0)).ravel())
-        self.sizes = np.where(sizes > 0, sizes, 1.0)
-        generators = sp.csc_array(generators @ sp.diags_array(1 / self.sizes))
+        generators, self.sizes = unit_generators(program)
         free, signed = generators[:, program.free], generators[:, ~program.free]
         self.program = program
         self.free = cp.Variable(free.shape[1]) if free.shape[1] else None

@@ -1,5 +1,8 @@
 """Solvers propose; what they propose is well formed, and every way of ending is mapped."""
 
+from types import SimpleNamespace
+
+import clarabel
 import jax
 import numpy as np
 import pytest
@@ -9,6 +12,8 @@ import reachjax as rj
 from reachjax.programs.presolve import presolved
 from reachjax.proofs.recheck import interval_offsets
 from reachjax.proofs.reported import judged_offsets
+from reachjax.solvers import clarabel as direct
+from reachjax.solvers import conic
 from reachjax.solvers.conic import STATUSES
 from tests.closed_loops import closed_loop, one_step, random_loop, step_program
 from tests.networks import box_region, directions, simulate
@@ -16,7 +21,7 @@ from tests.networks import box_region, directions, simulate
 SOLVERS = {
     "Clarabel": rj.Clarabel(),
     "SCS": rj.SCS(),
-    "by name": rj.CvxpySolver("CLARABEL", {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9}),
+    "by name": rj.CvxpySolver(*rj.Clarabel().settings()),
 }
 
 
@@ -40,6 +45,13 @@ def test_solvers_agree(setting, solution):
     reference = rj.Clarabel().solve(setting[2])
     # SCS stops at 1e-7 of feasibility, which leaves some 1e-5 in the value
     np.testing.assert_allclose(solution.offsets, reference.offsets, atol=2e-5)
+
+
+def test_called_directly_clarabel_answers_as_it_does_by_cvxpy(setting):
+    straight, by_name = SOLVERS["Clarabel"].solve(setting[2]), SOLVERS["by name"].solve(setting[2])
+    np.testing.assert_allclose(straight.offsets, by_name.offsets, atol=1e-8)
+    np.testing.assert_allclose(straight.moments, by_name.moments, atol=1e-4)
+    np.testing.assert_array_equal(straight.statuses, by_name.statuses)
 
 
 def test_moments_are_semidefinite_with_corner_one_and_satisfy_facts_and_complementarity(
@@ -110,18 +122,73 @@ def test_bounds_are_sound_under_every_status_that_cvxpy_has(setting, monkeypatch
             variable.save_value(None if "feasible" in word else value)
 
     monkeypatch.setattr(cp.Problem, "solve", solve)
-    solution = rj.Clarabel().solve(program)
+    solution = rj.SCS().solve(program)
     assert set(solution.statuses) == {STATUSES[word]}
+    require_sound(data, region, program, solution)
+    if word == "solver_error" or "feasible" in word:
+        require_nothing_proposed(program, solution)
+
+
+def require_sound(data, region, program, solution):
     bounds = judged_offsets(program, solution).value
     certificate = rj.Certificate.from_solution(program, bounds, solution)
     states = np.vstack([region.corners, region.sample(20_000, seed=0)])
     attained = (simulate(data, states, 1)[1] @ directions(3, extra=1).T).max(axis=0)
     assert np.all(certificate.bounds >= attained)
     assert all(status.advice for status in certificate.statuses)
-    if word == "solver_error" or "feasible" in word:
-        np.testing.assert_array_equal(certificate.bounds, interval_offsets(program))
-        assert np.isnan(solution.offsets).all()
-        assert np.isnan(solution.moments).all()
+
+
+def require_nothing_proposed(program, solution):
+    bounds = judged_offsets(program, solution).value
+    np.testing.assert_array_equal(bounds, interval_offsets(program))
+    assert np.isnan(solution.offsets).all()
+    assert np.isnan(solution.moments).all()
+
+
+class Panic(BaseException):
+    """As compiled code raises it."""
+
+
+@pytest.mark.parametrize("word", [*direct.STATUSES, "NumericalError", "Unsolved", "a panic", "NaN"])
+def test_bounds_are_sound_under_every_status_that_clarabel_has(setting, monkeypatch, word):
+    """Whatever Clarabel says, with values of any kind, the bound holds."""
+    data, region, program = setting
+    rng = np.random.default_rng(0)
+
+    def solver(P, q, A, b, cones, settings):
+        def solve():
+            if word == "a panic":
+                raise Panic
+            x, z = rng.normal(size=A.shape[1]), rng.normal(size=A.shape[0])
+            return SimpleNamespace(status=word, x=x * np.nan if word == "NaN" else x, z=z)
+
+        return SimpleNamespace(solve=solve)
+
+    monkeypatch.setattr(clarabel, "DefaultSolver", solver)
+    solution = rj.Clarabel().solve(program)
+    assert set(solution.statuses) == {direct.STATUSES.get(word, rj.SolverStatus.FAILED)}
+    require_sound(data, region, program, solution)
+    if direct.STATUSES.get(word) not in direct.ANSWERS:
+        require_nothing_proposed(program, solution)
+
+
+def test_every_status_of_clarabel_is_mapped():
+    words = {word for word in dir(clarabel.SolverStatus) if word[0].isupper()}
+    failures = {"Unsolved", "NumericalError", "CallbackTerminated"}
+    assert words == set(direct.STATUSES) | failures
+
+
+@pytest.mark.parametrize("interrupt", [KeyboardInterrupt, SystemExit])
+def test_clarabel_can_be_interrupted(setting, monkeypatch, interrupt):
+    def solver(*_):
+        def solve():
+            raise interrupt
+
+        return SimpleNamespace(solve=solve)
+
+    monkeypatch.setattr(clarabel, "DefaultSolver", solver)
+    with pytest.raises(interrupt):
+        rj.Clarabel().solve(setting[2])
 
 
 def test_every_status_of_cvxpy_is_mapped():
@@ -166,18 +233,19 @@ def test_rows_at_rounding_level_and_empty_columns_do_not_reach_the_solver(settin
     np.testing.assert_allclose(sizes, 1.0, rtol=0.5)  # sums of pairs are estimated
 
 
-def test_the_model_is_built_once_for_all_facets(setting, monkeypatch):
-    from reachjax.solvers.conic import FacetModel
-
+@pytest.mark.parametrize(
+    ("model", "name"), [(direct.FacetCone, "Clarabel"), (conic.FacetModel, "SCS")]
+)
+def test_the_model_is_built_once_for_all_facets(setting, monkeypatch, model, name):
     built = []
-    original = FacetModel.__init__
+    original = model.__init__
 
-    def counted(self, program):
-        built.append(program)
-        original(self, program)
+    def counted(self, *args):
+        built.append(args)
+        original(self, *args)
 
-    monkeypatch.setattr(FacetModel, "__init__", counted)
-    rj.Clarabel().solve(setting[2])
+    monkeypatch.setattr(model, "__init__", counted)
+    SOLVERS[name].solve(setting[2])
     assert len(built) == 1
 
 

@@ -123,7 +123,9 @@ class Step:
         Raises:
             ValueError: the set is empty or unbounded.
         """
-        return boxed(self.X, f"the certified set at t = {self.t}" if self.k else "X0")
+        if not self.k:
+            return boxed(self.X, "X0")
+        return boxed(self.X, f"the certified set at t = {self.t}, of what X0 reaches,")
 
     @cached_property
     def window(self) -> Window:

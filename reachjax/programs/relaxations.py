@@ -257,7 +257,7 @@ class BranchAndCut(AbstractRelaxation):
     2018), with the products of Burer (2009) for cuts.
     """
 
-    nodes: int = 2000
+    nodes: int = 10_000
     products_by: CuttingPlanes = CuttingPlanes()
     remove_stable: bool = True
 

@@ -82,15 +82,10 @@ def affine_leaf(forms: AffineForms, horizon: Horizon) -> Found:
     return Found(phases, none, weights, columns[None], nodes=0)
 
 
-def branched(
-    horizon: Horizon,
-    programs: AbstractPrograms,
-    forms: AffineForms,
-    attained: Callable[[list[Float[np.ndarray, " n"]]], float],
-    enough: Callable[[float, float], bool],
-    budget: int,
-) -> Found | None:
-    """Bound the largest value of a form, or of the least of several.
+class Tree:
+    """Branches that bound the largest value of a form, or of the least of several.
+
+    It can be grown by turns with others; what its leaves prove holds at any moment.
 
     Args:
         horizon: whose facts hold.
@@ -98,62 +93,103 @@ def branched(
         forms: `r` of them.
         attained: the largest value that is known to be attained, given columns of more solutions.
         enough: whether to stop, given the bound and what is attained.
-        budget: how many linear programs may be solved.
 
-    Returns:
-        The leaves; None where the first program has no answer.
+    Attributes:
+        nodes: how many linear programs were solved.
     """
-    zero, facts = horizon.zero, horizon.facts
-    forms = forms.widened(facts.columns.shape[1])
-    rows, constants = np.asarray(forms.columns), np.asarray(forms.rows[:, 0])
-    size = abs(rows).max(initial=0.0)
 
-    def solved(phases: dict[int, int], basis: Any = None) -> Vertex | None:
-        held = (zero[i, side] for i, side in phases.items())
-        return programs.largest(rows, constants, held, basis=basis)
+    def __init__(
+        self,
+        horizon: Horizon,
+        programs: AbstractPrograms,
+        forms: AffineForms,
+        attained: Callable[[list[Float[np.ndarray, " n"]]], float],
+        enough: Callable[[float, float], bool],
+    ):
+        forms = forms.widened(horizon.facts.columns.shape[1])
+        self._rows, self._constants = np.asarray(forms.columns), np.asarray(forms.rows[:, 0])
+        self._horizon, self._programs = horizon, programs
+        self._attained, self._enough = attained, enough
+        self._serial, self._stuck = itertools.count(), False
+        self._heap: list[tuple[float, int, Node]] = []
+        self._empty: list[Node] = []
+        self._best, self.nodes = -np.inf, 1
+        first = self._solved({})
+        if first is not None and len(first.columns):  # facts of thin sets seem to hold nowhere
+            self._push(first.value, Node({}, first))
+            self._best = attained([first.columns])
 
-    def split_at(node: Node) -> int | None:
-        """The pair to be split; None if all that is not held is as it should be."""
-        if not len(zero):
-            return None
-        values = facts.columns @ node.vertex.columns + facts.rows[:, 0]
-        off = np.minimum(values[zero[:, 0]], values[zero[:, 1]]) / horizon.gaps
-        off[list(node.phases)] = 0.0
-        if off.max() <= EXACT:
-            return None
-        weight = abs(node.vertex.reduced) + SHARE * abs(rows).max(axis=0) + EXACT * size
-        return int(np.where(off > EXACT, off * weight[horizon.columns], -1.0).argmax())
+    @property
+    def is_open(self) -> bool:
+        """Whether there is more to be had from it."""
+        if self._stuck or not self._heap:
+            return False
+        return not self._enough(-self._heap[0][0], self._best)
 
-    first = solved({})
-    if first is None or not len(first.columns):  # or facts of thin sets seem to hold nowhere
-        return None
-    count, serial = 1, itertools.count()
-    heap: list[tuple[float, int, Node]] = [(-first.value, next(serial), Node({}, first))]
-    empty: list[Node] = []
-    best = attained([first.columns]) if len(first.columns) else -np.inf
-    while heap and count < budget and not enough(-heap[0][0], best):
-        bound, _, node = heap[0]
-        pair = split_at(node)
-        if pair is None:
-            break
+    def grow(self, budget: int) -> None:
+        """Split leaves until it is closed, or so many more programs are solved."""
+        budget += self.nodes
+        while self.nodes < budget and self.is_open:
+            pair = self._split_at(self._heap[0][-1])
+            if pair is None or not self._split(pair):
+                self._stuck = True
+
+    def _split(self, pair: int) -> bool:
+        """Whether the leaf of the largest bound could be split."""
+        bound, _, node = self._heap[0]
         children = []
         for side in (0, 1):
             phases = node.phases | {pair: side}
-            vertex = solved(phases, node.vertex.basis)
-            count += 1
+            vertex = self._solved(phases, node.vertex.basis)
+            self.nodes += 1
             children.append(None if vertex is None else Node(phases, vertex))
         if None in children:
-            break
-        heapq.heappop(heap)
+            return False
+        heapq.heappop(self._heap)
         if solutions := [each.vertex.columns for each in children if len(each.vertex.columns)]:
-            best = max(best, attained(solutions))
+            self._best = max(self._best, self._attained(solutions))
         for child in children:
             if len(child.vertex.columns):
-                value = min(child.vertex.value, -bound)
-                heapq.heappush(heap, (-value, next(serial), child))
+                self._push(min(child.vertex.value, -bound), child)
             else:
-                empty.append(_proved_empty(child, node, best, horizon))
-    return _found([node for *_, node in heap] + empty, len(zero), count)
+                self._empty.append(_proved_empty(child, node, self._best, self._horizon))
+        return True
+
+    def _push(self, value: float, node: Node) -> None:
+        heapq.heappush(self._heap, (-value, next(self._serial), node))
+
+    def _solved(self, phases: dict[int, int], basis: Any = None) -> Vertex | None:
+        held = (self._horizon.zero[i, side] for i, side in phases.items())
+        return self._programs.largest(self._rows, self._constants, held, basis=basis)
+
+    def _split_at(self, node: Node) -> int | None:
+        """The pair to be split; None if all that is not held is as it should be."""
+        horizon, rows = self._horizon, self._rows
+        if not len(horizon.zero):
+            return None
+        facts = horizon.facts
+        values = (facts.columns @ node.vertex.columns + facts.rows[:, 0])[horizon.zero]
+        off = values.min(axis=1) / horizon.gaps
+        off[list(node.phases)] = 0.0
+        if off.max() <= EXACT:
+            return None
+        size = abs(rows).max(initial=0.0)
+        weight = abs(node.vertex.reduced) + SHARE * abs(rows).max(axis=0) + EXACT * size
+        return int(np.where(off > EXACT, off * weight[horizon.columns], -1.0).argmax())
+
+    def found(self) -> Found | None:
+        """The leaves; None where the first program had no answer."""
+        leaves = [node for *_, node in self._heap] + self._empty
+        if not leaves:
+            return None
+        phases = np.full((len(leaves), len(self._horizon.zero)), -1, dtype=np.int8)
+        for leaf, held in zip(leaves, phases, strict=True):
+            held[list(leaf.phases)] = list(leaf.phases.values())
+        multipliers, weights, columns = (
+            np.stack([getattr(leaf.vertex, name) for leaf in leaves])
+            for name in ("multipliers", "weights", "columns")
+        )
+        return Found(phases, multipliers, weights, columns, self.nodes)
 
 
 def settled(
@@ -210,16 +246,3 @@ def _proved_empty(child: Node, parent: Node, floor: float, horizon: Horizon) -> 
     rest = vertex.value - floor if np.isfinite(floor) else 1.0 + abs(vertex.value)
     multipliers = vertex.multipliers - 2 * rest / value * ray
     return Node(child.phases, vertex._replace(multipliers=multipliers))
-
-
-def _found(leaves: list[Node], pairs: int, nodes: int) -> Found:
-    """The leaves as arrays."""
-    phases = np.full((len(leaves), pairs), -1, dtype=np.int8)
-    for leaf, held in zip(leaves, phases, strict=True):
-        held[list(leaf.phases)] = list(leaf.phases.values())
-    vertices = [leaf.vertex for leaf in leaves]
-    multipliers, weights, columns = (
-        np.stack([getattr(vertex, name) for vertex in vertices])
-        for name in ("multipliers", "weights", "columns")
-    )
-    return Found(phases, multipliers, weights, columns, nodes)

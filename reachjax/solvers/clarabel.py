@@ -141,8 +141,8 @@ class FacetCone:
         Args:
             row: without a constant.
         """
-        unknowns = self._matrix.shape[1]
-        constants = np.zeros(self._matrix.shape[0])
+        unknowns = 1 + len(self._sizes)
+        constants = np.zeros(self._signed + len(self._row))
         there = self._column == self._size - 1
         constants[self._signed :][there] = -(self._weight * row[self._row])[there]
         solver = self._clarabel.DefaultSolver(

@@ -7,6 +7,7 @@ facets of a step prove bounds the units of the next one.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterator
 
@@ -22,12 +23,15 @@ from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.replayed import Replay, replayed
 from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box, Polytope, Template
-from reachjax.tubes.ladder import Climbed, Ladder
+from reachjax.tubes.ladder import WORK, Climbed, Ladder
 from reachjax.tubes.steps import Reached, Setting, Step
 from reachjax.tubes.successors import facets_by_products
 
-PRODUCTS = 5e7
+PRODUCTS = 2.5e7
 """The fourth power of the columns of all facets that get products, in all: some tens of seconds."""
+
+BRANCHING = 0.5
+"""Of the time that a step has, where there is a limit; the rest is for products."""
 
 EXACT = 1e-7
 """Where derivatives are asked for, a facet climbs until its gap is a smaller part of its range."""
@@ -53,8 +57,10 @@ def sets_by_branching(
     gap = setting.gap
     if not is_concrete(setting.loop, X0, template):  # a derivative is that of what is attained
         gap = min(gap, EXACT)
-    ladder = Ladder(loop, begun, around, setting.start, nodes, setting.deadline)
-    X, steps, work = X0, [], PRODUCTS
+    timed = np.isfinite(setting.deadline)  # then that is the budget
+    work, products_work = (np.inf, np.inf) if timed else (WORK, PRODUCTS)
+    ladder = Ladder(loop, begun, around, setting.start, nodes, setting.deadline, work)
+    X, steps = X0, []
     for k in range(1, horizon + 1):
         began = time.perf_counter()
         steps.append(Step(setting, X, k - 1, tuple(steps)))
@@ -65,7 +71,8 @@ def sets_by_branching(
         if setting.simulations is not None:
             simulated = setting.simulations.values(k, rows)
         target, ranges = ladder.facets(rows, simulated, gap)
-        climbed = ladder.climbed(target, (horizon - k) * len(rows))
+        end = _share(setting.deadline, 1 / (horizon - k + 1))
+        climbed = ladder.climbed(target, (horizon - k) * len(rows), _share(end, BRANCHING))
         if not np.isfinite(climbed.bounds).all():
             raise ValueError(
                 f"the loop's states at t = {setting.start + k} overflow or are not numbers: check "
@@ -76,16 +83,26 @@ def sets_by_branching(
         opened = np.flatnonzero(gaps > setting.gap * ranges)
         opened = opened[np.argsort(-gaps[opened], kind="stable")]
         cost = float(climbed.columns.shape[1]) ** 4
-        opened = opened[: int(work // cost)] if not setting.late else opened[:0]
-        work -= len(opened) * cost
+        opened = opened[: int(min(products_work / cost, len(opened)))]
         products = None
-        if len(opened):
-            offsets, products = _with_products(steps[-1], directions, offsets, opened)
+        if len(opened) and time.monotonic() < end:
+            products_work -= len(opened) * cost
+            limited = dataclasses.replace(setting, deadline=end)
+            step = dataclasses.replace(steps[-1], setting=limited)
+            offsets, products = _with_products(step, directions, offsets, opened)
+        else:
+            opened = opened[:0]
         X = Polytope(directions, offsets)
         seconds = time.perf_counter() - began
         proof = _certificate(climbed, offsets, products, opened, seconds)
         yield Reached(X, proof, climbed.states, climb=False)
         ladder.horizon.narrow(*_ends(rows, np.asarray(jax.lax.stop_gradient(offsets))))
+
+
+def _share(deadline: float, share: float) -> float:
+    """When this share of the time that is left is over."""
+    now = time.monotonic()
+    return now + share * (deadline - now)
 
 
 def _offsets(

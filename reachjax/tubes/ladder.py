@@ -20,15 +20,15 @@ from reachjax.programs.horizon import Horizon, joined
 from reachjax.proofs.branches import Branches, HorizonFacts, Rung, bounds_of, leaf_bounds
 from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box
-from reachjax.solvers.branching import Found, affine_leaf, branched, settled
+from reachjax.solvers.branching import Found, Tree, affine_leaf, settled
 from reachjax.solvers.conic_programs import ConicPrograms
 from reachjax.solvers.linear_programs import LinearPrograms
 
 FLAT = 1e-6
 """A facet's range counts as this part of what affine forms say, at least."""
 
-LEAST_NODES = 8
-"""What each facet may take, whatever the others took."""
+TURN = 200
+"""How many linear programs a tree is grown by before others have their turn."""
 
 WORK = 1e9
 """Rows and columns, squared, of all linear programs of a tube: half a minute where measured."""
@@ -91,16 +91,24 @@ class Ladder:
         t: the time of the initial set.
         nodes: how many linear programs a bound may take.
         deadline: after which nothing is solved, as `time.monotonic` says it.
+        work: what all linear programs may take, in rows and columns, squared.
 
     Attributes:
         horizon: forms and facts.
     """
 
     def __init__(
-        self, loop: ClosedLoop, X0: AbstractSet, box: Box, t: int, nodes: int, deadline: float
+        self,
+        loop: ClosedLoop,
+        X0: AbstractSet,
+        box: Box,
+        t: int,
+        nodes: int,
+        deadline: float,
+        work: float = WORK,
     ):
         self._loop, self._t, self._nodes, self._deadline = loop, t, nodes, deadline
-        self._work = WORK
+        self._work = work
         self.horizon = Horizon(loop, X0, box, t)
         start = self.horizon.start
         columns = start.spread.shape[1]
@@ -143,13 +151,6 @@ class Ladder:
     def _spend(self, programs: int) -> None:
         self._work -= programs * self._size**2
 
-    def _budget(self, bounds: int) -> int:
-        """How many linear programs one of so many bounds may take."""
-        if self._work <= 0:
-            return 0
-        affordable = int(2 * self._work / (bounds * self._size**2))
-        return min(self._nodes, max(LEAST_NODES, affordable))
-
     def facets(
         self, directions: Float[np.ndarray, "f n_x"], simulated: Simulated, gap: float
     ) -> tuple[Target, Float[np.ndarray, " f"]]:
@@ -172,18 +173,19 @@ class Ladder:
         each = [forms[i : i + 1] for i in range(len(directions))]
         return Target(each, lambda states: states @ directions.T, enough, simulated), ranges
 
-    def climbed(self, target: Target, left: int = 0) -> Climbed:
+    def climbed(self, target: Target, left: int = 0, until: float = np.inf) -> Climbed:
         """Bounds of the state after the steps so far.
 
         Args:
             target: what is sought.
             left: how many bounds are to be sought later.
+            until: when to stop, as `time.monotonic` says it.
         """
-        horizon, facts = self.horizon, self.horizon.facts
-        self._programs.grow(facts, horizon.varying)
+        horizon = self.horizon
+        self._programs.grow(horizon.facts, horizon.varying)
         best, worst = target.simulated.most.copy(), target.simulated.states.copy()
         states: list[np.ndarray] = []
-        found: list[Found] = []
+        trees: dict[int, Tree] = {}
         for number, forms in enumerate(target.forms):
 
             def attained(columns: list[np.ndarray], number: int = number) -> float:
@@ -196,17 +198,33 @@ class Ladder:
                 return float(best[number])
 
             def enough(bound: float, attained: float, number: int = number) -> bool:
-                return self.late or target.enough(number, bound, attained)
+                late = time.monotonic() >= min(self._deadline, until)
+                return late or target.enough(number, bound, attained)
 
             upper = forms.ends(horizon.start)[1].min()
-            budget = self._budget(left + len(target.forms) - number)
-            leaves = None
-            if budget and np.isfinite(upper) and not enough(upper, best[number]):
-                programs = self._programs
-                leaves = branched(horizon, programs, forms, attained, enough, budget)
-                self._spend(leaves.nodes if leaves else 1)
-            found.append(leaves or affine_leaf(forms, horizon))
+            affordable = self._nodes and self._work > 0
+            if affordable and np.isfinite(upper) and not enough(upper, best[number]):
+                trees[number] = Tree(horizon, self._programs, forms, attained, enough)
+                self._spend(1)
+        self._grow(list(trees.values()), len(target.forms) / (left + len(target.forms)))
+        found = [
+            (number in trees and trees[number].found()) or affine_leaf(forms, horizon)
+            for number, forms in enumerate(target.forms)
+        ]
         return self._judged(target, best, worst, found, states)
+
+    def _grow(self, trees: list[Tree], share: float) -> None:
+        """Grow trees by turns, until all are closed or this share of the work is done."""
+        pool = share * self._work / self._size**2
+        while trees := [tree for tree in trees if tree.is_open and tree.nodes < self._nodes]:
+            turn = min(pool / len(trees), TURN)
+            if turn < 1:
+                break
+            for tree in trees:
+                before = tree.nodes
+                tree.grow(int(min(turn, self._nodes - before)))
+                pool -= tree.nodes - before
+                self._spend(tree.nodes - before)
 
     def _initial(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n_x"]:
         start = self.horizon.start

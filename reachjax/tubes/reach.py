@@ -203,7 +203,8 @@ def reach(
         gap: a facet is proved well enough if a trajectory attains its bound but for this part of
             half the facet's simulated range.
         time_limit: seconds for the whole call, after which nothing is solved any more: what is
-            proved by then is returned. None: until gaps are closed or budgets are used up.
+            proved by then is returned. It is shared out among the steps, and takes the place of the
+            budgets that end the call without it. None: until gaps are closed or these are used up.
 
     Raises:
         RuntimeError: JAX's 64-bit floats are off.

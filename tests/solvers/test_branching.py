@@ -13,7 +13,7 @@ from reachjax.programs.horizon import Horizon, upper_bounds
 from reachjax.programs.initial import InitialColumns
 from reachjax.proofs.branches import Branches, HorizonFacts, bounds_of
 from reachjax.proofs.witnesses import initial_states
-from reachjax.solvers.branching import affine_leaf, branched, settled
+from reachjax.solvers.branching import Tree, affine_leaf, settled
 from reachjax.solvers.conic_programs import ConicPrograms
 from reachjax.solvers.linear_programs import LinearPrograms
 from tests.closed_loops import initial_set, on_host, switching_loop
@@ -242,6 +242,13 @@ def case(request):
     return loop, X0, horizon_of(loop, X0), directions, *exact_maxima(loop, X0, STEPS, directions)
 
 
+def branched(horizon, programs, forms, attained, enough, budget):
+    """The leaves of a tree of so many programs."""
+    tree = Tree(horizon, programs, forms, attained, enough)
+    tree.grow(budget - tree.nodes)
+    return tree.found()
+
+
 def test_the_bound_is_the_exact_maximum(case):
     _, _, horizon, directions, exact, _ = case
     programs, forms = programs_of(horizon), directions @ horizon.state
@@ -275,6 +282,30 @@ def test_a_small_budget_is_kept_and_its_bound_holds(case, budget):
         leaves = branched(horizon, programs, row, nothing_attained, never, budget)
         assert leaves.nodes <= budget + 1
         assert value - 1e-12 <= bound_by(horizon, row, leaves) <= previous[i] + 1e-9
+
+
+def test_trees_that_grow_by_turns_prove_what_each_proves_alone():
+    loop, X0 = switching_loop(3, hidden=(4, 3), seed=3), initial_set("box", 3, seed=3)
+    horizon = horizon_of(loop, X0)
+    forms, programs = [row[None] @ horizon.state for row in np.eye(3)], programs_of(horizon)
+    trees = [Tree(horizon, programs, form, nothing_attained, never) for form in forms]
+    bounds = []
+    while any(tree.is_open for tree in trees):
+        before = [tree.nodes for tree in trees]
+        for tree in trees:
+            tree.grow(4)
+        bounds.append([bound_by(horizon, *pair) for pair in zip(forms, found(trees), strict=True)])
+        if before == [tree.nodes for tree in trees]:
+            break
+    assert len(bounds) > 2
+    assert np.all(np.diff(bounds, axis=0) <= 1e-9)
+    for form, bound in zip(forms, bounds[-1], strict=True):
+        alone = branched(horizon, programs_of(horizon), form, nothing_attained, never, 5000)
+        assert bound == pytest.approx(bound_by(horizon, form, alone), abs=1e-8)
+
+
+def found(trees):
+    return [tree.found() for tree in trees]
 
 
 def test_it_stops_where_the_bound_is_enough(case):

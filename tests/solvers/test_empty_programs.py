@@ -6,14 +6,14 @@ import pytest
 
 from reachjax import MLP, AffinePlant, Box, ClosedLoop
 from reachjax.programs.horizon import Horizon
-from reachjax.solvers.branching import branched
+from reachjax.solvers.branching import Tree
 from reachjax.solvers.linear_programs import Vertex
 
 
 class Infeasible:
     """A solver to which facts of a thin set seem to hold nowhere."""
 
-    def largest(self, rows, constants, zero, reach=1.0):
+    def largest(self, rows, constants, zero, reach=1.0, basis=None):
         none = np.zeros(0)
         return Vertex(-np.inf, none, np.zeros(4), none, none)
 
@@ -21,7 +21,7 @@ class Infeasible:
 class Silent:
     """A solver without answers."""
 
-    def largest(self, rows, constants, zero, reach=1.0):
+    def largest(self, rows, constants, zero, reach=1.0, basis=None):
         return None
 
 
@@ -32,4 +32,6 @@ def test_no_leaves_rest_on_a_first_program_without_columns(programs):
     horizon = Horizon(loop, X0, X0)
     horizon.advance()
     parts = lambda columns: 0.0, lambda bound, attained: False
-    assert branched(horizon, programs, horizon.state, *parts, 100) is None
+    tree = Tree(horizon, programs, horizon.state, *parts)
+    assert not tree.is_open
+    assert tree.found() is None

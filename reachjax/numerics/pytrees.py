@@ -51,13 +51,18 @@ def pytree(cls: type[T]) -> type[T]:
         return children, tuple(getattr(tree, name) for name in meta)
 
     def unflatten(aux, children):
-        tree = object.__new__(cls)
-        for name, value in zip((*data, *meta), (*children, *aux), strict=True):
-            object.__setattr__(tree, name, value)
-        return tree
+        return unchecked(cls, **dict(zip((*data, *meta), (*children, *aux), strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten)
     return cls
+
+
+def unchecked(cls: type[T], **values: Any) -> T:
+    """An object with these fields as they are: they are known to be right."""
+    made = object.__new__(cls)
+    for name, value in values.items():
+        object.__setattr__(made, name, value)
+    return made
 
 
 class Replaceable:

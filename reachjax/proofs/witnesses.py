@@ -147,6 +147,7 @@ class Simulations:
         """Simulate these initial states too, those that are in the set or just outside."""
         if not len(states):
             return
+        states = np.unique(states, axis=0)  # facets of many steps are often worst at one state
         for pull in PULLS:
             inside = self._inside(states)[:, None]
             states = np.where(inside, states, self._middle + pull * (states - self._middle))

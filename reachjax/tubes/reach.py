@@ -26,7 +26,7 @@ from reachjax.numerics.checks import (
     whole_number,
     wrapped,
 )
-from reachjax.numerics.pytrees import Replaceable, pytree, static
+from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.witnesses import Simulations, initial_states
@@ -83,6 +83,20 @@ class ReachTube(Replaceable):
 
     def __post_init__(self):
         self.require_sealed()
+
+    @classmethod
+    def sealed(
+        cls,
+        loop: ClosedLoop,
+        template: AbstractTemplate,
+        sets: tuple[AbstractSet, ...],
+        certificates: tuple[AbstractProof | None, ...],
+        start: int,
+    ) -> ReachTube:
+        """The tube of what was proved together."""
+        parts = {"loop": loop, "template": template, "sets": sets, "certificates": certificates}
+        require_double_precision(tube=floats_of(tuple(parts.values())))
+        return unchecked(cls, **parts, start=start, seal=seal_of(*parts.values(), start=start))
 
     def require_sealed(self) -> None:
         """Raise an error unless all parts are those that `reach` computed together.
@@ -268,7 +282,7 @@ def reach(
         certificates = _with_witnesses(steps, simulations)
     sets = X0, *(step.region for step in steps)
     proved = loop, template, sets, (None, *owned(certificates))
-    return ReachTube(*proved, start, seal_of(*proved, start=start))
+    return ReachTube.sealed(*proved, start=start)
 
 
 def simulations_from(

@@ -122,8 +122,9 @@ def _certificates(trial: Trial, proofs, sets, found: Found, rng) -> None:
 def _multipliers(proof) -> np.ndarray:
     """What `recheck` takes others of."""
     if isinstance(proof, rj.BranchCertificate):
-        return proof.branches.multipliers
-    return proof.slopes if isinstance(proof, rj.LinearCertificate) else proof.multipliers
+        return np.asarray(proof.branches.multipliers)
+    linear = isinstance(proof, rj.LinearCertificate)
+    return np.asarray(proof.slopes if linear else proof.multipliers)
 
 
 def _spoilt(held: np.ndarray, rng) -> np.ndarray:

@@ -189,7 +189,7 @@ def inverse_factor(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         inverse[i, i] = 1 / L[i, i]
         inverse[i, :i] = -(L[i, :i] @ inverse[:i, :i]) / L[i, i]
     values = np.linalg.eigvalsh(C.astype(float))
-    return inverse / widths, WIDE(values[-1] / max(values[0], 1e-16))
+    return inverse / widths, np.array(values[-1] / max(values[0], 1e-16), dtype=WIDE)
 
 
 def solved(M: np.ndarray, v: np.ndarray) -> np.ndarray | None:

@@ -96,7 +96,7 @@ class Initial:
 
     def _perhaps(self, points: np.ndarray) -> np.ndarray:
         room, error = self.region.room_wide(points, np.zeros_like(points))
-        return (room >= -error).all(axis=1)
+        return np.all(room >= -error, axis=1)
 
 
 def random_region(rng: np.random.Generator, kind: str, scale: np.ndarray, facets: int) -> Initial:

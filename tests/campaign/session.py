@@ -31,8 +31,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def numbers(config: pytest.Config) -> list[int]:
     """The cases that were asked for."""
-    if config.getoption("case") is not None:
-        return [config.getoption("case")]
+    if (case := config.getoption("case")) is not None:
+        return [case]
     asked = config.getoption("cases")
     return [*(DEFAULT if asked is None else range(asked))]
 

@@ -2,12 +2,12 @@
 
 import functools
 
-import flax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import linen, nnx
+from flax.core import freeze
 
 import reachjax as rj
 from tests.networks import controller, he_network
@@ -139,7 +139,7 @@ class Linen(linen.Module):
         return linen.Dense(self.sizes[-1], self.use_bias)(x)
 
 
-@pytest.mark.parametrize("wrap", [dict, lambda v: v["params"], flax.core.freeze])
+@pytest.mark.parametrize("wrap", [dict, lambda v: v["params"], freeze])
 @pytest.mark.parametrize("use_bias", [True, False])
 def test_a_network_from_linen_parameters_maps_as_the_module_does(use_bias, wrap):
     module = Linen(use_bias=use_bias)
@@ -222,7 +222,7 @@ def test_attributes_are_refused_where_their_order_cannot_be_checked():
         jax.jit(lambda w: rj.MLP.from_flax(nnx.merge(graph, w))(jnp.ones(2)))(weights)
 
 
-class Nested(linen.Module):
+class NestedLinen(linen.Module):
     """The outer layer is constructed first, so linen numbers it 0."""
 
     @linen.compact
@@ -231,11 +231,11 @@ class Nested(linen.Module):
 
 
 def test_linen_layers_that_chain_in_several_orders_are_refused_without_their_module():
-    variables = Nested().init(jax.random.key(0), jnp.ones(2))
+    variables = NestedLinen().init(jax.random.key(0), jnp.ones(2))
     with pytest.raises(ValueError, match=r"chain in more than one order.*pass module="):
         rj.MLP.from_flax(variables, rj.ReLU())
     with pytest.raises(ValueError, match="computes something else than its linear layers"):
-        rj.MLP.from_flax(variables, module=Nested())
+        rj.MLP.from_flax(variables, module=NestedLinen())
     assert (
         len(
             rj.MLP.from_flax(

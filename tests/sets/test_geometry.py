@@ -65,7 +65,7 @@ def test_a_derivative_is_the_central_difference_in_every_argument(name, n):
 
 
 def test_a_batch_of_sets_is_one_set_at_a_time():
-    A, b, C, d = arguments("separations", 2)
+    A, b, C, d = arguments("separations", 2)  # pyright: ignore[reportAssignmentType]
     scales = jnp.array([0.5, 1.0, 1.5])
     batch = jax.jit(jax.vmap(lambda s: separations(A, s * b, C, d)))(scales)
     single = jnp.stack([separations(A, s * b, C, d) for s in scales])

@@ -134,8 +134,8 @@ def test_lengths_of_facet_normals_do_not_matter():
     Q = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     A, b = np.vstack([Q, -Q]), np.r_[1.0, 2.0, 3.0, 1.0, 2.0, 3.0] + 0.1
     expected = rj.Polytope(A, b).bounding_box()
-    for length in (1e-12, 1e-9, 1e-4, 1e4, 1e9, 1e12, 10.0 ** np.arange(-6, 6)):
-        lengths = np.broadcast_to(length, b.shape) if np.ndim(length) == 0 else length[::2]
+    same = (np.full(b.shape, length) for length in (1e-12, 1e-9, 1e-4, 1e4, 1e9, 1e12))
+    for lengths in (*same, 10.0 ** np.arange(-6, 6)[::2]):
         polytope = rj.Polytope(A * lengths[:, None], b * lengths)
         np.testing.assert_allclose(polytope.bounding_box().upper, expected.upper, rtol=1e-9)
         assert polytope.volume() == pytest.approx(2.2 * 4.2 * 6.2, rel=1e-9)

@@ -210,7 +210,13 @@ class Absolute(rj.AbstractUnit):
     def __call__(self, y):
         return abs(y)
 
-    interval = lines = facts = None
+    def interval(self, lower, upper):
+        raise NotImplementedError
+
+    lines = interval
+
+    def facts(self, y, z, lower, upper):
+        raise NotImplementedError
 
 
 def test_only_relus_are_taken():

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.numerics.checks import floats_of, require_double_precision
-from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.numerics.pytrees import Replaceable, pytree, static
+from reachjax.numerics.rounding import gamma
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import upper_bounds
 from reachjax.programs.initial import InitialColumns
@@ -84,6 +85,10 @@ class BranchCertificate(AbstractProof):
         by_products: `(p,)`, numbers of the facets of `products`.
         rungs: `(f,)`, values of `Rung`.
         nodes: `(f,)`, how many linear programs were solved for each facet.
+        least: whether there is one bound, of the least of all rows.
+
+    Raises:
+        ValueError: there are not as many bounds as rows, or more than one of their least.
     """
 
     about: HorizonFacts
@@ -92,6 +97,15 @@ class BranchCertificate(AbstractProof):
     by_products: Int[Array | np.ndarray, " p"]
     rungs: Int[Array | np.ndarray, " f"]
     nodes: Int[Array | np.ndarray, " f"]
+    least: bool = static(default=False)
+
+    def __post_init__(self):
+        rows, bounds = len(self.about.rows.rows), len(self.bounds)
+        expected = 1 if self.least else rows
+        if bounds != expected:
+            raise ValueError(
+                f"BranchCertificate.bounds must be {expected} of {rows} rows, but {bounds} arrived"
+            )
 
     def __repr__(self) -> str:
         counts = np.bincount(np.asarray(self.rungs), minlength=len(Rung))
@@ -142,20 +156,23 @@ class BranchCertificate(AbstractProof):
                 )
             branches = branches.replace(multipliers=given)
         count, upper = len(self.bounds), about.rows.ends(about.start)[1]
-        if len(upper) == count:  # each bound is of a row of its own
+        if self.least:  # any of them bounds it
+            upper = upper.min(keepdims=True)
+        else:
             branches = branches.replace(weights=np.eye(count)[np.asarray(branches.owner)])
-        # any of several rows bounds the least of them
-        upper = upper if len(upper) == count else upper.min(keepdims=True)
-        found = np.fmin(bounds_of(about, branches, count), upper)
+        values = leaf_bounds(about, branches)
+        found = np.fmin(bounds_of(branches, values, count), upper)
         if self.products is not None:
             which = np.asarray(self.by_products)
             found[which] = np.fmin(found[which], self.products.recheck())
         return found
 
 
-def bounds_of(about: HorizonFacts, branches: Branches, count: int) -> Float[np.ndarray, " count"]:
-    """Upper bounds by the leaves of each tree; infinite where one of them is missing."""
-    phases, values = np.asarray(branches.phases), leaf_bounds(about, branches)
+def bounds_of(
+    branches: Branches, values: Float[np.ndarray, " l"], count: int
+) -> Float[np.ndarray, " count"]:
+    """Upper bounds by those of the leaves of each tree; infinite where a leaf is missing."""
+    phases = np.asarray(branches.phases)
     found = np.full(count, np.inf)
     for number in range(count):
         mine = np.asarray(branches.owner) == number
@@ -171,12 +188,22 @@ def leaf_bounds(about: HorizonFacts, branches: Branches) -> Float[np.ndarray, " 
     """
     given = np.asarray(branches.multipliers)
     free = _free(about, np.asarray(branches.phases))
-    weights = np.fmax(np.asarray(branches.weights), 0.0)
-    total = weights.sum(axis=1, keepdims=True)
-    shares = np.where(total > 0, weights / np.where(total > 0, total, 1.0), np.nan)
+    shares = _shares(np.asarray(branches.weights))
     multipliers = np.where(free, given, np.fmax(given, 0.0))
     values = upper_bounds(shares @ about.rows, about.facts, multipliers, about.start)
+    # the least of the rows is at most their mean, and shares may add up to 1 but for rounding
+    mixed = (shares > 0).sum(axis=1) > 1
+    values = values + np.where(mixed, gamma(shares.shape[1] + 4) * abs(values), 0.0)
     return np.where(np.isnan(values), np.inf, values)
+
+
+def _shares(weights: Float[np.ndarray, "l f"]) -> Float[np.ndarray, "l f"]:
+    """Weights of sum 1, but for rounding; NaN where there are none."""
+    weights = np.fmax(weights, 0.0)
+    largest = weights.max(axis=1, keepdims=True)
+    with np.errstate(all="ignore"):  # none above zero, or one that is infinite
+        weights = weights / largest
+        return weights / weights.sum(axis=1, keepdims=True)
 
 
 def covered(phases: Int[np.ndarray, "l p"]) -> bool:
@@ -186,17 +213,20 @@ def covered(phases: Int[np.ndarray, "l p"]) -> bool:
         >>> covered(np.array([[0, -1], [1, 0], [1, 1]])), covered(np.array([[0, -1], [1, 0]]))
         (True, False)
     """
-    held = phases >= 0
-    if not len(phases):
-        return False
-    if not held.any(axis=1).all():
-        return True
-    split = np.flatnonzero(held.all(axis=0))
-    if not len(split):
-        return False
-    sides = phases[:, split[0]]
-    rest = np.delete(phases, split[0], axis=1)
-    return covered(rest[sides == 0]) and covered(rest[sides == 1])
+    groups = [(np.arange(len(phases)), phases >= 0)]
+    while groups:
+        leaves, held = groups.pop()
+        if not len(leaves):
+            return False
+        if not held.any(axis=1).all():
+            continue
+        split = np.flatnonzero(held.all(axis=0))
+        if not len(split):
+            return False
+        sides, rest = phases[leaves, split[0]], held.copy()
+        rest[:, split[0]] = False
+        groups += [(leaves[sides == side], rest[sides == side]) for side in (0, 1)]
+    return True
 
 
 def _free(about: HorizonFacts, phases: Int[np.ndarray, "l p"]) -> np.ndarray:

@@ -107,9 +107,9 @@ class Simulations:
         self._trajectories = self.simulated(states, horizon)
 
     @property
-    def states(self) -> Float[np.ndarray, "c n_x"]:
-        """The initial states."""
-        return self._states
+    def trajectories(self) -> Float[np.ndarray, "c h+1 n_x"]:
+        """All of them."""
+        return self._trajectories
 
     def simulated(
         self, states: Float[np.ndarray, "c n_x"], steps: int
@@ -119,8 +119,12 @@ class Simulations:
 
     def values(self, k: int, directions: Float[np.ndarray, "f n_x"]) -> Simulated:
         """What is known of directions after `k` steps."""
-        found = self._trajectories[:, k] @ directions.T
-        return Simulated(found.min(axis=0), found.max(axis=0), self._states[found.argmax(axis=0)])
+        return self.known(self._trajectories[:, k] @ directions.T)
+
+    def known(self, values: Float[np.ndarray, "c f"]) -> Simulated:
+        """What is known of numbers that these are the values of, trajectory by trajectory."""
+        worst = values.argmax(axis=0)
+        return Simulated(values.min(axis=0), values.max(axis=0), self._states[worst])
 
     def climb(
         self,
@@ -143,10 +147,10 @@ class Simulations:
         found = ascended(*fixed, begin, region, which, k, self._horizon, self._start)
         self.include(np.asarray(found))
 
-    def include(self, states: Float[np.ndarray, "m n_x"]) -> None:
+    def include(self, states: Float[np.ndarray, "m n_x"]) -> Float[np.ndarray, "k h+1 n_x"]:
         """Simulate these initial states too, those that are in the set or just outside."""
         if not len(states):
-            return
+            return self._trajectories[:0]
         states = np.unique(states, axis=0)  # facets of many steps are often worst at one state
         for pull in PULLS:
             inside = self._inside(states)[:, None]
@@ -155,6 +159,7 @@ class Simulations:
         kept = self._inside(states) & np.isfinite(found).all(axis=(1, 2))
         self._states = np.concatenate([self._states, states[kept]])
         self._trajectories = np.concatenate([self._trajectories, found[kept]])
+        return found[kept]
 
     def _inside(self, states: Float[np.ndarray, "m n_x"]) -> Bool[np.ndarray, " m"]:
         """Which states are in the initial set."""

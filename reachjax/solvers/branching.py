@@ -152,7 +152,9 @@ class Tree:
             if len(child.vertex.columns):
                 self._push(min(child.vertex.value, -bound), child)
             else:
-                self._empty.append(_proved_empty(child, node, self._best, self._horizon))
+                proved = _proved_empty(child, node, self._best, self._horizon)
+                self._empty.append(proved or Node(child.phases, node.vertex))
+                self._stuck |= proved is None  # the bound falls no further
         return True
 
     def _push(self, value: float, node: Node) -> None:
@@ -198,6 +200,7 @@ def settled(
     form: AffineForms,
     columns: Float[np.ndarray, " n"],
     leaves: Int[np.ndarray, "l p"],
+    bound: float,
 ) -> Float[np.ndarray, " m"] | None:
     """Multipliers of a bound that is attained, with nothing of the lines that hold units.
 
@@ -211,38 +214,42 @@ def settled(
         form: one.
         columns: where it is attained.
         leaves: phases of the pairs of facts in each leaf, in one of which it is.
+        bound: that is proved.
 
     Returns:
-        None where the bound is another one.
+        None where the bound is not attained there.
     """
     facts, zero = horizon.facts, horizon.zero
     values = (facts.columns @ columns + facts.rows[:, 0])[zero] / horizon.gaps[:, None]
     vanishing = values <= BENT
     both, side = vanishing.all(axis=1), vanishing.argmax(axis=1)
     row, constant = np.asarray(form.columns), np.asarray(form.rows[:, 0])
-    attained, size = constant[0] + row[0] @ columns[: row.shape[1]], abs(row).sum()
+    attained, near = constant[0] + row[0] @ columns[: row.shape[1]], BENT * abs(row).sum()
+    if bound - attained > near:
+        return None
     for phases in leaves:
         if np.any((phases >= 0) & ~both & (phases != side)):
             continue
         there = np.where(both, phases, side)
         held = (zero[i, there[i]] for i in np.flatnonzero(there >= 0))
         vertex = programs.largest(row, constant, held, reach=2.0)
-        if vertex is not None and abs(vertex.value - attained) <= BENT * size:
+        if vertex is not None and abs(vertex.value - attained) <= near:
             return vertex.multipliers
     return None
 
 
-def _proved_empty(child: Node, parent: Node, floor: float, horizon: Horizon) -> Node:
+def _proved_empty(child: Node, parent: Node, floor: float, horizon: Horizon) -> Node | None:
     """A branch without states, with multipliers that bound it by what is attained elsewhere.
 
-    Those of its facts that show it to be empty are added to its parent's until they suffice.
+    Those of its facts that show it to be empty are added to its parent's until they suffice; None
+    if they do not show it.
     """
     vertex, rays = parent.vertex, np.outer([1.0, -1.0], child.vertex.multipliers)
     nothing = AffineForms(np.zeros((2, 2)), np.zeros((2, 2)))
     values = horizon.bounds(nothing, rays)
     value, ray = values.min(), rays[values.argmin()]
     if not value < 0:
-        return Node(child.phases, vertex)
+        return None
     rest = vertex.value - floor if np.isfinite(floor) else 1.0 + abs(vertex.value)
     multipliers = vertex.multipliers - 2 * rest / value * ray
     return Node(child.phases, vertex._replace(multipliers=multipliers))

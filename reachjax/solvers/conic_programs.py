@@ -42,7 +42,9 @@ class ConicPrograms(AbstractPrograms):
         self._columns, self._width = columns, facts.columns.shape[1]
         rows, constants = facts.columns[:, columns], facts.rows[:, 0]
         size = np.maximum(abs(rows).max(axis=1, initial=0.0), abs(constants))
-        self._size = np.where((size > 0) & np.isfinite(size), size, 1.0)
+        known = np.isfinite(size)
+        rows, constants = np.where(known[:, None], rows, 0.0), np.where(known, constants, 0.0)
+        self._size = np.where((size > 0) & known, size, 1.0)
         self._facts, self._constants = rows / self._size[:, None], constants / self._size
 
     def largest(

@@ -117,7 +117,9 @@ class LinearPrograms(AbstractPrograms):
         self._columns, self._width, old = columns, facts.columns.shape[1], len(self._rows)
         constants, rows = facts.rows[old:, 0], facts.columns[old:, columns]
         size = np.maximum(abs(rows).max(axis=1, initial=0.0), abs(constants))
-        size = np.where((size > 0) & np.isfinite(size), size, 1.0)
+        known = np.isfinite(size)
+        rows, constants = np.where(known[:, None], rows, 0.0), np.where(known, constants, 0.0)
+        size = np.where((size > 0) & known, size, 1.0)
         self._rows = np.append(self._rows, self._count + np.arange(len(rows)))
         self._size = np.append(self._size, size)
         self._constant = np.append(self._constant, constants / size)

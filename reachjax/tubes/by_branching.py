@@ -7,7 +7,6 @@ facets of a step prove bounds the units of the next one.
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Iterator
 
@@ -29,9 +28,6 @@ from reachjax.tubes.successors import facets_by_products
 
 PRODUCTS = 2.5e7
 """The fourth power of the columns of all facets that get products, in all: some tens of seconds."""
-
-BRANCHING = 0.5
-"""Of the time that a step has, where there is a limit; the rest is for products."""
 
 EXACT = 1e-7
 """Where derivatives are asked for, a facet climbs until its gap is a smaller part of its range."""
@@ -58,21 +54,22 @@ def sets_by_branching(
     if not is_concrete(setting.loop, X0, template):  # a derivative is that of what is attained
         gap = min(gap, EXACT)
     timed = np.isfinite(setting.deadline)  # then that is the budget
-    work, products_work = (np.inf, np.inf) if timed else (WORK, PRODUCTS)
-    ladder = Ladder(loop, begun, around, setting.start, nodes, setting.deadline, work)
+    of_programs, work = (np.inf, np.inf) if timed else (WORK, PRODUCTS)
+    ladder = Ladder(loop, begun, around, setting.start, nodes, setting.deadline, of_programs)
     X, steps = X0, []
     for k in range(1, horizon + 1):
         began = time.perf_counter()
         steps.append(Step(setting, X, k - 1, tuple(steps)))
         directions = template.at(k).directions
         rows = np.asarray(jax.lax.stop_gradient(directions))
-        ladder.advance()
+        end = ladder.until(1 / (horizon - k + 1))
+        ladder.advance(until=end)
         simulated = Simulated.nothing(around.center, len(rows))
         if setting.simulations is not None:
             simulated = setting.simulations.values(k, rows)
         target, ranges = ladder.facets(rows, simulated, gap)
-        end = _share(setting.deadline, 1 / (horizon - k + 1))
-        climbed = ladder.climbed(target, (horizon - k) * len(rows), _share(end, BRANCHING))
+        half = (time.monotonic() + end) / 2  # the other one is for products
+        climbed = ladder.climbed(target, (horizon - k) * len(rows), half)
         if not np.isfinite(climbed.bounds).all():
             raise ValueError(
                 f"the loop's states at t = {setting.start + k} overflow or are not numbers: check "
@@ -82,27 +79,20 @@ def sets_by_branching(
         gaps = climbed.bounds - climbed.attained
         opened = np.flatnonzero(gaps > setting.gap * ranges)
         opened = opened[np.argsort(-gaps[opened], kind="stable")]
-        cost = float(climbed.columns.shape[1]) ** 4
-        opened = opened[: int(min(products_work / cost, len(opened)))]
         products = None
         if len(opened) and time.monotonic() < end:
-            products_work -= len(opened) * cost
-            limited = dataclasses.replace(setting, deadline=end)
-            step = dataclasses.replace(steps[-1], setting=limited)
-            offsets, products = _with_products(step, directions, offsets, opened)
+            cost = float(steps[-1].window.taken) ** 4
+            opened = opened[: int(min(work / cost, len(opened)))]
+            work -= len(opened) * cost
         else:
             opened = opened[:0]
+        if len(opened):
+            offsets, products = _with_products(steps[-1], directions, offsets, opened, end)
         X = Polytope(directions, offsets)
         seconds = time.perf_counter() - began
         proof = _certificate(climbed, offsets, products, opened, seconds)
         yield Reached(X, proof, climbed.states, climb=False)
         ladder.horizon.narrow(*_ends(rows, np.asarray(jax.lax.stop_gradient(offsets))))
-
-
-def _share(deadline: float, share: float) -> float:
-    """When this share of the time that is left is over."""
-    now = time.monotonic()
-    return now + share * (deadline - now)
 
 
 def _offsets(
@@ -126,10 +116,14 @@ def _offsets(
 
 
 def _with_products(
-    step: Step, directions: Float[Array, "f n_x"], offsets: Float[Array, " f"], opened: np.ndarray
+    step: Step,
+    directions: Float[Array, "f n_x"],
+    offsets: Float[Array, " f"],
+    opened: np.ndarray,
+    end: float,
 ) -> tuple[Float[Array, " f"], Certificate]:
-    """The better of what is proved and what products prove of some facets."""
-    found, proof = facets_by_products(step, directions[opened])
+    """The better of what is proved and what products prove of some facets until a time."""
+    found, proof = facets_by_products(step, directions[opened], end)
     better = found < offsets[opened]
     return offsets.at[opened].set(jnp.where(better, found, offsets[opened])), proof
 

@@ -28,7 +28,7 @@ from reachjax.proofs.branches import BranchCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated, Simulations
 from reachjax.sets import AbstractSet, PolyhedralSet
-from reachjax.tubes.ladder import Climbed, Ladder, Target
+from reachjax.tubes.ladder import WORK, Climbed, Ladder, Target
 from reachjax.tubes.reach import EXAMPLES, deadline_of, simulations_from
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Requirement, requirements
@@ -122,7 +122,8 @@ def decide(
     on_host, begun, around = jax.device_get((loop, X0, boxed(X0, "X0")))
     for nodes in dict.fromkeys((min(FEW, relaxation.nodes), relaxation.nodes)):
         if not decision.ended:
-            ladder = Ladder(on_host, begun, around, start, nodes, deadline)
+            work = WORK if time_limit is None else np.inf
+            ladder = Ladder(on_host, begun, around, start, nodes, deadline, work)
             decision.climb(ladder, tighten=nodes > FEW)
     return decision.verdict()
 
@@ -157,9 +158,8 @@ class _Decision:
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
         self._example: Counterexample | None = None
         self._simulations = simulations
-        states = np.zeros((0, loop.states))
-        found = states if simulations is None else simulations.states
-        self._tried(list(self._open.values()), found)
+        if simulations is not None:
+            self._seen(required, simulations.trajectories)
 
     @property
     def ended(self) -> bool:
@@ -202,41 +202,49 @@ class _Decision:
 
     def _decided(self, key: tuple[str, int], item: Requirement, ladder: Ladder) -> None:
         """Bound one requirement at the time that the ladder has come to."""
-        target, units = _target(item, ladder, self._loop.states)
-        climbed = ladder.climbed(target)
+        target, units = _target(item, ladder, self._simulations)
+        left = sum(other.time >= item.time for other in self._open.values())
+        climbed = ladder.climbed(target, (left - 1) * len(target.forms), ladder.until(1 / left))
         right = climbed.bounds <= 0 if item.inside else climbed.bounds < 0
         margin = float(np.min(-climbed.bounds / units))
-        self._note(key, bool(np.all(right)), margin, climbed)
+        holds = bool(np.all(right))
+        self._note(key, holds, margin)
+        if holds:
+            self._certificates[key] = _certificate(climbed, target.simulated, not item.inside)
         if not np.all(right):
             worst, middle = climbed.worst[climbed.attained > 0], self._middle
-            self._tried([item], np.concatenate([middle + p * (worst - middle) for p in PULLS]))
+            self._tried(item, np.concatenate([middle + p * (worst - middle) for p in PULLS]))
 
-    def _note(
-        self, key: tuple[str, int], holds: bool, margin: float, climbed: Climbed | None = None
-    ) -> None:
+    def _note(self, key: tuple[str, int], holds: bool, margin: float) -> None:
         name, k = key
         self._margins[name][k] = np.fmax(self._margins[name][k], margin)
         if holds:
             del self._open[key]
-            if climbed is not None:
-                self._certificates[key] = _certificate(climbed)
 
-    def _tried(self, items: list[Requirement], states: np.ndarray) -> None:
-        """Simulate initial states in search of a counterexample."""
-        if not len(states):
+    def _tried(self, item: Requirement, states: np.ndarray) -> None:
+        """Simulate initial states that may break a requirement."""
+        if self._simulations is not None:
+            self._seen([item], self._simulations.include(states))
+        else:
+            runs = trajectories(self._on_host, states, self._horizon, self._start)
+            self._seen([item], runs[np.isfinite(runs).all(axis=(1, 2))])
+
+    def _seen(self, items: list[Requirement], runs: np.ndarray) -> None:
+        """What trajectories show, a counterexample perhaps."""
+        if not len(runs):
             return
         found: list[Suspect] = []
-        runs = trajectories(self._on_host, states, self._horizon, self._start)
-        runs = runs[np.isfinite(runs).all(axis=(1, 2))]
         for item in items:
             rooms = item.simulated(runs)
             row = self._simulated[item.name]
-            row[item.time] = np.fmin(row[item.time], rooms.min(initial=np.inf))
+            row[item.time] = np.fmin(row[item.time], rooms.min())
             found += suspects(item, rooms, runs)
         self._example = counterexample(self._loop, self._X0, found, self._start)
 
 
-def _target(item: Requirement, ladder: Ladder, states: int) -> tuple[Target, np.ndarray]:
+def _target(
+    item: Requirement, ladder: Ladder, simulations: Simulations | None
+) -> tuple[Target, np.ndarray]:
     """What must be below zero: the excess over each facet, or the depth in the set."""
     parts = item.region.facets_in_units(inner=item.inside)
     C, d, norms = (np.asarray(part) for part in parts)
@@ -256,18 +264,21 @@ def _target(item: Requirement, ladder: Ladder, states: int) -> tuple[Target, np.
     def enough(number: int, bound: float, attained: float) -> bool:
         return bound <= -BELOW * sizes[number] or attained > 0
 
-    blank = Simulated.nothing(np.zeros(states), len(forms))
-    return Target(forms, values, enough, blank), norms if item.inside else np.ones(1)
+    if simulations is None:
+        known = Simulated.nothing(np.asarray(start.center), len(forms))
+    else:
+        known = simulations.known(values(simulations.trajectories[:, len(ladder.horizon.steps)]))
+    return Target(forms, values, enough, known), norms if item.inside else np.ones(1)
 
 
-def _certificate(climbed: Climbed) -> BranchCertificate:
+def _certificate(climbed: Climbed, known: Simulated, least: bool) -> BranchCertificate:
     """The proof of a requirement."""
     count = len(climbed.bounds)
-    return BranchCertificate(
+    proof = BranchCertificate(
         codes=np.full(count, int(SolverStatus.SOLVED)),
-        bounds=owned(climbed.bounds),
-        witnesses=climbed.attained,
-        witness_states=climbed.worst,
+        bounds=climbed.bounds,
+        witnesses=known.most,
+        witness_states=known.states,
         seconds=np.full(count, np.nan),
         about=climbed.about,
         branches=climbed.branches,
@@ -275,4 +286,6 @@ def _certificate(climbed: Climbed) -> BranchCertificate:
         by_products=np.zeros(0, dtype=int),
         rungs=climbed.rungs,
         nodes=climbed.nodes,
+        least=least,
     )
+    return owned(proof)

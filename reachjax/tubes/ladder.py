@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -121,21 +122,28 @@ class Ladder:
         """Whether the time is over."""
         return time.monotonic() >= self._deadline
 
-    def advance(self, tighten: bool = True) -> None:
+    def until(self, share: float) -> float:
+        """When this share of the time that is left is over, as `time.monotonic` says it."""
+        now = time.monotonic()
+        return now + share * (self._deadline - now)
+
+    def advance(self, tighten: bool = True, until: float = np.inf) -> None:
         """One step more.
 
         Args:
             tighten: whether the ranges of units that switch are bounded by linear programs.
+            until: when to stop that, as `time.monotonic` says it.
         """
-        self.horizon.advance(self._ranges if tighten and self._nodes else None)
+        ranges = partial(self._ranges, until) if tighten and self._nodes else None
+        self.horizon.advance(ranges)
 
-    def _ranges(self, forms: AffineForms) -> Float[np.ndarray, "k m"]:
+    def _ranges(self, until: float, forms: AffineForms) -> Float[np.ndarray, "k m"]:
         """Multipliers that bound the inputs of units from both sides."""
         facts = self.horizon.facts
         self._programs.grow(facts, self.horizon.varying)
         found = np.zeros((len(forms.rows), len(facts.rows)))
         for row, constant, multipliers in zip(forms.columns, forms.rows, found, strict=True):
-            if self.late or self._work <= 0:
+            if self._work <= 0 or time.monotonic() >= min(self._deadline, until):
                 break
             self._spend(1)
             vertex = self._programs.largest(row[None], constant[:1], ())
@@ -164,12 +172,13 @@ class Ladder:
         forms = directions @ self.horizon.state
         lower, upper = forms.ends(self.horizon.start)
         floor = FLAT * (upper - lower) / 2
+        if gap:
+            floor = np.fmax(floor, ROUNDED / gap * np.fmax(abs(lower), abs(upper)))
         ranges = np.fmax((simulated.most - simulated.least) / 2, floor)
 
         def enough(facet: int, bound: float, attained: float) -> bool:
             return bound - attained <= gap * ranges[facet]
 
-        ranges = np.fmax(ranges, ROUNDED / gap * np.fmax(abs(lower), abs(upper)) if gap else 0.0)
         each = [forms[i : i + 1] for i in range(len(directions))]
         return Target(each, lambda states: states @ directions.T, enough, simulated), ranges
 
@@ -256,18 +265,18 @@ class Ladder:
         uppers = [forms.ends(horizon.start)[1].min() for forms in target.forms]
         mine = (np.flatnonzero(owner == number) for number in range(count))
         deciding = np.array([leaf[each[leaf].argmax()] for leaf in mine])
-        nodes = np.array([leaf.nodes for leaf in found])
-        rungs = np.where(nodes > 1, Rung.PHASE_SPLITS, Rung.LINEAR_PROGRAM)
+        bounds, leaf_counts = bounds_of(leaves, each, count), np.bincount(owner)
+        rungs = np.where(leaf_counts > 1, Rung.PHASE_SPLITS, Rung.LINEAR_PROGRAM)
         return Climbed(
             about=about,
             branches=leaves,
-            bounds=np.fmin(bounds_of(about, leaves, count), uppers),
+            bounds=np.fmin(bounds, uppers),
             attained=best,
             worst=worst,
             columns=np.concatenate([leaf.columns for leaf in found])[deciding],
             multipliers=multipliers[deciding],
-            rungs=np.where(nodes == 0, Rung.AFFINE_FORM, rungs),
-            nodes=nodes,
+            rungs=np.where(bounds < uppers, rungs, Rung.AFFINE_FORM),
+            nodes=np.array([leaf.nodes for leaf in found]),
             states=np.array(states).reshape(-1, len(horizon.start.center)),
         )
 
@@ -279,9 +288,12 @@ class Ladder:
         columns, owner = climbed.columns.copy(), climbed.branches.owner
         phases = np.asarray(climbed.branches.phases)
         for facet in range(len(found)):
+            if self.late:
+                break
             form = climbed.about.rows[facet : facet + 1]
             at = self.horizon.columns_at(climbed.worst[facet])
-            given = settled(self.horizon, self._programs, form, at, phases[owner == facet])
+            leaves, bound = phases[owner == facet], climbed.bounds[facet]
+            given = settled(self.horizon, self._programs, form, at, leaves, bound)
             if given is not None:
                 found[facet], columns[facet] = given, at
         return columns, found

@@ -215,7 +215,7 @@ def reach(
         progress: wraps the iteration over steps to show a progress bar, such as `tqdm.tqdm`; inside
             `jax.jit` it sees them once, while the loop is traced.
         gap: a facet is proved well enough if a trajectory attains its bound but for this part of
-            half the facet's simulated range.
+            half the facet's simulated range. `LinearBounds` knows neither gaps nor limits.
         time_limit: seconds for the whole call, after which nothing is solved any more: what is
             proved by then is returned. It is shared out among the steps, and takes the place of the
             budgets that end the call without it. None: until gaps are closed or these are used up.
@@ -231,8 +231,10 @@ def reach(
     The offsets of the sets have first derivatives (reverse mode) in the loop's weights, plant and
     input box, in a box's ends and in a polytope's normals and offsets; so have centre and shape of
     ellipsoids, also in centre and shape of an ellipsoid `X0`. A derivative is that of the bound
-    that is reported: where a program was not solved, of what is proved without its optimum. It is
-    NaN where there is no bound.
+    that is reported: where a program was not solved, of what is proved without its optimum; where
+    no trajectory attains a bound of `BranchAndCut`, of its multipliers with the ranges of units
+    held. It is NaN where there is no bound. So that bounds are attained, facets climb to a `gap` of
+    1e-7 where a derivative is asked for, if theirs is larger.
 
     Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 

@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax import Box
+from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon
+from reachjax.programs.initial import InitialColumns
 from reachjax.proofs.branches import (
     BranchCertificate,
     Branches,
@@ -206,7 +209,7 @@ def test_a_facet_without_one_of_its_leaves_is_bounded_by_its_form_alone(split):
     plain = proof.recheck()
     for leaf, owner in enumerate(proof.branches.owner):
         rest = without(proof.branches, leaf)
-        assert bounds_of(proof.about, rest, 6)[owner] == np.inf
+        assert bounds_of(rest, leaf_bounds(proof.about, rest), 6)[owner] == np.inf
         found = proof.replace(branches=rest).recheck()
         assert found[owner] == upper[owner] > plain[owner] + 1e-6
         np.testing.assert_array_equal(np.delete(found, owner), np.delete(plain, owner))
@@ -284,6 +287,49 @@ def test_weights_that_weigh_nothing_prove_nothing(several, weights):
     assert np.isinf(found[0])
 
 
+@pytest.mark.parametrize("weights", [[1e308] * 3, [1e308, 1e-308, 0.0], [5e-324] * 3])
+def test_weights_of_any_size_bound_the_least_of_several_rows(several, weights):
+    about, values = several
+    found = leaf_bounds(about, one_leaf(about, weights))
+    assert values.min(axis=1).max() <= found[0] < np.inf
+
+
+@pytest.mark.parametrize("weights", [[np.inf, 1.0, 1.0], [np.inf] * 3])
+def test_infinite_weights_prove_nothing(several, weights):
+    about, _ = several
+    assert np.isinf(leaf_bounds(about, one_leaf(about, weights))[0])
+
+
+def test_shares_that_are_rounded_bound_the_least_all_the_same():
+    """Of three rows that are the same constant: a third thrice is not quite one."""
+    start = InitialColumns.of(Box([0.0], [1.0]), Box([0.0], [1.0]))
+    state = jax.device_get(AffineForms.beginning(start))
+    for constant in (1e6, -1e6):
+        rows = np.zeros((7, 1)) @ state + constant
+        about = HorizonFacts(start, state[:0], np.zeros((0, 2), dtype=int), rows)
+        for weights in np.random.default_rng(0).exponential(size=(200, 7)):
+            leaf = Branches(
+                np.zeros(1, int), np.zeros((1, 0), int), np.zeros((1, 0)), weights[None]
+            )
+            assert constant <= leaf_bounds(about, leaf)[0] <= constant + 1e-13 * abs(constant)
+
+
+def test_a_proof_has_as_many_bounds_as_rows(split):
+    proof, _ = split
+    with pytest.raises(ValueError, match=r"BranchCertificate\.bounds must be 6 of 6 rows, but 1"):
+        proof.replace(bounds=proof.bounds[:1])
+    with pytest.raises(ValueError, match="must be 1 of 6 rows, but 6 arrived"):
+        proof.replace(least=True)
+
+
+def test_leaves_of_a_thousand_splits_cover_everything():
+    count = 1200
+    leaf, pair = np.indices((count + 1, count))
+    phases = np.where(pair < leaf, 0, np.where(pair == leaf, 1, -1))
+    assert covered(phases)
+    assert not covered(np.delete(phases, 700, axis=0))
+
+
 def test_the_best_of_several_rows_bounds_the_least(several):
     about, values = several
     _, upper = about.rows.ends(about.start)
@@ -301,6 +347,7 @@ def test_the_best_of_several_rows_bounds_the_least(several):
         by_products=np.zeros(0, int),
         rungs=one.astype(int),
         nodes=one.astype(int),
+        least=True,
     )
     assert proof.recheck() == [upper.min()]
     assert upper.min() >= values.min(axis=1).max()

@@ -11,7 +11,7 @@ from experiments.tightness.exact import exact_maxima
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, upper_bounds
 from reachjax.programs.initial import InitialColumns
-from reachjax.proofs.branches import Branches, HorizonFacts, bounds_of
+from reachjax.proofs.branches import Branches, HorizonFacts, bounds_of, leaf_bounds
 from reachjax.proofs.witnesses import initial_states
 from reachjax.solvers.branching import Tree, affine_leaf, settled
 from reachjax.solvers.conic_programs import ConicPrograms
@@ -222,7 +222,7 @@ def bound_by(horizon, forms, leaves):
     about = HorizonFacts(horizon.start, horizon.facts, horizon.zero, forms.widened(width))
     owner = np.zeros(len(leaves.phases), dtype=int)
     branches = Branches(owner, leaves.phases, leaves.multipliers, leaves.weights)
-    (found,) = bounds_of(about, branches, 1)
+    (found,) = bounds_of(branches, leaf_bounds(about, branches), 1)
     return found
 
 
@@ -421,7 +421,7 @@ def test_settled_multipliers_bound_what_is_attained(case):
         row = directions[i : i + 1] @ horizon.state
         at = horizon.columns_at(worst[i])
         none = np.full((1, len(horizon.zero)), -1)
-        multipliers = settled(horizon, programs, row, at, none)
+        multipliers = settled(horizon, programs, row, at, none, value)
         assert multipliers is not None
         facts = horizon.facts.rows[:, 0] + horizon.facts.columns @ at
         assert multipliers @ facts == pytest.approx(0.0, abs=1e-6)
@@ -439,4 +439,13 @@ def test_what_is_not_the_maximum_is_not_settled(case):
     center = np.asarray(X0.bounding_box().center)
     row, none = directions[:1] @ horizon.state, np.full((1, len(horizon.zero)), -1)
     at = horizon.columns_at(center)
-    assert settled(horizon, programs_of(horizon), row, at, none) is None
+    value = float(row.rows[0, 0] + row.columns[0] @ at[: row.columns.shape[1]])
+    assert settled(horizon, programs_of(horizon), row, at, none, value) is None
+
+
+def test_what_is_attained_below_the_bound_is_not_settled(case):
+    _, _, horizon, directions, exact, worst = case
+    row, none = directions[:1] @ horizon.state, np.full((1, len(horizon.zero)), -1)
+    at, above = horizon.columns_at(worst[0]), exact[0] + 1e-3 * abs(row.columns).sum()
+    assert settled(horizon, programs_of(horizon), row, at, none, exact[0]) is not None
+    assert settled(horizon, programs_of(horizon), row, at, none, above) is None

@@ -57,7 +57,8 @@ def test_gaps_are_closed_and_not_negative(case):
         gaps = np.asarray(tube.proof(k).gaps)
         ranges = np.ptp(runs[:, k] @ np.asarray(tube.template.directions).T, axis=0) / 2
         assert gaps.min() >= -1e-12
-        assert np.all(gaps <= 2e-3 * ranges)
+        # half a facet's range is that of samples when it climbs, and of others here
+        assert np.all(gaps <= 1.1e-4 * ranges + 1e-9)
 
 
 def test_proofs_recheck_to_the_offsets_of_the_sets(case):
@@ -80,15 +81,19 @@ def test_witnesses_are_states_of_the_set_that_attain_their_values(case):
         np.testing.assert_allclose(np.sum(rows * after, axis=1), proof.witnesses, atol=1e-12)
 
 
-def test_nodes_are_none_where_affine_forms_suffice(case):
+def test_a_rung_is_what_a_bound_rests_on(case):
     *_, tube = case
     for k in range(1, HORIZON + 1):
         proof = tube.proof(k)
-        nodes = np.asarray(proof.nodes)
-        for way, count in zip(proof.ways, nodes, strict=True):
-            if way is not Rung.PRODUCTS:
-                expected = Rung.AFFINE_FORM, Rung.LINEAR_PROGRAM, Rung.PHASE_SPLITS
-                assert way is expected[min(count, 2)]
+        _, forms = proof.about.rows.ends(proof.about.start)
+        leaves = np.bincount(proof.branches.owner)
+        assert np.all(np.asarray(proof.nodes)[leaves > 1] >= 3)
+        for i, way in enumerate(proof.ways):
+            if way is Rung.AFFINE_FORM:
+                assert proof.bounds[i] == forms[i]
+            else:
+                assert proof.bounds[i] < forms[i]
+                assert way is Rung.PRODUCTS or (leaves[i] > 1) == (way is Rung.PHASE_SPLITS)
 
 
 def test_without_nodes_the_tube_is_that_of_affine_forms(case):

@@ -72,8 +72,11 @@ def checked(verdict, loop, X0, start=0):
         assert verdict.simulated[example.requirement][example.time] <= 1e-12
     for (name, k), proof in verdict.certificates.items():
         bounds = np.asarray(proof.bounds)
-        assert bounds.max() <= 0
+        assert bounds.max() < 0 or (bounds.max() == 0 and not proof.least)
         assert k >= 1
+        for value, state in zip(proof.witnesses, proof.witness_states, strict=True):
+            assert value <= bounds.max()
+            assert X0.contains(state)
         assert verdict.margins[name][k] >= 0
         np.testing.assert_allclose(proof.recheck(), bounds, atol=1e-12)
 
@@ -142,6 +145,34 @@ def test_decisions_are_those_of_a_tube(n_x, kind, seed):
         verdict = rj.decide(loop, X0, 3, avoid=avoid, start=start, samples=100)
         assert verdict.status is rj.verify(tube, avoid=avoid).status is status
         checked(verdict, loop, X0, start)
+
+
+def test_certificates_own_their_numbers():
+    loop, X0 = halves(BOX)
+    verdict = rj.decide(loop, X0, 2, goal=half_space([1, 1], 0.6), samples=100)
+    ((_, proof),) = verdict.certificates.items()
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(proof))
+
+
+def test_a_ball_that_touches_what_is_avoided_is_refuted():
+    loop, X0 = halves(BALL)
+    verdict = rj.decide(loop, X0, 2, avoid={2: [rj.Box([0.17, 0.17], [1.0, 1.0])]}, samples=100)
+    assert verdict.status is REFUTED  # (0.68, 0.68) is in the ball
+    checked(verdict, loop, X0)
+
+
+def test_what_cannot_be_decided_soon_leaves_work_for_what_comes_later(monkeypatch):
+    """Else the first requirement takes everything, and a later counterexample is not found."""
+    monkeypatch.setattr(rj.tubes.decisions, "WORK", 3e5)
+    loop, X0 = switching_loop(3, seed=23, hidden=(4, 3)), initial_set("box", 3, seed=3)
+    tube = rj.reach(loop, X0, 3, rj.Template.box(3), samples=100)
+    rows = np.asarray(tube.template.directions)
+    second, third = (np.asarray(tube.sets[k].b) for k in (2, 3))
+    at_bound = [half_space(-rows[i], -second[i] - 1e-9) for i in range(6)]
+    broken = [half_space(-rows[0], -third[0] + 1e-4)]
+    verdict = rj.decide(loop, X0, 3, avoid={2: at_bound, 3: broken}, samples=1)
+    assert verdict.status is REFUTED
+    checked(verdict, loop, X0)
 
 
 def test_without_time_what_forms_leave_open_is_unknown():

@@ -1,5 +1,6 @@
 """The library, and what a user would pick instead: each bounds the facets of all steps."""
 
+import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +26,10 @@ PROGRAM = 0.25
 GAP = 1e-4
 """How close to its bound a maximum of HiGHS has to be, as a part of the facet's range: as close as
 `rj.reach` wants its own."""
+
+NEARLY = 1.5
+"""The ranges that `rj.reach` measures gaps by are those of its samples, which are smaller or larger
+than the widths between what is attained at last."""
 
 LARGEST = 50
 """Entries of the paper's basis up to which its program is stated in cvxpy: a second a facet."""
@@ -54,8 +59,10 @@ Method = Callable[[Task, Settings], Answer]
 
 
 def by_default(task: Task, _: Settings) -> Answer:
-    """`rj.reach` as it is by itself."""
-    return _of_tube(rj.reach(task.loop, task.X0, task.horizon, task.template))
+    """`rj.reach` as it is by itself; done where its gap is closed."""
+    found = _of_tube(rj.reach(task.loop, task.X0, task.horizon, task.template))
+    open_gaps = found.bounds - found.attained > NEARLY * GAP * task.widths(found.attained) / 2
+    return dataclasses.replace(found, done=~open_gaps)
 
 
 def by_linear_bounds(task: Task, _: Settings) -> Answer:
@@ -90,7 +97,7 @@ def by_paper(task: Task, settings: Settings) -> Answer:
     X, began = task.X0, time.perf_counter()
     for t, offsets in enumerate(bounds):
         for i, direction in enumerate(task.directions):
-            if time.perf_counter() - began > settings.patience:
+            if time.perf_counter() - began > SHARE * settings.patience:
                 return Answer.of_bounds(bounds)
             offsets[i] = paper_step(**_paper_data(task, X, t), directions=direction[None])[0][0]
         X = rj.Polytope(task.directions, offsets)

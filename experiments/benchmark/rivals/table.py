@@ -13,7 +13,7 @@ from experiments.benchmark.timing import cells
 NOTE = """\
 first: in a process of its own, compilation included unless JAX has a cache
 warm: median of later calls;  /HiGHS: warm seconds over its own
-done: facets of all steps that are bounded; for HiGHS, exactly maximised
+done: facets of all steps that are bounded; for reach and HiGHS, to 1e-4
 size: last set over the largest values that trajectories or HiGHS attain, in
 area or in the worst width;  gap: median of bound less such a value, as a part
 of the facet's range

@@ -20,6 +20,7 @@ from reachjax.numerics.checks import (
     described,
     is_concrete,
     owned,
+    real_number,
     require_bar,
     require_double_precision,
     require_kind,
@@ -31,14 +32,11 @@ from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.sets import AbstractSet, Template
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.cells import grid, halves
-from reachjax.tubes.reach import SAMPLES, ReachTube, reach
+from reachjax.tubes.reach import GAP, SAMPLES, ReachTube, reach
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
 
 Bar = Callable[[Iterable[Any]], Iterable[Any]]
 """Wraps an iteration over cells, such as `tqdm.tqdm`."""
-
-NO_GAP = 1e-9
-"""A gap of this part of a set's width is none."""
 
 BESIDE = 1e-9
 """States that are further beside the initial set than this are not in it."""
@@ -124,6 +122,7 @@ def reach_partitioned(
     samples: int = SAMPLES,
     seed: int = 0,
     progress: Bar | None = None,
+    gap: float = GAP,
 ) -> PartitionedTube:
     """Tubes from cells of an initial set, which together hold every state.
 
@@ -137,13 +136,15 @@ def reach_partitioned(
         solver: what solves the semidefinite programs.
         cells: a number for each coordinate: equal parts of the box around the initial set. Or how
             many in all: then those cells are halved at which the union's gap is widest, until there
-            are as many or no gap is left, at once if one cell's bounds are exact.
+            are as many or no gap is left.
         executor: runs the cells' programs: any with the interface of `concurrent.futures`; threads
-            by default, of which one at a time is in cvxpy. Arguments are sent as numpy arrays.
+            by default. Arguments are sent as numpy arrays.
         start: the time of `X0`, for time-varying loops.
         samples: how many trajectories are simulated in each cell for witnesses.
         seed: of the samples.
         progress: wraps the iteration over tubes to show a progress bar, such as `tqdm.tqdm`.
+        gap: what may be left open of a facet, as a part of its half-range: in each cell, as `reach`
+            takes it, and in the union, where it ends the halving of cells.
 
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
@@ -181,6 +182,7 @@ def reach_partitioned(
         "start": start,
         "samples": samples,
         "seed": seed,
+        "gap": real_number("gap", gap, 0.0),
     }
     own = ThreadPoolExecutor() if executor is None else None
     try:
@@ -189,7 +191,7 @@ def reach_partitioned(
         if isinstance(cells, np.ndarray | jax.Array) and cells.ndim < 2:
             counts = cells.tolist()
         if isinstance(counts, int | np.integer):
-            tubes = _guided(run, X0, whole_number("cells", counts, 1))
+            tubes = _guided(run, X0, whole_number("cells", counts, 1), gap)
         elif isinstance(counts, Sequence) and not isinstance(counts, str):
             tubes = run.tubes([cell.part for cell in grid(X0, counts)])
         else:
@@ -247,7 +249,7 @@ def _tube(loop: ClosedLoop, cell: AbstractSet, template: Template, options: dict
         return jax.device_get(reach(loop, cell, template=template, **options))
 
 
-def _guided(run: _Run, X0: AbstractSet, count: int) -> list[ReachTube]:
+def _guided(run: _Run, X0: AbstractSet, count: int, gap: float) -> list[ReachTube]:
     """Halve the cells at which the union's gap is widest, along their longest side."""
     boxes, tubes = [X0.bounding_box()], run.tubes([X0])
     sides = np.asarray(boxes[0].widths)
@@ -255,7 +257,7 @@ def _guided(run: _Run, X0: AbstractSet, count: int) -> list[ReachTube]:
     widths = _widths(tubes[0])
     while len(tubes) < count:
         some = min(math.ceil(len(tubes) / 4), count - len(tubes))
-        worst = _worst(X0, tubes, widths)[:some]
+        worst = _worst(X0, tubes, widths, gap)[:some]
         if not worst:
             break
         parts = [half for i in worst for half in halves(X0, boxes[i], sides)]
@@ -278,7 +280,9 @@ def _widths(tube: ReachTube) -> Float[np.ndarray, "h m"]:
     return np.array([b + X.support(-A) for X, A, b in facets])
 
 
-def _worst(X0: AbstractSet, tubes: list[ReachTube], widths: Float[np.ndarray, "h m"]) -> list[int]:
+def _worst(
+    X0: AbstractSet, tubes: list[ReachTube], widths: Float[np.ndarray, "h m"], gap: float
+) -> list[int]:
     """The cells whose bounds leave gaps in the union, the widest first, in units of its widths."""
     steps = range(1, tubes[0].horizon + 1)
     bounds = np.array([[tube.proof(t).bounds for t in steps] for tube in tubes])
@@ -286,4 +290,4 @@ def _worst(X0: AbstractSet, tubes: list[ReachTube], widths: Float[np.ndarray, "h
     witnesses = attained.max(axis=0)
     beyond = (bounds - witnesses) / np.where(widths > 0, widths, np.inf)
     widest = beyond.max(axis=(1, 2))
-    return [int(i) for i in np.argsort(-widest, stable=True) if widest[i] > NO_GAP]
+    return [int(i) for i in np.argsort(-widest, stable=True) if widest[i] > gap / 2]

@@ -207,8 +207,20 @@ def test_a_cluster_runs_the_cells(loop, partitioned):
 
 @pytest.mark.parametrize("cells", [np.array([2, 1]), jnp.array([2, 1]), np.array(2), np.int64(2)])
 def test_cells_may_be_counted_by_arrays(loop, cells):
-    tube = rj.reach_partitioned(loop, SETS["box"], 1, rj.Template.box(2), cells=cells, **RECURSION)
+    given = loop, SETS["box"], 1, rj.Template.box(2)
+    tube = rj.reach_partitioned(*given, cells=cells, gap=0.0, **RECURSION)
     assert len(tube.tubes) == 2
+
+
+def test_a_gap_ends_the_halving_of_cells(loop):
+    given = loop, SETS["box"], 3, rj.Template.octagonal(2)
+    few, more = (
+        rj.reach_partitioned(*given, cells=6, gap=gap, samples=100, **RECURSION)
+        for gap in (0.5, 1e-4)
+    )
+    assert len(few.tubes) < len(more.tubes) == 6
+    plain = rj.reach_partitioned(*given, cells=6, samples=100)
+    assert len(plain.tubes) == 1  # the default closes the gaps of the whole set
 
 
 def test_threads_leave_the_filters_of_warnings_alone(loop):

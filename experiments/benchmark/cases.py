@@ -20,6 +20,9 @@ from experiments.double_integrator.problem import INITIAL_BOX, closed_loop, temp
 RANDOM_BOX = np.array([[0.25, -0.25], [0.75, 0.25]])  # the size of the paper's X_0, near the kinks
 
 
+Study = Literal["steps", "growth", "loops", "rivals", "decisions"]
+
+
 @dataclass(frozen=True)
 class Settings:
     """Time Reach-SDP: cvxpy rebuilt for every facet, and other rivals, against this library.
@@ -27,9 +30,9 @@ class Settings:
     Trained weights and results are kept under `output`.
     """
 
-    study: tyro.conf.Positional[Literal["steps", "growth", "loops", "rivals"]] = "steps"
+    study: tyro.conf.Positional[Study] = "steps"
     """One step of several networks; one facet as networks grow; tubes and training steps; tubes
-    beside those of what a user would pick instead."""
+    beside those of what a user would pick instead; verdicts beside the same."""
 
     widths: tuple[int, ...] = (10, 20, 32)
     """`steps`: neurons in each of the two hidden layers, one network a width."""
@@ -46,12 +49,12 @@ class Settings:
     methods: tuple[str, ...] = ()
     """`rivals`: names of methods as the table has them; all without any."""
     simulations: int = 20_000
-    """`rivals`: trajectories whose largest values bounds are compared with."""
+    """`rivals`, `decisions`: trajectories whose largest values bounds are compared with."""
     repetitions: int = 3
     """Warm calls of which the median is taken."""
     patience: float = 60.0
     """Seconds after which a method is not called again, and cvxpy rebuilt for no more facets;
-    `rivals`: after which a call is ended."""
+    `rivals`, `decisions`: after which a call is ended."""
     clock: Literal["wall", "cpu"] = "wall"
     """What a second is; with one thread, the processor's own are immune to other jobs."""
     samples: int = 500

@@ -5,9 +5,10 @@ networks with two hidden layers: some trained on the MPC and started from the pa
 set, some with random weights and a set of the same size where most of their neurons switch.
 `growth`: one facet of the paper's program as random networks grow. `loops`: six-step tubes of the
 trained 2-10-5-1 network, and training steps. `rivals`: tubes of ever larger loops beside HiGHS's
-mixed-integer programs, affine forms in plain numpy, and the paper's programs by cvxpy. All methods
-run one after the other, with one BLAS thread and one thread for Clarabel (XLA takes what cores
-there are), so their ratios mean more than their seconds.
+mixed-integer programs, affine forms in plain numpy, and the paper's programs by cvxpy.
+`decisions`: verdicts on six initial sets of a car, beside affine forms and samples. All methods run
+one after the other, with one BLAS thread and one thread for Clarabel (XLA takes what cores there
+are), so their ratios mean more than their seconds.
 """
 
 import dataclasses
@@ -37,6 +38,7 @@ from experiments.benchmark.loops import (
     tube_rows,
     tube_table,
 )
+from experiments.benchmark.rivals import decisions as verdicts
 from experiments.benchmark.rivals.comparison import Run, rows, unsound
 from experiments.benchmark.rivals.methods import chosen
 from experiments.benchmark.rivals.table import NOTE, table
@@ -123,6 +125,21 @@ def rivals(settings: Settings) -> None:
         raise SystemExit(f"error: bounds are below values that are attained: {', '.join(wrong)}")
 
 
+def decisions(settings: Settings) -> None:
+    """Every method on six initial sets of one loop, each method in a process of its own."""
+    sets, found = verdicts.tasks(), []
+    rooms = verdicts.margins(sets, settings)
+    with bar() as shown:
+        progress = shown.add_task("", total=len(verdicts.METHODS))
+        for method in verdicts.METHODS:
+            shown.update(progress, description=method)
+            found.append(verdicts.row(method, sets, settings))
+            shown.advance(progress)
+    rich.print(verdicts.table(found, rooms, settings))
+    seen = [{"ahead": ahead, "room": room} for ahead, room in rooms.items()]
+    write(settings, rows=found, simulated=seen)
+
+
 def write(settings: Settings, **results: list[dict]) -> None:
     """Settings, threads and every row of each table."""
     threads = {name: os.environ.get(name) for name in THREADS} | {"cores": os.cpu_count()}
@@ -135,6 +152,6 @@ def main(settings: Settings) -> None:
     """One study: its tables are printed, and its rows written."""
     require_folder(settings.output)
     jax.config.update("jax_enable_x64", True)
-    studies = {"steps": steps, "growth": growth, "loops": loops, "rivals": rivals}
+    studies = {study.__name__: study for study in (steps, growth, loops, rivals, decisions)}
     studies[settings.study](settings)
     rich.print(f"written: {settings.output / settings.study}.json")

@@ -1,5 +1,6 @@
 """Verdicts of the library beside those of affine forms and of simulations."""
 
+import dataclasses
 import json
 import re
 
@@ -29,6 +30,15 @@ def test_what_methods_say_agrees_with_what_simulations_show(sets):
     assert said["decide"] == said["verify"] == ["proved", "refuted"]
     assert said["numpy"] == ["proved", "-"]
     assert said["samples"] == ["-", "refuted"]
+
+
+def test_an_initial_set_that_is_unsafe_itself_is_not_proved():
+    """The lead drives away from it at first, so one step later all is well."""
+    task = dataclasses.replace(cruise_control.following(-35.35), horizon=1)
+    rooms = task.margin(task.simulated(500, 0)[:, :1]), task.margin(task.simulated(500, 0)[:, 1:])
+    assert rooms[0] < 0 < rooms[1]
+    said = {name: method(task, SETTINGS) for name, method in decisions.METHODS.items()}
+    assert said == {"decide": "refuted", "verify": "refuted", "numpy": "-", "samples": "refuted"}
 
 
 def test_the_command_prints_one_table_and_writes_its_rows(tmp_path, capsys, monkeypatch):

@@ -27,7 +27,13 @@ from reachjax.tubes.steps import Reached, Setting, Step
 from reachjax.tubes.successors import facets_by_products
 
 PRODUCTS = 2.5e7
-"""The fourth power of the columns of all facets that get products, in all: some tens of seconds."""
+"""The fourth power of the horizon's columns, of all facets that get products: some tens of seconds.
+
+A window that has fewer begins at a certified set, and hardly proves more than is known.
+"""
+
+LARGEST = 100
+"""Columns of the horizon from which on no facet gets products, whatever the time."""
 
 EXACT = 1e-7
 """Where derivatives are asked for, a facet climbs until its gap is a smaller part of its range."""
@@ -80,8 +86,9 @@ def sets_by_branching(
         opened = np.flatnonzero(gaps > setting.gap * ranges)
         opened = opened[np.argsort(-gaps[opened], kind="stable")]
         products = None
-        if len(opened) and time.monotonic() < end:
-            cost = float(steps[-1].window.taken) ** 4
+        columns = climbed.columns.shape[1]
+        if columns <= LARGEST and time.monotonic() < end:
+            cost = float(columns) ** 4
             opened = opened[: int(min(work / cost, len(opened)))]
             work -= len(opened) * cost
         else:

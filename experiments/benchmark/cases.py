@@ -19,7 +19,6 @@ from experiments.double_integrator.problem import INITIAL_BOX, closed_loop, temp
 
 RANDOM_BOX = np.array([[0.25, -0.25], [0.75, 0.25]])  # the size of the paper's X_0, near the kinks
 
-
 Study = Literal["steps", "growth", "loops", "rivals", "decisions"]
 
 
@@ -49,7 +48,8 @@ class Settings:
     methods: tuple[str, ...] = ()
     """`rivals`: names of methods as the table has them; all without any."""
     simulations: int = 20_000
-    """`rivals`, `decisions`: trajectories whose largest values bounds are compared with."""
+    """`rivals`: trajectories whose largest values bounds are compared with; `decisions`: those that
+    tell what a set's margin is, and that samples refute by."""
     repetitions: int = 3
     """Warm calls of which the median is taken."""
     patience: float = 60.0

@@ -38,9 +38,17 @@ from experiments.benchmark.loops import (
     tube_rows,
     tube_table,
 )
-from experiments.benchmark.rivals import decisions as verdicts
 from experiments.benchmark.rivals.comparison import Run, rows, unsound
+from experiments.benchmark.rivals.decision_table import DECISIONS_NOTE, decision_table
+from experiments.benchmark.rivals.decisions import (
+    contradictions,
+    decision_rows,
+    initial_sets,
+    margins,
+    totals,
+)
 from experiments.benchmark.rivals.methods import chosen
+from experiments.benchmark.rivals.procedures import PROCEDURES
 from experiments.benchmark.rivals.table import NOTE, table
 from experiments.benchmark.rivals.tasks import tasks
 from experiments.benchmark.steps import STEPS_NOTE, measured, methods, steps_table
@@ -126,18 +134,24 @@ def rivals(settings: Settings) -> None:
 
 
 def decisions(settings: Settings) -> None:
-    """Every method on six initial sets of one loop, each method in a process of its own."""
-    sets, found = verdicts.tasks(), []
-    rooms = verdicts.margins(sets, settings)
+    """Every procedure on six initial sets of one loop, each procedure in a process of its own.
+
+    Raises:
+        SystemExit: what is proved is broken by a trajectory, or refuted.
+    """
+    results, sets = [], initial_sets()
     with bar() as shown:
-        progress = shown.add_task("", total=len(verdicts.METHODS))
-        for method in verdicts.METHODS:
+        progress = shown.add_task("simulations", total=len(PROCEDURES))
+        rooms = margins(sets, settings)
+        for method in PROCEDURES:
             shown.update(progress, description=method)
-            found.append(verdicts.row(method, sets, settings))
+            results += decision_rows(method, sets, rooms, settings)
             shown.advance(progress)
-    rich.print(verdicts.table(found, rooms, settings))
-    seen = [{"ahead": ahead, "room": room} for ahead, room in rooms.items()]
-    write(settings, rows=found, simulated=seen)
+            write(settings, rows=results, totals=totals(results))
+    rich.print(decision_table(results))
+    rich.print(DECISIONS_NOTE)
+    if wrong := contradictions(results):
+        raise SystemExit(f"error: what is proved is broken: {', '.join(wrong)}")
 
 
 def write(settings: Settings, **results: list[dict]) -> None:

@@ -1,118 +1,112 @@
 """Whether a car keeps its distance, from six initial sets: who decides it, and in what time.
 
-`decide` against `verify` on the tube of `LinearBounds`, affine forms in plain numpy, which can only
-prove, and samples, which can only refute. Each answers for all sets in a process of its own.
+Each procedure answers for all sets, one after the other, in a process of its own: so what compiles
+falls to the first set, and to the first that is refuted.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 import reachjax as rj
-from experiments import report
 from experiments.benchmark.cases import Settings
 from experiments.benchmark.rivals import cruise_control
-from experiments.benchmark.rivals.affine_forms import affine_bounds
+from experiments.benchmark.rivals.procedures import PROCEDURES, Decision
 from experiments.benchmark.rivals.processes import Stopped, from_process
 from experiments.benchmark.rivals.task import Task
-from experiments.benchmark.timing import Timing, cells, each_call
+from experiments.benchmark.timing import Timing, each_call
 
-AHEAD = (0.0, -25.0, -30.6, -30.8, -35.0, -45.0)
-"""Metres by which the lead is farther ahead, in each initial set."""
-
-UNDECIDED = "-"
-
-Answer = Callable[[Task, Settings], str]
+AHEAD = (0.0, -25.0, -30.7, -30.72, -32.0, -35.0)
+"""Metres by which the lead is farther ahead. The distance is kept from the first three sets; from
+the others it is not, though it is at first. Somewhere between -30.7 and -30.72 it just is."""
 
 
-def by_decide(task: Task, _: Settings) -> str:
-    """`rj.decide`."""
-    return rj.decide(task.loop, task.X0, task.horizon, safe=task.safe).status.name.lower()
+def initial_sets() -> dict[str, Task]:
+    """The loop from each initial set, by the name that the table has."""
+    return {f"{ahead:+g} m": cruise_control.following(ahead) for ahead in AHEAD}
 
 
-def by_tube(task: Task, _: Settings) -> str:
-    """`rj.verify` on the tube of `rj.LinearBounds`."""
-    tube = rj.reach(task.loop, task.X0, task.horizon, task.template, rj.LinearBounds())
-    return rj.verify(tube, safe=task.safe).status.name.lower()
-
-
-def by_numpy(task: Task, _: Settings) -> str:
-    """Affine forms, which prove what they bound: every step but the first set, known by corners."""
-    assert task.safe is not None
-    A, b = map(np.asarray, task.safe.facets)
-    at_first = (task.X0.vertices() @ A.T).max(axis=0)
-    bounds = np.vstack([at_first, affine_bounds(task.loop, task.X0, task.horizon, A)])
-    return "proved" if np.all(bounds <= b) else UNDECIDED
-
-
-def by_simulation(task: Task, settings: Settings) -> str:
-    """Trajectories, which refute what they break."""
-    broken = task.margin(task.simulated(settings.simulations, settings.seed)) < 0
-    return "refuted" if broken else UNDECIDED
-
-
-METHODS: dict[str, Answer] = {
-    "decide": by_decide,
-    "verify": by_tube,
-    "numpy": by_numpy,
-    "samples": by_simulation,
-}
-"""By the names that tables have, the library first."""
-
-
-def tasks() -> dict[float, Task]:
-    """The loop from each initial set, by how far the lead is ahead."""
-    return {ahead: cruise_control.following(ahead) for ahead in AHEAD}
-
-
-def _answers(method: str, sets: dict[float, Task], settings: Settings) -> dict[str, str]:
-    return {f"{ahead:+g}": METHODS[method](task, settings) for ahead, task in sets.items()}
-
-
-def _calls(
-    method: str, sets: dict[float, Task], settings: Settings
-) -> Iterator[tuple[float, dict[str, str]]]:
-    return each_call(partial(_answers, method, sets, settings), settings)
-
-
-def row(method: str, sets: dict[float, Task], settings: Settings) -> dict[str, Any]:
-    """What a method says of every set, and its seconds for all of them together."""
-    arguments, calls = (method, sets, settings), []
-    try:
-        for call in from_process(_calls, *arguments, patience=settings.patience):
-            calls.append(call)
-    except Stopped:
-        if not calls:
-            calls = [(settings.patience, dict.fromkeys(map("{:+g}".format, sets), "?"))]
-    timing = Timing.of(calls)
-    return {"method": method, "answers": timing.result, **timing.row()}
-
-
-def margins(sets: dict[float, Task], settings: Settings) -> dict[str, float]:
-    """The least room that simulated trajectories leave, in metres."""
+def margins(sets: dict[str, Task], settings: Settings) -> dict[str, float]:
+    """The least room, in metres, that simulated trajectories from each set leave."""
     return {
-        f"{ahead:+g}": task.margin(task.simulated(settings.simulations, settings.seed))
-        for ahead, task in sets.items()
+        name: task.margin(task.simulated(settings.simulations, settings.seed))
+        for name, task in sets.items()
     }
 
 
-def _coloured(word: str) -> str:
-    verdict = word.upper()
-    return report.coloured(verdict, word) if verdict in report.COLOURS else word
+def decision_rows(
+    method: str, sets: dict[str, Task], rooms: dict[str, float], settings: Settings
+) -> list[dict[str, Any]]:
+    """A row for each set; where a call takes too long, this set and those after it have no verdict.
+
+    Args:
+        method: one of `PROCEDURES`.
+        sets: the tasks by their names.
+        rooms: what `margins` says of them.
+        settings: how often and how long procedures are called.
+    """
+    calls: dict[str, list[tuple[float, Decision]]] = {name: [] for name in sets}
+    problem = None
+    try:
+        for name, call in from_process(_calls, method, sets, settings, patience=settings.patience):
+            calls[name].append(call)
+    except Stopped as stopped:
+        problem = str(stopped)
+    shared = {"method": method, "clock": settings.clock, "problem": problem}
+    return [
+        {"set": name, "margin": rooms[name]} | shared | _decided(each)
+        for name, each in calls.items()
+    ]
 
 
-def table(rows: list[dict[str, Any]], rooms: dict[str, float], settings: Settings) -> Table:
-    """A row for each method, a column for each set."""
-    simulated = ("room", *(f"{room:.2f}" for room in rooms.values()), "", "")
-    shown = [simulated, ("",) * len(simulated)]
-    for each in rows:
-        warm, first = cells(each)
-        shown.append((each["method"], *map(_coloured, each["answers"].values()), first, warm))
-    title = (
-        "is the distance kept? by metres that the lead is ahead; room that\n"
-        f"simulations leave, in metres; {settings.clock} seconds for all sets"
-    )
-    return report.table(title, ("method",), (*rooms, "first", "warm"), shown)
+def _calls(
+    method: str, sets: dict[str, Task], settings: Settings
+) -> Iterator[tuple[str, tuple[float, Decision]]]:
+    for name, task in sets.items():
+        for call in each_call(partial(PROCEDURES[method], task, settings), settings):
+            yield name, call
+
+
+def _decided(calls: list[tuple[float, Decision]]) -> dict[str, Any]:
+    """The last verdict and the seconds of calls, if there are any."""
+    if not calls:
+        return {"verdict": None, "programs": None} | Timing(np.nan, [], None).row()
+    timing = Timing.of(calls)
+    decision: Decision = timing.result
+    return {"verdict": decision.verdict.name, "programs": decision.programs} | timing.row()
+
+
+def totals(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """For each procedure, how many sets it decides, and its seconds for all of them."""
+    found = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        each = [row for row in rows if row["method"] == method]
+        verdicts = [row["verdict"] for row in each]
+        programs = [row["programs"] for row in each]
+        found.append(
+            {
+                "method": method,
+                "sets": len(each),
+                "proved": verdicts.count("PROVED"),
+                "refuted": verdicts.count("REFUTED"),
+                "programs": None if None in programs else sum(programs),
+                "seconds": sum(row["seconds"] for row in each),
+                "first": sum(row["first"] for row in each),
+                "calls": all(row["calls"] for row in each),
+                "problem": each[0]["problem"],
+            }
+        )
+    return found
+
+
+def contradictions(rows: list[dict[str, Any]]) -> list[str]:
+    """Which procedures prove what a simulated trajectory breaks or another procedure refutes."""
+    refuted = {row["set"] for row in rows if row["verdict"] == rj.VerdictStatus.REFUTED.name}
+    return [
+        f"{row['method']} at {row['set']}"
+        for row in rows
+        if row["verdict"] == rj.VerdictStatus.PROVED.name
+        and (row["margin"] < 0 or row["set"] in refuted)
+    ]

@@ -1,5 +1,6 @@
 """The table of rivals: loops one below the other, a method a row."""
 
+from collections.abc import Callable
 from itertools import groupby
 from operator import itemgetter
 from typing import Any
@@ -22,18 +23,35 @@ of the facet's range
 
 def table(rows: list[dict[str, Any]]) -> Table:
     """All loops."""
-    shown = []
-    for _, group in groupby(rows, itemgetter("loop")):
-        methods = list(group)
-        words = _words(methods[0])
-        words += [""] * (len(methods) - len(words))
-        lines = [_cells(row) for row in methods]
-        lines += [("",) * len(lines[0])] * (len(words) - len(lines))
-        shown += [(word, *line) for word, line in zip(words, lines, strict=True)]
-        shown.append(("",) * len(shown[-1]))
+    shown = blocks(rows, "loop", _words, _cells)
     headings = ("first", "warm", "/HiGHS", "done", "size", "gap")
     title = f"tubes of the library and its rivals, {rows[0]['clock']} seconds"
     return report.table(title, ("loop", "method"), headings, shown[:-1])
+
+
+def blocks(
+    rows: list[dict[str, Any]],
+    by: str,
+    words: Callable[[dict[str, Any]], list[str]],
+    line: Callable[[dict[str, Any]], tuple[str, ...]],
+) -> list[tuple[str, ...]]:
+    """Lines of a table, a block for each group of rows and an empty line after it.
+
+    Args:
+        rows: those of a group one after the other.
+        by: the key whose value a group shares.
+        words: what the first column says of a group, line by line.
+        line: cells of a row, in the columns after it.
+    """
+    shown = []
+    for _, group in groupby(rows, itemgetter(by)):
+        members = list(group)
+        said, lines = words(members[0]), [line(row) for row in members]
+        said += [""] * (len(lines) - len(said))
+        lines += [("",) * len(lines[0])] * (len(said) - len(lines))
+        shown += [(word, *rest) for word, rest in zip(said, lines, strict=True)]
+        shown.append(("",) * len(shown[-1]))
+    return shown
 
 
 def _words(row: dict[str, Any]) -> list[str]:

@@ -1,6 +1,7 @@
 """What rivals are given: a loop, where it starts, what its sets look like, what it has to do."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
@@ -45,6 +46,11 @@ class Task:
         """Weights and biases of the network."""
         assert isinstance(self.loop.controller, rj.MLP)
         return [(np.asarray(W), np.asarray(b)) for W, b in self.loop.controller.layers]
+
+    @property
+    def required(self) -> dict[str, Any]:
+        """What `rj.verify` and `rj.decide` take of it."""
+        return {"goal": self.goal, "safe": self.safe, "avoid": self.avoid}
 
     def simulated(self, count: int, seed: int) -> Float[ndarray, "c horizon+1 n_x"]:
         """Trajectories from `count` states of the box and from its corners."""

@@ -286,8 +286,7 @@ def test_a_point_is_pushed_to_the_goal_by_limited_pushes(lesson):
     states = task.simulated(2000, 0)
     assert task.margin(states) > 0.5
     tube = rj.reach(task.loop, task.X0, task.horizon, task.template, rj.LinearBounds(), samples=1)
-    required = {"goal": task.goal, "safe": task.safe, "avoid": task.avoid}
-    assert rj.verify(tube, **required, samples=100).status is rj.VerdictStatus.PROVED
+    assert rj.verify(tube, **task.required, samples=100).status is rj.VerdictStatus.PROVED
 
 
 @pytest.mark.long

@@ -7,7 +7,8 @@ one of several generalised gradients: of a box's facet with respect to its norma
 of the facet's corners.
 
 A set that is empty, unbounded or too thin raises an error on plain arrays. Inside `jax.jit`, where
-it may come from weights that went astray in training, its values and slopes are NaN.
+it may come from weights that went astray in training, its values and slopes are NaN. What has a
+formula has it there, without a call to the host (`formulas`).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import is_concrete, require_double_precision
 from reachjax.numerics.host import all_finite, on_host
-from reachjax.sets import hulls, polyhedra
+from reachjax.sets import formulas, hulls, polyhedra
 from reachjax.sets.balance import lengths
 from reachjax.sets.separation import separation_and_multipliers
 
@@ -37,6 +38,8 @@ Offsets = Float[Array, " m"]
 
 def bounding_box(A: Normals, b: Offsets) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Lower and upper bounds of each coordinate, rounded outwards."""
+    if not is_concrete((A, b)) and (known := formulas.box_ends(A, b)) is not None:
+        return known
     ends, n = _values(_box, 2 * A.shape[1], A, b), A.shape[1]
     return -ends[:n], ends[n:]
 
@@ -53,6 +56,11 @@ def separation(A: Normals, b: Offsets, C: Normals, d: Offsets) -> Float[Array, "
 
 def volume(A: Normals, b: Offsets) -> Float[Array, ""]:
     """The volume: moving facet `i` by `db_i` sweeps `area_i db_i / |a_i|`."""
+    if not is_concrete((A, b)):
+        if (ends := formulas.box_ends(A, b)) is not None:
+            return jnp.prod(ends[1] - ends[0])
+        if A.shape[1] == 2:
+            return formulas.area(A, b)
     return _values(_volume, 1, A, b)[0]
 
 

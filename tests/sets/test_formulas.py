@@ -1,0 +1,101 @@
+"""Sizes that are formulas, beside those of linear programs and Qhull."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from reachjax.sets import Box, Polytope, Template, formulas, hulls
+
+
+def polygon(seed):
+    """Facets around a point, some of them redundant and some twice there."""
+    rng = np.random.default_rng(seed)
+    angles = np.r_[0.0, 2.1, 4.2, rng.uniform(0, 2 * np.pi, rng.integers(0, 9))]
+    A = np.c_[np.cos(angles), np.sin(angles)] * rng.uniform(0.1, 10, (len(angles), 1))
+    lengths = np.linalg.norm(A, axis=1)
+    size = 10 ** rng.uniform(-3, 3)
+    b = A @ (rng.normal(size=2) * 10 ** rng.uniform(-3, 3)) + rng.uniform(0.01, 1, len(A)) * (
+        size * lengths
+    )
+    return A, b, lengths
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_area_and_its_derivatives_are_those_of_qhull(seed):
+    A, b, lengths = polygon(seed)
+    area, areas, centroids = hulls.facet_areas(A, b)
+    value, (by_normals, by_offsets) = jax.value_and_grad(formulas.area, argnums=(0, 1))(A, b)
+    assert float(value) == pytest.approx(area, rel=1e-8)
+    swept = areas / lengths
+    np.testing.assert_allclose(by_offsets, swept, atol=1e-7 * swept.max())
+    expected = -swept[:, None] * centroids
+    np.testing.assert_allclose(by_normals, expected, atol=1e-7 * abs(expected).max())
+
+
+def test_facets_that_are_there_twice_count_once():
+    A, b, _ = polygon(3)
+    twice = formulas.area(np.r_[A, 2 * A], np.r_[b, 2 * b])
+    assert float(twice) == pytest.approx(hulls.volume(A, b), rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("A", "b"),
+    [
+        ([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], [1.0, -2.0, 1.0, 1.0]),
+        ([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], [0.0, 0.0, -1.0]),
+        ([[1.0, 0.0], [0.0, 1.0]], [1.0, 1.0]),
+        ([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]], [1.0, 1.0, 1.0]),
+    ],
+    ids=["empty box", "empty triangle", "a quadrant", "half a strip"],
+)
+def test_what_is_empty_or_unbounded_has_no_area_and_no_derivative(A, b):
+    value, slope = jax.value_and_grad(formulas.area, argnums=1)(jnp.array(A), jnp.array(b))
+    assert np.isnan(value)
+    assert np.isnan(slope).any()
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_boxes_are_told_apart_and_their_ends_are_exact(n):
+    box = Box(-np.arange(1.0, n + 1) / 3, np.arange(n) + 1 / 7)
+    A, b = (np.asarray(part) for part in Template.box(n).polytope(jnp.zeros(2 * n)).facets)
+    b = np.asarray(box.support(A))
+    ends = formulas.box_ends(A, b)
+    assert ends is not None
+    lower, upper = ends
+    np.testing.assert_array_equal(lower, box.lower)
+    np.testing.assert_array_equal(upper, box.upper)
+    assert formulas.box_ends(2 * A, b) is None  # b / 2 would have to be rounded outwards
+    assert formulas.box_ends(A[1:], b[1:]) is None  # unbounded
+    if n > 1:
+        octagonal = np.asarray(Template.octagonal(n).directions)
+        assert formulas.box_ends(octagonal, octagonal[:, 0]) is None
+
+
+def test_the_inner_one_of_two_facets_bounds_a_box_and_an_empty_one_has_no_ends():
+    A = np.array([[1.0], [1.0], [-1.0]])
+
+    def widths(b):
+        ends = formulas.box_ends(A, b)
+        assert ends is not None
+        return (ends[1] - ends[0])[0]
+
+    assert float(widths(jnp.array([2.0, 1.0, 0.0]))) == 1.0
+    np.testing.assert_array_equal(jax.grad(widths)(jnp.array([2.0, 1.0, 0.0])), [0, 1, 1])
+    value, slope = jax.value_and_grad(widths)(jnp.array([2.0, 1.0, -1.5]))
+    assert np.isnan(value)
+    assert np.isnan(slope).any()
+
+
+@pytest.mark.parametrize("template", [Template.box(3), Template.octagonal(2), Template.regular(5)])
+def test_compiled_sizes_and_boxes_are_those_of_plain_arrays(template):
+    A = template.directions
+    b = jnp.asarray(np.random.default_rng(0).uniform(0.5, 1.0, len(A)))
+
+    def sizes(b):
+        region = Polytope(A, b)
+        box = region.bounding_box()
+        return region.size(), box.lower, box.upper
+
+    for compiled, plain in zip(jax.jit(sizes)(b), sizes(b), strict=True):
+        np.testing.assert_allclose(compiled, plain, rtol=1e-12)

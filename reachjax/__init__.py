@@ -70,7 +70,7 @@ from reachjax.training import (
 from reachjax.tubes.decisions import decide
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
 from reachjax.tubes.plotting import plot_set, plot_tube
-from reachjax.tubes.reach import ReachTube, reach, reach_step
+from reachjax.tubes.reach import Interrupted, ReachTube, reach, reach_step
 from reachjax.tubes.requirements import shortfall
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.tubes.specs import verify
@@ -108,6 +108,7 @@ __all__ = [
     "EllipsoidTemplate",
     "HardTanh",
     "InteriorPoint",
+    "Interrupted",
     "Intersection",
     "LeakyReLU",
     "LinearBounds",

@@ -126,6 +126,11 @@ class Tree:
             return False
         return not self._enough(-self._heap[0][0], self._best)
 
+    @property
+    def gap(self) -> float:
+        """Between what is proved and what is attained; zero where nothing is left to be split."""
+        return -self._heap[0][0] - self._best if self._heap else 0.0
+
     def grow(self, budget: int) -> None:
         """Split leaves until it is closed, or so many more programs are solved."""
         budget += self.nodes

@@ -113,6 +113,9 @@ class ConicPrograms(AbstractPrograms):
             self._placed(size * reduced),
         )
 
+    def forget(self) -> None:
+        """Nothing is kept anyhow."""
+
     def _placed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
         """Values of the columns that matter among those of all."""
         found = np.zeros(self._width)

@@ -80,6 +80,10 @@ class AbstractPrograms(abc.ABC):
             basis: where the search begins; None where the last one ended.
         """
 
+    @abc.abstractmethod
+    def forget(self) -> None:
+        """Let what is solved next depend on nothing that was solved before."""
+
 
 class LinearPrograms(AbstractPrograms):
     """Linear programs as one model.
@@ -166,6 +170,11 @@ class LinearPrograms(AbstractPrograms):
             self._count -= extra
             self._model.changeColBounds(0, 0.0, 0.0)
         return found
+
+    def forget(self) -> None:
+        """Let what is solved next depend on nothing that was solved before."""
+        self._hold(set())
+        self._model.clearSolver()
 
     def _solved(
         self, rows: np.ndarray, constants: np.ndarray, size: float, extra: int

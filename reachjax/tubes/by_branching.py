@@ -8,7 +8,7 @@ facets of a step prove bounds the units of the next one.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +40,13 @@ EXACT = 1e-7
 
 
 def sets_by_branching(
-    setting: Setting, nodes: int, X0: AbstractSet, box: Box, template: Template, horizon: int
+    setting: Setting,
+    nodes: int,
+    X0: AbstractSet,
+    box: Box,
+    template: Template,
+    horizon: int,
+    known: Sequence[Reached] = (),
 ) -> Iterator[Reached]:
     """The smallest sets that are proved within the setting's gap, nodes and time.
 
@@ -51,6 +57,7 @@ def sets_by_branching(
         box: around it.
         template: what the sets look like.
         horizon: how many steps there are.
+        known: the first ones.
 
     Raises:
         ValueError: states overflow.
@@ -61,9 +68,22 @@ def sets_by_branching(
         gap = min(gap, EXACT)
     timed = np.isfinite(setting.deadline)  # then that is the budget
     of_programs, work = (np.inf, np.inf) if timed else (WORK, PRODUCTS)
-    ladder = Ladder(loop, begun, around, setting.start, nodes, setting.deadline, of_programs)
+    ladder = Ladder(
+        loop, begun, around, setting.start, nodes, setting.deadline, of_programs, setting.note
+    )
     X, steps = X0, []
-    for k in range(1, horizon + 1):
+    for k, (region, proof, *_) in enumerate(known, start=1):
+        steps.append(Step(setting, X, k - 1, tuple(steps)))
+        X = region
+        ladder.advance()
+        if isinstance(proof, BranchCertificate):
+            ladder.spend(int(np.sum(proof.nodes)))
+            work -= len(proof.by_products) * ladder.width**4
+        ladder.horizon.narrow(*_ends(*_fixed(X)))
+    left = (horizon - len(known)) / horizon
+    ladder.grant(left * of_programs)
+    work = max(work, left * PRODUCTS)
+    for k in range(len(known) + 1, horizon + 1):
         began = time.perf_counter()
         steps.append(Step(setting, X, k - 1, tuple(steps)))
         directions = template.at(k).directions
@@ -86,20 +106,20 @@ def sets_by_branching(
         opened = np.flatnonzero(gaps > setting.gap * ranges)
         opened = opened[np.argsort(-gaps[opened], kind="stable")]
         products = None
-        columns = climbed.columns.shape[1]
-        if columns <= LARGEST and time.monotonic() < end:
-            cost = float(columns) ** 4
+        if ladder.width <= LARGEST and time.monotonic() < end:
+            cost = ladder.width**4
             opened = opened[: int(min(work / cost, len(opened)))]
             work -= len(opened) * cost
         else:
             opened = opened[:0]
         if len(opened):
+            setting.note(f"products for {len(opened)} facets, largest gap {gaps.max():.1e}")
             offsets, products = _with_products(steps[-1], directions, offsets, opened, end)
         X = Polytope(directions, offsets)
         seconds = time.perf_counter() - began
         proof = _certificate(climbed, offsets, products, opened, seconds)
         yield Reached(X, proof, climbed.states, climb=False)
-        ladder.horizon.narrow(*_ends(rows, np.asarray(jax.lax.stop_gradient(offsets))))
+        ladder.horizon.narrow(*_ends(*_fixed(X)))
 
 
 def _offsets(
@@ -133,6 +153,14 @@ def _with_products(
     found, proof = facets_by_products(step, directions[opened], end)
     better = found < offsets[opened]
     return offsets.at[opened].set(jnp.where(better, found, offsets[opened])), proof
+
+
+def _fixed(X: AbstractSet) -> tuple[np.ndarray, np.ndarray]:
+    """Directions and offsets of a set's facets, without derivatives."""
+    flat, _ = X.parts
+    assert flat is not None  # as templates have it
+    rows, offsets = jax.lax.stop_gradient(flat.facets)
+    return np.asarray(rows), np.asarray(offsets)
 
 
 def _ends(rows: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

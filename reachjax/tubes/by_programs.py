@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from reachjax.numerics.checks import is_concrete
+from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.tubes.steps import Reached, Setting, Step
 from reachjax.tubes.successors import successors
@@ -18,6 +19,7 @@ def sets_by_programs(
     template: AbstractTemplate,
     horizon: int,
     window: int | None,
+    known: Sequence[Reached] = (),
 ) -> Iterator[Reached]:
     """The smallest sets that are proved, each being the next one's set of states.
 
@@ -29,14 +31,24 @@ def sets_by_programs(
         template: what the sets look like.
         horizon: how many steps there are.
         window: over how many of them a program reaches back; None for as many as may be.
+        known: the first ones.
     """
     X, proof, steps = X0, None, []
     for k in range(horizon):
         before = steps if window is None else steps[max(0, k + 1 - window) :]
         step = Step(setting, X, k, tuple(before), proof)
         steps.append(step)
+        if k < len(known):
+            X, proof = known[k].region, _of_programs(known[k].proof)
+            continue
+        setting.note("semidefinite programs")
         X, proof = successors(step, template.at(k + 1))
         states = np.zeros((0, X0.dimension))
         if len(step.window) == k + 1 and is_concrete(proof.moments):
             states = np.asarray(proof.moments)[:, : X0.dimension, -1]
         yield Reached(X, proof, states, climb=True)
+
+
+def _of_programs(proof: AbstractProof) -> AbstractCertificate | None:
+    """A proof by programs, whose products the next one may begin with; None if it is another."""
+    return proof if isinstance(proof, AbstractCertificate) else None

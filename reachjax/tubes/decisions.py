@@ -29,7 +29,7 @@ from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated, Simulations
 from reachjax.sets import AbstractSet, PolyhedralSet
 from reachjax.tubes.ladder import WORK, Climbed, Ladder, Target
-from reachjax.tubes.reach import EXAMPLES, deadline_of, simulations_from
+from reachjax.tubes.propagation import EXAMPLES, deadline_of, simulations_from
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Requirement, requirements
 from reachjax.tubes.steps import boxed

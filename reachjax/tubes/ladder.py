@@ -93,6 +93,7 @@ class Ladder:
         nodes: how many linear programs a bound may take.
         deadline: after which nothing is solved, as `time.monotonic` says it.
         work: what all linear programs may take, in rows and columns, squared.
+        note: is told what happens.
 
     Attributes:
         horizon: forms and facts.
@@ -107,7 +108,9 @@ class Ladder:
         nodes: int,
         deadline: float,
         work: float = WORK,
+        note: Callable[[str], None] = lambda note: None,
     ):
+        self._note = note
         self._loop, self._t, self._nodes, self._deadline = loop, t, nodes, deadline
         self._work = work
         self.horizon = Horizon(loop, X0, box, t)
@@ -134,6 +137,8 @@ class Ladder:
             tighten: whether the ranges of units that switch are bounded by linear programs.
             until: when to stop that, as `time.monotonic` says it.
         """
+        # what a step proves depends on nothing but what it is about
+        self._programs.forget()
         ranges = partial(self._ranges, until) if tighten and self._nodes else None
         self.horizon.advance(ranges)
 
@@ -141,11 +146,12 @@ class Ladder:
         """Multipliers that bound the inputs of units from both sides."""
         facts = self.horizon.facts
         self._programs.grow(facts, self.horizon.varying)
+        self._note(f"ranges of {len(forms.rows) // 2} units")
         found = np.zeros((len(forms.rows), len(facts.rows)))
         for row, constant, multipliers in zip(forms.columns, forms.rows, found, strict=True):
             if self._work <= 0 or time.monotonic() >= min(self._deadline, until):
                 break
-            self._spend(1)
+            self.spend(1)
             vertex = self._programs.largest(row[None], constant[:1], ())
             if vertex is not None and len(vertex.columns):
                 multipliers[:] = np.maximum(vertex.multipliers, 0.0)
@@ -156,8 +162,18 @@ class Ladder:
         """Rows and columns of a linear program."""
         return len(self.horizon.facts.rows) + len(self.horizon.varying)
 
-    def _spend(self, programs: int) -> None:
+    @property
+    def width(self) -> int:
+        """The columns of the horizon."""
+        return self.horizon.facts.columns.shape[1]
+
+    def spend(self, programs: int) -> None:
+        """Take so many linear programs of the size that they have now from the work."""
         self._work -= programs * self._size**2
+
+    def grant(self, work: float) -> None:
+        """Let so much work be left, at least."""
+        self._work = max(self._work, work)
 
     def facets(
         self, directions: Float[np.ndarray, "f n_x"], simulated: Simulated, gap: float
@@ -214,7 +230,7 @@ class Ladder:
             affordable = self._nodes and self._work > 0
             if affordable and np.isfinite(upper) and not enough(upper, best[number]):
                 trees[number] = Tree(horizon, self._programs, forms, attained, enough)
-                self._spend(1)
+                self.spend(1)
         self._grow(list(trees.values()), len(target.forms) / (left + len(target.forms)))
         found = [
             (number in trees and trees[number].found()) or affine_leaf(forms, horizon)
@@ -225,7 +241,11 @@ class Ladder:
     def _grow(self, trees: list[Tree], share: float) -> None:
         """Grow trees by turns, until all are closed or this share of the work is done."""
         pool = share * self._work / self._size**2
+        count = len(trees)
         while trees := [tree for tree in trees if tree.is_open and tree.nodes < self._nodes]:
+            largest = max(tree.gap for tree in trees)
+            closed = count - len(trees)
+            self._note(f"splits, {closed} of {count} facets closed, largest gap {largest:.1e}")
             turn = min(pool / len(trees), TURN)
             if turn < 1:
                 break
@@ -233,7 +253,7 @@ class Ladder:
                 before = tree.nodes
                 tree.grow(int(min(turn, self._nodes - before)))
                 pool -= tree.nodes - before
-                self._spend(tree.nodes - before)
+                self.spend(tree.nodes - before)
 
     def _initial(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n_x"]:
         start = self.horizon.start

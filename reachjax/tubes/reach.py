@@ -6,56 +6,29 @@ recheck. A tube repeats it, each set being the next one's set of states (equatio
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Sequence
+from typing import Any
 
-import jax
-import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.checks import (
-    floats_of,
-    is_concrete,
-    owned,
-    real_number,
-    require_bar,
-    require_double_precision,
-    require_kind,
-    same_size,
-    whole_number,
-    wrapped,
-)
+from reachjax.numerics.checks import floats_of, owned, require_double_precision, whole_number
 from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof
-from reachjax.proofs.witnesses import Simulations, initial_states
-from reachjax.sets import AbstractSet, AbstractTemplate, Template
+from reachjax.proofs.witnesses import initial_states
+from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
-from reachjax.tubes.by_branching import sets_by_branching
-from reachjax.tubes.by_forms import sets_by_forms
-from reachjax.tubes.by_programs import sets_by_programs
+from reachjax.tubes.propagation import (
+    GAP,
+    SAMPLES,
+    Options,
+    Progress,
+    Task,
+    check_task,
+    propagated,
+)
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
-from reachjax.tubes.steps import Reached, Setting, boxed
-
-Progress = Callable[[Iterable[int]], Iterable[int]]
-"""Wraps the iteration over time steps, such as `tqdm.tqdm` or `rich.progress.track`."""
-
-SAMPLES = 1000
-
-GAP = 1e-4
-"""What may stay open of a facet, as a part of its range."""
-
-LARGEST_WINDOW = 64
-"""The most columns of a window whose length is chosen."""
-
-EXAMPLES = {
-    ClosedLoop: "a ClosedLoop",
-    AbstractSet: "a set such as Box(lower, upper) or Polytope(A, b)",
-    AbstractTemplate: "a template, such as Template.box(n) or EllipsoidTemplate()",
-    AbstractRelaxation: "a relaxation object, such as BranchAndCut()",
-    AbstractSolver: "a solver object, such as Auto()",
-}
 
 
 @pytree
@@ -133,6 +106,66 @@ class ReachTube(Replaceable):
         """Trajectories from corners of the initial set and `samples` points drawn from it."""
         states = initial_states(self.sets[0], samples, seed)
         return self.loop.simulate(states, self.horizon, self.start)
+
+    def extended(self, steps: int, **options: Any) -> ReachTube:
+        """The same tube and some steps more.
+
+        With the options that it was computed with, the sets are those of one call for all steps,
+        bit for bit but where a time limit, or a trajectory that came with products, had a say.
+
+        Args:
+            steps: how many more.
+            options: keyword arguments of `reach`, `relaxation` to `time_limit`; those that are not
+                given are as `reach` has them, whatever this tube was computed with.
+
+        Raises:
+            Interrupted: Ctrl-C; it has the tube of what was proved.
+            RuntimeError, TypeError, ValueError: as `reach` does; there is no such option, or
+                `steps` is no positive number.
+
+        Example:
+            >>> from reachjax import MLP, AffinePlant, Box, Template, reach
+            >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+            >>> tube = reach(loop, Box([1.0], [2.0]), 1, Template.box(1)).extended(2)
+            >>> tube.sets[3].b.tolist()  # x <= 2 / 8 and -x <= -1 / 8
+            [0.25, -0.125]
+        """
+        self.require_sealed()
+        horizon = self.horizon + whole_number("steps", steps, 1)
+        task = Task(self.loop, self.sets[0], horizon, self.template, self.start)
+        proofs = [self.proof(t) for t in range(1, self.horizon + 1)]
+        return _tube(task, Options.named(options), list(zip(self.sets[1:], proofs, strict=True)))
+
+
+class Interrupted(KeyboardInterrupt):
+    """A tube was interrupted (Ctrl-C): what was proved by then is not lost.
+
+    Attributes:
+        tube: the tube of the steps that were done. `tube.extended(steps)` goes on, in another
+            process too: a tube can be pickled.
+    """
+
+    def __init__(self, tube: ReachTube, horizon: int):
+        left = horizon - tube.horizon
+        super().__init__(
+            f"interrupted after {tube.horizon} of {horizon} steps. They are proved: this "
+            f"exception's `tube` has them, and tube.extended({left}) goes on"
+        )
+        self.tube = tube
+
+
+def _tube(
+    task: Task, options: Options, known: Sequence[tuple[AbstractSet, AbstractProof]] = ()
+) -> ReachTube:
+    """The tube of a task, some of whose first sets may be known."""
+    check_task(task, options)
+    loop, X0, template = owned((task.loop, task.X0, task.template))
+    found = propagated(task._replace(loop=loop, X0=X0, template=template), options, known)
+    sets, certificates = (X0, *found.sets), (None, *found.proofs)
+    tube = ReachTube.sealed(loop, template, sets, certificates, start=task.start)
+    if found.interrupted:
+        raise Interrupted(tube, task.horizon)
+    return tube
 
 
 def reach_step(
@@ -213,7 +246,8 @@ def reach(
             there.
         seed: of the samples.
         progress: wraps the iteration over steps to show a progress bar, such as `tqdm.tqdm`; inside
-            `jax.jit` it sees them once, while the loop is traced.
+            `jax.jit` it sees them once, while the loop is traced. A bar that shows notes, as tqdm's
+            do (`set_postfix_str`), is told what happens within a step.
         gap: a facet is proved well enough if a trajectory attains its bound but for this part of
             half the facet's simulated range. `LinearBounds` knows neither gaps nor limits.
         time_limit: seconds for the whole call, after which nothing is solved any more: what is
@@ -221,6 +255,7 @@ def reach(
             budgets that end the call without it. None: until gaps are closed or these are used up.
 
     Raises:
+        Interrupted: Ctrl-C, a `KeyboardInterrupt` whose `tube` has the steps that were done.
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind, or `progress` returns no iterable.
         ValueError: dimensions disagree, `X0` is empty or unbounded, the window is no positive
@@ -248,122 +283,5 @@ def reach(
         >>> bool((tube.proof(3).gaps >= 0).all())
         True
     """
-    _check(loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress)
-    real_number("gap", gap, 0.0)
-    deadline = deadline_of(time_limit)
-    loop, X0, template = owned((loop, X0, template))
-    box = boxed(X0, "X0")
-    fixed = jax.lax.stop_gradient((loop, X0))
-    simulations = None
-    if is_concrete(fixed):
-        simulations = simulations_from(*fixed, horizon, start, samples, seed)
-    setting = Setting(
-        loop=loop,
-        start=start,
-        relaxation=relaxation,
-        solver=solver,
-        limit=LARGEST_WINDOW if window is None else None,
-        drop_columns=window != 1 and is_concrete(fixed, jax.lax.stop_gradient(template)),
-        simulations=simulations,
-        gap=gap,
-        deadline=deadline,
-    )
-    if relaxation.by_forms:
-        following = sets_by_forms(loop, X0, box, template, horizon, start)
-    elif window is None and isinstance(relaxation, BranchAndCut) and isinstance(template, Template):
-        following = sets_by_branching(setting, relaxation.nodes, X0, box, template, horizon)
-    else:
-        following = sets_by_programs(setting, X0, template, horizon, window)
-    steps = [step for _, step in zip(wrapped(progress, range(horizon)), following, strict=False)]
-    if len(steps) < horizon:
-        raise ValueError(
-            f"progress must pass on each of the {horizon} steps, but {len(steps)} arrived"
-        )
-    certificates = [step.proof for step in steps]
-    if simulations is not None and is_concrete(certificates):
-        certificates = _with_witnesses(steps, simulations)
-    sets = X0, *(step.region for step in steps)
-    proved = loop, template, sets, (None, *owned(certificates))
-    return ReachTube.sealed(*proved, start=start)
-
-
-def simulations_from(
-    loop: ClosedLoop, X0: AbstractSet, horizon: int, start: int, samples: int, seed: int
-) -> Simulations | None:
-    """Trajectories from the initial set; None if it is too thin for states to be drawn from it.
-
-    Raises:
-        ValueError: it surely is empty.
-    """
-    try:
-        return Simulations(loop, X0, horizon, start, samples, seed)
-    except ValueError as error:
-        raise ValueError(f"X0 cannot be used: {error}") from None
-    except RuntimeError:
-        if X0.surely_empty():
-            raise ValueError(
-                "X0 is empty: its polytope and its ellipsoid have no point in common"
-            ) from None
-    return None
-
-
-def _with_witnesses(steps: list[Reached], simulations: Simulations) -> list[AbstractProof]:
-    """Simulate what the certificates bound, from the initial set."""
-    simulated = [step.states for step in steps if not step.climb]
-    if simulated:
-        simulations.include(np.concatenate(simulated))
-    for k, step in enumerate(steps, start=1):
-        if step.climb and len(step.states):
-            simulations.climb(k, step.region, np.arange(len(step.states)), step.states)
-    found = [simulations.attained(k, step.region) for k, step in enumerate(steps, start=1)]
-    return [
-        step.proof.replace(witnesses=values, witness_states=states)
-        for step, (values, states) in zip(steps, found, strict=True)
-    ]
-
-
-def deadline_of(time_limit: float | None) -> float:
-    """When to stop, as `time.monotonic` says it.
-
-    Raises:
-        TypeError: the limit is no number.
-        ValueError: it is negative.
-    """
-    if time_limit is None:
-        return np.inf
-    return time.monotonic() + real_number("time_limit", time_limit, 0.0)
-
-
-def _check(
-    loop, X0, horizon, template, relaxation, window, solver, start, samples, seed, progress
-) -> None:
-    for name, value, kind in (
-        ("loop", loop, ClosedLoop),
-        ("X0", X0, AbstractSet),
-        ("template", template, AbstractTemplate),
-        ("relaxation", relaxation, AbstractRelaxation),
-        ("solver", solver, AbstractSolver),
-    ):
-        require_kind(name, value, kind, EXAMPLES[kind])
-    require_double_precision(loop=loop, X0=X0, template=template)
-    same_size(
-        "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)
-    )
-    same_size(
-        "the loop's number of states is",
-        "the dimension of template is",
-        (loop.states, template.dimension or loop.states),
-    )
-    loop.check_horizon(horizon, start)
-    if template.steps is not None and template.steps < horizon:
-        raise ValueError(f"template is given for {template.steps} steps, but horizon is {horizon}")
-    require_bar(progress)
-    whole_number("samples", samples, 1)
-    whole_number("seed", seed, 0)
-    if window is not None:
-        whole_number("window", window, 1)
-    elif not (relaxation.by_forms or is_concrete(jax.lax.stop_gradient((loop, X0, template)))):
-        raise ValueError(
-            "window=None is chosen from numbers: inside jax.jit, vmap or scan give a number, such "
-            "as window=1"
-        )
+    options = Options(relaxation, window, solver, samples, seed, progress, gap, time_limit)
+    return _tube(Task(loop, X0, horizon, template, start), options)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -67,6 +68,7 @@ class Setting:
         simulations: trajectories from the initial set; None where numbers are traced.
         gap: what is left open, as a part of a facet's range.
         deadline: when to stop, as `time.monotonic` says it.
+        note: is told what happens within a step.
     """
 
     loop: ClosedLoop
@@ -78,6 +80,7 @@ class Setting:
     simulations: Simulations | None
     gap: float = 1e-4
     deadline: float = np.inf
+    note: Callable[[str], None] = lambda note: None
 
     @property
     def late(self) -> bool:

@@ -10,6 +10,8 @@ import jax
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from reachjax import keep_compilations
+
 CONTINUES = "run again to continue with what is stored"
 
 
@@ -40,8 +42,7 @@ def configure_jax(output: Path) -> None:
     require_folder(output)
     jax.config.update("jax_enable_x64", True)
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(output / "jax_cache"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        keep_compilations(output / "jax_cache")
 
 
 def bar(progress=True):

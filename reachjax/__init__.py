@@ -22,6 +22,7 @@ from reachjax.loops import (
     runge_kutta,
     zero_order_hold,
 )
+from reachjax.numerics.compilations import keep_compilations
 from reachjax.programs.basis import ChangeOfBasis, change_of_basis
 from reachjax.programs.relaxations import (
     AbstractRelaxation,
@@ -132,6 +133,7 @@ __all__ = [
     "change_of_basis",
     "decide",
     "failures",
+    "keep_compilations",
     "log_volume",
     "log_widths",
     "plot_set",

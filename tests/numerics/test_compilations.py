@@ -1,0 +1,60 @@
+"""Compilations outlive a process."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import pytest
+
+import reachjax as rj
+
+RUN = """
+import sys
+import jax, jax.numpy as jnp
+import reachjax as rj
+jax.block_until_ready(jnp.sin(jnp.ones(3)))  # compiled before there is a cache
+folder = rj.keep_compilations(*sys.argv[1:])
+before = set(folder.iterdir())
+jax.block_until_ready(jax.jit(lambda x: jnp.cos(x) + 2)(jnp.ones(5)))
+print(folder, len([each for each in set(folder.iterdir()) - before if "atime" not in each.name]))
+"""
+
+
+def run(environment, *arguments):
+    command = [sys.executable, "-c", RUN, *map(str, arguments)]
+    found = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+    folder, kept = found.stdout.split()
+    return folder, int(kept)
+
+
+@pytest.fixture
+def environment(tmp_path):
+    kept = {"PATH", "PYTHONPATH", "HOME", "VIRTUAL_ENV", "LD_LIBRARY_PATH"}
+    own = {"XDG_CACHE_HOME": str(tmp_path / "caches"), "JAX_PLATFORMS": "cpu"}
+    return {name: value for name, value in os.environ.items() if name in kept} | own
+
+
+def test_a_second_process_compiles_nothing(environment, tmp_path):
+    folder = tmp_path / "given"
+    first, kept = run(environment, folder)
+    assert first == str(folder)
+    assert kept > 0
+    assert run(environment, folder) == (str(folder), 0)
+
+
+def test_compilations_are_in_the_users_cache_or_where_they_are_kept_already(environment, tmp_path):
+    assert run(environment)[0] == str(tmp_path / "caches" / "reachjax")
+    there = str(tmp_path / "there")
+    assert run(environment | {"JAX_COMPILATION_CACHE_DIR": there})[0] == there
+
+
+def test_bad_folders_are_named(tmp_path):
+    kept = jax.config.values["jax_compilation_cache_dir"]
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(ValueError, match="folder must be one that can be written to"):
+        rj.keep_compilations(file / "folder")
+    with pytest.raises(TypeError, match="folder must be a path, but 3 arrived"):
+        rj.keep_compilations(3)  # pyright: ignore[reportArgumentType]
+    assert jax.config.values["jax_compilation_cache_dir"] == kept

@@ -6,22 +6,20 @@ Two penalties on one tube need not solve for it twice: with `tube = reach(...)`,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.checks import described, whole_number
-from reachjax.programs.relaxations import LocalBounds
-from reachjax.sets import AbstractSet, AbstractTemplate, PolyhedralSet
-from reachjax.tubes.reach import reach
+from reachjax.numerics.checks import described, is_concrete, whole_number
+from reachjax.programs.relaxations import BranchAndCut, LinearBounds, LocalBounds
+from reachjax.sets import AbstractSet, AbstractTemplate, Box, PolyhedralSet, Template
+from reachjax.tubes.reach import ReachTube, reach
 from reachjax.tubes.requirements import AvoidSets, check_margin, requirements, shortfall
 from reachjax.tubes.sizes import log_volume
-
-STEPWISE = {"relaxation": LocalBounds(), "window": 1}
-"""What penalties ask of `reach`: small programs of one size, compiled once."""
 
 
 def volume_penalty(
@@ -31,11 +29,13 @@ def volume_penalty(
     template: AbstractTemplate,
     *,
     measure: Callable[[AbstractSet], Float[Array, ""]] = log_volume,
+    cells: Sequence[int] | None = None,
     **options: Any,
 ) -> Float[Array, ""]:
     """The mean size of the certified sets at times `1 .. horizon`.
 
-    Differentiable in the loop and the initial set, also inside `jax.jit`, `vmap` and `scan`.
+    Differentiable in the loop and the initial set, also inside `jax.jit`, `vmap` (over initial sets
+    or networks) and `scan`.
 
     Args:
         loop: the closed loop.
@@ -44,11 +44,16 @@ def volume_penalty(
         template: what every set looks like: facet directions, ellipsoids, or both.
         measure: the size of one set. Logarithms weigh all steps alike, and are -inf for a flat set;
             `volume` is in the units of the states and weighs large sets most.
-        options: keyword arguments of `reach`, such as `solver`; the relaxation is `LocalBounds()`
-            and the window 1 unless they say otherwise.
+        cells: into how many equal parts each coordinate of `X0`, a box, is cut; the penalty is the
+            mean over the cells. None: it is not cut.
+        options: keyword arguments of `reach`, such as `relaxation`. For a `Template` that is
+            `LinearBounds()`, which takes milliseconds, unless they say otherwise; for ellipsoids,
+            or where a `solver` or a `window` is given, `LocalBounds()`. The window is 1, but for
+            `BranchAndCut()` outside of compiled code, which has none.
 
     Raises:
-        RuntimeError, TypeError, ValueError: as `reach` does; `measure` gives no number.
+        RuntimeError, TypeError, ValueError: as `reach` does; `measure` gives no number; `cells` are
+            no positive numbers, one for each coordinate of a box.
 
     Example:
         >>> import jax
@@ -63,12 +68,15 @@ def volume_penalty(
     """
     if not callable(measure):
         raise TypeError(f"measure must be a function of a set, but {described(measure)} arrived")
-    tube = reach(loop, X0, horizon, template, **STEPWISE | options)
-    sizes = [measure(region) for region in tube.sets[1:]]
-    if sizes[0] is None or jnp.shape(sizes[0]) != ():
-        arrived = "None" if sizes[0] is None else f"an array of shape {jnp.shape(sizes[0])}"
-        raise ValueError(f"measure must give one number for a set, but {arrived} arrived")
-    return sum(sizes, start=jnp.zeros(())) / horizon
+
+    def size(tube: ReachTube) -> Float[Array, ""]:
+        sizes = [measure(region) for region in tube.sets[1:]]
+        if sizes[0] is None or jnp.shape(sizes[0]) != ():
+            arrived = "None" if sizes[0] is None else f"an array of shape {jnp.shape(sizes[0])}"
+            raise ValueError(f"measure must give one number for a set, but {arrived} arrived")
+        return sum(sizes, start=jnp.zeros(())) / horizon
+
+    return _penalised(size, loop, X0, horizon, template, cells, options)
 
 
 def specification_penalty(
@@ -81,12 +89,14 @@ def specification_penalty(
     safe: PolyhedralSet | None = None,
     *,
     margin: float = 0.0,
+    cells: Sequence[int] | None = None,
     **options: Any,
 ) -> Float[Array, ""]:
     """By how much the certified sets miss a reach-avoid specification: zero once it is proved.
 
     A hinge on the distance to the goal, the avoided sets and the boundary of the safe set, summed
-    over facets and times (see `shortfall`). Differentiable as `volume_penalty` is.
+    over facets and times (see `shortfall`); the mean over cells, if there are any. Differentiable
+    as `volume_penalty` is.
 
     Args:
         loop: the closed loop.
@@ -99,11 +109,12 @@ def specification_penalty(
         safe: where every state must be at all times.
         margin: how far the sets should be from breaking a requirement, in the units of the state; a
             little more than zero keeps the proof when the weights move on.
-        options: keyword arguments of `reach`, such as `solver`; the relaxation is `LocalBounds()`
-            and the window 1 unless they say otherwise.
+        cells: as of `volume_penalty`; what is proved of each cell is proved of `X0`.
+        options: as of `volume_penalty`.
 
     Raises:
-        RuntimeError, TypeError, ValueError: as `reach` and `verify` do.
+        RuntimeError, TypeError, ValueError: as `reach` and `verify` do; `cells` are no positive
+            numbers, one for each coordinate of a box.
 
     Example:
         >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template
@@ -118,5 +129,69 @@ def specification_penalty(
     check_margin(margin)
     if isinstance(loop, ClosedLoop):  # mistakes are named before anything is solved
         requirements(loop.states, whole_number("horizon", horizon, 1), goal, avoid, safe)
-    tube = reach(loop, X0, horizon, template, **STEPWISE | options)
-    return shortfall(tube, goal, avoid, safe, margin=margin)
+
+    def missing(tube: ReachTube) -> Float[Array, ""]:
+        return shortfall(tube, goal, avoid, safe, margin=margin)
+
+    return _penalised(missing, loop, X0, horizon, template, cells, options)
+
+
+def _penalised(
+    penalty: Callable[[ReachTube], Float[Array, ""]],
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    horizon: int,
+    template: AbstractTemplate,
+    cells: Sequence[int] | None,
+    options: dict[str, Any],
+) -> Float[Array, ""]:
+    """The penalty of a tube, or its mean over those from the cells of an initial set."""
+    options = _completed(loop, X0, template, options)
+
+    def of(X0: AbstractSet) -> Float[Array, ""]:
+        return penalty(reach(loop, X0, horizon, template, **options))
+
+    if cells is None:
+        return of(X0)
+    lower, upper = _grid(X0, cells)
+    if options["window"] is None:  # on the host, one by one
+        each = [of(Box(*ends)) for ends in zip(lower, upper, strict=True)]
+        return sum(each, start=jnp.zeros(())) / len(each)
+    return jnp.mean(jax.vmap(lambda lower, upper: of(Box(lower, upper)))(lower, upper))
+
+
+def _completed(
+    loop: ClosedLoop, X0: AbstractSet, template: AbstractTemplate, options: dict[str, Any]
+) -> dict[str, Any]:
+    """The options that are given, and what they leave open."""
+    by_programs = not isinstance(template, Template) or "solver" in options or "window" in options
+    relaxation = options.get("relaxation", LocalBounds() if by_programs else LinearBounds())
+    of_numbers = is_concrete(jax.lax.stop_gradient((loop, X0, template)))
+    window = None if isinstance(relaxation, BranchAndCut) and of_numbers else 1
+    return {"window": window} | options | {"relaxation": relaxation}
+
+
+def _grid(
+    X0: AbstractSet, counts: Sequence[int]
+) -> tuple[Float[Array, "cells n_x"], Float[Array, "cells n_x"]]:
+    """Lower and upper ends of the cells of a box.
+
+    Raises:
+        TypeError: it is no box, or a count no whole number.
+        ValueError: there is not a positive number for each coordinate.
+    """
+    if not isinstance(X0, Box):
+        raise TypeError(f"cells are of an X0 of type Box, but {described(X0)} arrived")
+    if not isinstance(counts, Sequence) or len(counts) != X0.dimension:
+        raise ValueError(
+            f"cells must be a number for each of {X0.dimension} coordinates, but {counts} arrived"
+        )
+    numbers = [whole_number(f"cells[{i}]", count, 1) for i, count in enumerate(counts)]
+    index = jnp.stack(jnp.meshgrid(*map(jnp.arange, numbers), indexing="ij"), axis=-1)
+    index, many = index.reshape(-1, len(numbers)), jnp.asarray(numbers)
+
+    def ends(index: Array) -> Float[Array, "cells n_x"]:
+        within = X0.lower + X0.widths * (index / many)
+        return jnp.where(index == many, X0.upper, within)  # exactly, and so nothing is left out
+
+    return ends(index), ends(index + 1)

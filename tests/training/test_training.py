@@ -27,16 +27,76 @@ def case():
 
 
 def test_penalties_are_those_of_the_tube(case):
-    tube = recursion(*case, 2, TEMPLATE)
-    logs = rj.volume_penalty(*case, 2, TEMPLATE)
-    assert float(logs) == pytest.approx(float(rj.log_volume(tube)) / 2, rel=1e-9)
-    areas = rj.volume_penalty(*case, 2, TEMPLATE, measure=rj.volume)
-    assert float(areas) == pytest.approx(np.mean([s.volume() for s in tube.sets[1:]]), rel=1e-9)
-    missing = rj.specification_penalty(*case, 2, TEMPLATE, goal=GOAL, margin=0.1)
-    assert float(missing) == pytest.approx(float(rj.shortfall(tube, goal=GOAL, margin=0.1)))
-    assert missing > 0
-    paper = rj.volume_penalty(*case, 2, TEMPLATE, relaxation=rj.PaperQC(repeated=False))
-    assert paper > logs
+    """Of affine forms, unless a relaxation, a window or a solver say otherwise."""
+    for options, tube in (
+        ({}, rj.reach(*case, 2, TEMPLATE, rj.LinearBounds())),
+        ({"window": 1}, recursion(*case, 2, TEMPLATE)),
+        ({"relaxation": rj.LocalBounds()}, recursion(*case, 2, TEMPLATE)),
+        ({"relaxation": rj.BranchAndCut()}, rj.reach(*case, 2, TEMPLATE)),
+    ):
+        logs = rj.volume_penalty(*case, 2, TEMPLATE, **options)
+        assert float(logs) == pytest.approx(float(rj.log_volume(tube)) / 2, rel=1e-9)
+        areas = rj.volume_penalty(*case, 2, TEMPLATE, measure=rj.volume, **options)
+        expected = np.mean([region.volume() for region in tube.sets[1:]])
+        assert float(areas) == pytest.approx(expected, rel=1e-9)
+        missing = rj.specification_penalty(*case, 2, TEMPLATE, goal=GOAL, margin=0.1, **options)
+        assert float(missing) == pytest.approx(float(rj.shortfall(tube, goal=GOAL, margin=0.1)))
+        assert missing > 0
+
+
+@pytest.mark.parametrize("relaxation", [rj.LinearBounds(), rj.LocalBounds(), rj.BranchAndCut()])
+def test_penalties_of_cells_are_the_mean_of_theirs(case, relaxation):
+    loop, X0 = case
+    tubes = rj.reach_partitioned(loop, X0, 1, rj.Template.box(2), cells=(1, 3)).tubes
+
+    def penalty(X0, **cells):
+        template = rj.Template.box(2)
+        return rj.specification_penalty(
+            loop, X0, 1, template, goal=GOAL, relaxation=relaxation, **cells
+        )
+
+    each = [float(penalty(tube.sets[0])) for tube in tubes]
+    assert float(penalty(X0, cells=(1, 3))) == pytest.approx(np.mean(each), rel=1e-6)
+    assert penalty(X0, cells=(1, 3)) <= penalty(X0) * (1 + 1e-6)
+
+
+def test_cells_have_derivatives_in_compiled_code(case):
+    loop, X0 = case
+
+    def penalty(net, X0):
+        return rj.volume_penalty(loop.replace(controller=net), X0, 2, TEMPLATE, cells=(2, 2))
+
+    plain = jax.grad(penalty)(loop.controller, X0)
+    compiled = jax.jit(jax.grad(penalty))(loop.controller, X0)
+    for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(compiled), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
+
+
+def test_several_initial_sets_are_penalised_at_once(case):
+    loop, X0 = case
+    sets = [rj.Box(X0.lower + shift, X0.upper + shift) for shift in (0.0, 0.1, 0.2)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sets)
+
+    def penalty(X0):
+        return rj.volume_penalty(loop, X0, 2, TEMPLATE)
+
+    each = [float(penalty(X0)) for X0 in sets]
+    np.testing.assert_allclose(jax.jit(jax.vmap(penalty))(stacked), each, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("cells", "X0", "error", "match"),
+    [
+        ((2,), None, ValueError, "cells must be a number for each of 2 coordinates"),
+        (4, None, ValueError, "cells must be a number for each of 2 coordinates"),
+        ((2, 0), None, ValueError, "cells.1. must be at least 1"),
+        ((2, 2), rj.Ellipsoid([0.0, 0.0], np.eye(2)), TypeError, "cells are of an X0 of type Box"),
+    ],
+)
+def test_bad_cells_are_named(case, cells, X0, error, match):
+    loop, box = case
+    with pytest.raises(error, match=match):
+        rj.volume_penalty(loop, X0 or box, 1, TEMPLATE, cells=cells)
 
 
 def test_a_gradient_step_lowers_each_penalty(case):
@@ -66,6 +126,28 @@ def test_a_schedule_warms_up_ramps_and_leaves_steps_out():
     expected = [0] * 4 + [0.5, 0, 1.5, 0, 2.5, 0, 3, 0, 3, 0]
     np.testing.assert_allclose(weights, expected)
     np.testing.assert_allclose(jax.jit(jax.vmap(schedule))(jnp.arange(14)), expected)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_schedule_sharpens_the_relaxation(case, compiled):
+    stages = {6: rj.LocalBounds(), 2: rj.LinearBounds(), 4: rj.PaperQC()}
+    schedule = rj.PenaltySchedule(1.0, relaxations=stages)
+    of = {rj.LinearBounds(): 1.0, rj.PaperQC(): 2.0, rj.LocalBounds(): 3.0}
+
+    def weighed(step, x):
+        return schedule.apply(step, lambda x, relaxation: of[relaxation] * x, x)
+
+    applied = jax.jit(weighed) if compiled else weighed
+    assert [float(applied(step, 2.0)) for step in range(0, 8)] == [2, 2, 2, 2, 4, 4, 6, 6]
+    assert [of[schedule.relaxation(step)] for step in (0, 3, 4, 100)] == [1, 1, 2, 3]
+    assert rj.PenaltySchedule(1.0).relaxation(3) is None
+
+    def penalty(relaxation):
+        return rj.volume_penalty(*case, 1, TEMPLATE, relaxation=relaxation)
+
+    first, last = (float(schedule.apply(step, penalty)) for step in (0, 6))
+    assert first == pytest.approx(float(penalty(rj.LinearBounds())), rel=1e-9)
+    assert last == pytest.approx(float(penalty(rj.LocalBounds())), rel=1e-6)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -364,6 +446,9 @@ def test_a_state_without_a_count_is_an_error():
         ({"weight": 1.0, "warmup": -1}, ValueError, "warmup must be at least 0, but -1 arrived"),
         ({"weight": 1.0, "ramp": 0.5}, TypeError, r"ramp must be a whole number, but 0\.5 arrived"),
         ({"weight": 1.0, "wramup": 5}, TypeError, "wramup"),
+        ({"weight": 1.0, "relaxations": rj.PaperQC()}, TypeError, "a mapping from steps to relax"),
+        ({"weight": 1.0, "relaxations": {0: 3}}, TypeError, "a relaxation object, but 3 arrived"),
+        ({"weight": 1.0, "relaxations": {-1: rj.PaperQC()}}, ValueError, "at least 0, but -1"),
     ],
 )
 def test_bad_schedules_are_named(options, error, message):

@@ -127,7 +127,7 @@ class ReachTube(Replaceable):
             >>> from reachjax import MLP, AffinePlant, Box, Template, reach
             >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
             >>> tube = reach(loop, Box([1.0], [2.0]), 1, Template.box(1)).extended(2)
-            >>> tube.sets[3].b.tolist()  # x <= 2 / 8 and -x <= -1 / 8
+            >>> tube.sets[3].b.round(9).tolist()  # x <= 2 / 8 and -x <= -1 / 8
             [0.25, -0.125]
         """
         self.require_sealed()

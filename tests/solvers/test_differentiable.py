@@ -141,6 +141,7 @@ def test_a_batch_of_networks_and_sets_equals_one_at_a_time():
     agree(both[1], single[1])
 
 
+@pytest.mark.long
 def test_scan_and_remat_give_the_same_gradient():
     loop, X0 = planar(0)
     plain = jax.grad(value)(loop, X0)

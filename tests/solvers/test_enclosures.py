@@ -114,8 +114,9 @@ def final(template, horizon, solver=rj.Auto(), relaxation=rj.LocalBounds()):  # 
 # values.
 STEP, PROMISED = 1e-5, 1e-3
 TEMPLATES = ("minimum volume", "given shape")
-SHORT = [*((3, 1, 0, template) for template in TEMPLATES), (2, 3, 0, "minimum volume")]
+SHORT = [(3, 1, 0, "given shape"), (2, 3, 0, "minimum volume")]
 LONG = [
+    (3, 1, 0, "minimum volume"),
     *((n, 1, 0, template) for n in (1, 2) for template in TEMPLATES),
     (2, 3, 0, "given shape"),
     *((2, 10, 1, template) for template in TEMPLATES),

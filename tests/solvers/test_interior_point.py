@@ -415,7 +415,9 @@ def test_a_path_that_is_lost_still_gives_an_ellipsoid(network):
     assert sizes[0] <= sizes[1] + 0.2
 
 
-@pytest.mark.parametrize("shape", [None, np.eye(2)], ids=["free", "given"])
+@pytest.mark.parametrize(
+    "shape", [pytest.param(None, marks=pytest.mark.long), np.eye(2)], ids=["free", "given"]
+)
 def test_gradients_of_ellipsoids_of_weights_that_are_no_numbers_are_none(shape):
     loop, X = closed_loop(random_loop(2)), round_of(2, 0)
 

@@ -64,7 +64,8 @@ def test_cells_have_derivatives_in_compiled_code(case):
     loop, X0 = case
 
     def penalty(net, X0):
-        return rj.volume_penalty(loop.replace(controller=net), X0, 2, TEMPLATE, cells=(2, 2))
+        template = rj.Template.box(2)
+        return rj.volume_penalty(loop.replace(controller=net), X0, 1, template, cells=(2, 2))
 
     plain = jax.grad(penalty)(loop.controller, X0)
     compiled = jax.jit(jax.grad(penalty))(loop.controller, X0)

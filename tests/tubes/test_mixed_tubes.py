@@ -146,7 +146,8 @@ def test_the_gradient_is_the_central_difference(horizon, shape):
     assert error_in_all_parts(f, args, gradient, 1e-4) <= PROMISED
 
 
-@pytest.mark.parametrize("horizon", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.long  # a quicker test has the steps
+@pytest.mark.parametrize("horizon", [1, 2])
 def test_compiled_and_plain_penalties_agree(horizon):
     loop, X0 = case(2, 0, hidden=(3,))
     avoid, goal = [rj.Box([0.0, 0.0], [0.1, 0.1])], rj.Box([-0.1, -0.1], [0.1, 0.1])

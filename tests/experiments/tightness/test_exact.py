@@ -146,7 +146,7 @@ def test_a_single_point_goes_where_it_is_simulated():
     assert value == pytest.approx(simulate(data, point[None], 3)[-1, 0, 1], abs=ROUNDING)
 
 
-@pytest.mark.parametrize("n_x", [1, 3])
+@pytest.mark.parametrize("n_x", [1, pytest.param(3, marks=pytest.mark.long)])
 def test_a_tube_unrolled_once_has_the_maxima_of_each_step(n_x):
     data, region = random_loop(n_x, steps=5), box_region(n_x, seed=0)
     loop, rows = closed_loop(data), np.vstack([np.eye(n_x), -np.ones(n_x)])

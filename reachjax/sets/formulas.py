@@ -59,13 +59,12 @@ def area(A: Float[Array, "m 2"], b: Float[Array, " m"]) -> Float[Array, ""]:
     normals, distances = normals / norms[:, None], offsets / norms
     along = jnp.stack([-normals[:, 1], normals[:, 0]], axis=1)
     lower, upper = _edges(normals, distances, along)
-    # again from a point inside: those of a set far from the origin lose their digits
     edge = (upper >= lower) & jnp.isfinite(lower) & jnp.isfinite(upper)
     middle = jnp.where(edge, (lower + upper) / 2, 0.0)
     middles = distances[:, None] * normals + middle[:, None] * along
     inside = jnp.where(edge[:, None], middles, 0.0).sum(axis=0) / jnp.maximum(edge.sum(), 1)
+    # from a point inside: distances of a set far from the origin are all alike
     distances = distances - normals @ inside
-    lower, upper = _edges(normals, distances, along)
     lengths = jnp.maximum(upper - lower, 0.0)
     area = lengths @ distances / 2
     empty = jnp.max(upper - lower) < -EMPTY * jnp.max(jnp.abs(distances))

@@ -131,6 +131,7 @@ def propagated(
         ValueError: the initial set is empty or unbounded, states overflow, or the progress bar
             leaves out steps.
     """
+    deadline = deadline_of(options.time_limit)
     fixed, horizon, simulations = task.fixed, task.horizon, None
     if is_concrete((fixed.loop, fixed.X0)):
         simulations = simulations_from(
@@ -147,7 +148,7 @@ def propagated(
         drop_columns=options.window != 1 and is_concrete((fixed.loop, fixed.X0, fixed.template)),
         simulations=simulations,
         gap=options.gap,
-        deadline=deadline_of(options.time_limit),
+        deadline=deadline,
         note=getattr(bar, "set_postfix_str", _unheard),
     )
     steps, interrupted = before, False

@@ -151,7 +151,11 @@ class Interrupted(KeyboardInterrupt):
             f"interrupted after {tube.horizon} of {horizon} steps. They are proved: this "
             f"exception's `tube` has them, and tube.extended({left}) goes on"
         )
-        self.tube = tube
+        self.tube, self._horizon = tube, horizon
+
+    def __reduce__(self) -> tuple[type, tuple[ReachTube, int]]:
+        """How it is pickled, as when it comes from another process."""
+        return type(self), (self.tube, self._horizon)
 
 
 def _tube(

@@ -87,6 +87,22 @@ def test_the_inner_one_of_two_facets_bounds_a_box_and_an_empty_one_has_no_ends()
     assert np.isnan(slope).any()
 
 
+def test_ends_and_areas_have_derivatives_in_normals():
+    """A facet of a box, turned about its middle."""
+    b = jnp.ones(4)
+
+    def sizes(A):
+        box = Polytope(A, b).bounding_box()
+        return jnp.array([box.upper[0], Polytope(A, b).size()])
+
+    A = Template.box(2).directions
+    for compiled in (False, True):
+        slopes = jax.jacrev(jax.jit(sizes) if compiled else sizes)(A)
+        (first,) = np.flatnonzero((np.asarray(A) == [1, 0]).all(axis=1))
+        np.testing.assert_allclose(slopes[0, first, 0], -1.0, atol=1e-9)  # x <= b / a
+        np.testing.assert_allclose(slopes[1, first], [-2.0, 0.0], atol=1e-9)
+
+
 @pytest.mark.parametrize("template", [Template.box(3), Template.octagonal(2), Template.regular(5)])
 def test_compiled_sizes_and_boxes_are_those_of_plain_arrays(template):
     A = template.directions

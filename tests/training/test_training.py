@@ -85,6 +85,18 @@ def test_several_initial_sets_are_penalised_at_once(case):
     np.testing.assert_allclose(jax.jit(jax.vmap(penalty))(stacked), each, rtol=1e-9)
 
 
+@pytest.mark.parametrize("relaxation", [{}, {"relaxation": rj.BranchAndCut()}])
+def test_what_is_no_loop_set_or_template_is_named(case, relaxation):
+    loop, X0 = case
+    for arguments, name in (
+        (("loop", X0, 1, TEMPLATE), "loop"),
+        ((loop, [0.0, 1.0], 1, TEMPLATE), "X0"),
+        ((loop, X0, 1, "octagonal"), "template"),
+    ):
+        with pytest.raises(TypeError, match=f"^{name} must be"):
+            rj.volume_penalty(*arguments, **relaxation)
+
+
 @pytest.mark.parametrize(
     ("cells", "X0", "error", "match"),
     [

@@ -68,6 +68,7 @@ def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(task, way):
         rj.reach(*task, STEPS, template, **options, progress=Stopping(DONE))
     tube = stopped.value.tube
     assert tube.horizon == DONE
+    assert same(pickle.loads(pickle.dumps(stopped.value)).tube, tube)
     assert rj.verify(tube, safe=rj.Box([-9.0, -9.0], [9.0, 9.0])).status is not None
     assert same(tube.extended(STEPS - DONE, **options), whole)
 

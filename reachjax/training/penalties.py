@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.checks import described, is_concrete, require_kind, whole_number
+from reachjax.numerics.checks import described, is_concrete, whole_number
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds, LocalBounds
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, PolyhedralSet, Template
-from reachjax.tubes.propagation import EXAMPLES
+from reachjax.tubes.propagation import require_kinds
 from reachjax.tubes.reach import ReachTube, reach
 from reachjax.tubes.requirements import AvoidSets, check_margin, requirements, shortfall
 from reachjax.tubes.sizes import log_volume
@@ -147,12 +147,7 @@ def _penalised(
     options: dict[str, Any],
 ) -> Float[Array, ""]:
     """The penalty of a tube, or its mean over those from the cells of an initial set."""
-    for name, value, kind in (
-        ("loop", loop, ClosedLoop),
-        ("X0", X0, AbstractSet),
-        ("template", template, AbstractTemplate),
-    ):
-        require_kind(name, value, kind, EXAMPLES[kind])
+    require_kinds(loop=loop, X0=X0, template=template)
     options = _completed(loop, X0, template, options)
 
     def of(X0: AbstractSet) -> Float[Array, ""]:

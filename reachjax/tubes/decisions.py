@@ -29,7 +29,7 @@ from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated, Simulations
 from reachjax.sets import AbstractSet, PolyhedralSet
 from reachjax.tubes.ladder import WORK, Climbed, Ladder, Target
-from reachjax.tubes.propagation import EXAMPLES, deadline_of, simulations_from
+from reachjax.tubes.propagation import deadline_of, require_kinds, simulations_from
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Requirement, requirements
 from reachjax.tubes.steps import boxed
@@ -98,8 +98,7 @@ def decide(
         >>> decide(loop, X0, 3, avoid=[Box([0.4], [0.43])]).status.name
         'REFUTED'
     """
-    for name, value, kind in (("loop", loop, ClosedLoop), ("X0", X0, AbstractSet)):
-        require_kind(name, value, kind, EXAMPLES[kind])
+    require_kinds(loop=loop, X0=X0)
     require_kind("relaxation", relaxation, BranchAndCut, "a BranchAndCut")
     require_double_precision(loop=loop, X0=X0)
     same_size(

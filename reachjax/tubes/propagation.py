@@ -43,13 +43,14 @@ GAP = 1e-4
 LARGEST_WINDOW = 64
 """The most columns of a window whose length is chosen."""
 
-EXAMPLES = {
-    ClosedLoop: "a ClosedLoop",
-    AbstractSet: "a set such as Box(lower, upper) or Polytope(A, b)",
-    AbstractTemplate: "a template, such as Template.box(n) or EllipsoidTemplate()",
-    AbstractRelaxation: "a relaxation object, such as BranchAndCut()",
-    AbstractSolver: "a solver object, such as Auto()",
+KINDS = {
+    "loop": (ClosedLoop, "a ClosedLoop"),
+    "X0": (AbstractSet, "a set such as Box(lower, upper) or Polytope(A, b)"),
+    "template": (AbstractTemplate, "a template, such as Template.box(n) or EllipsoidTemplate()"),
+    "relaxation": (AbstractRelaxation, "a relaxation object, such as BranchAndCut()"),
+    "solver": (AbstractSolver, "a solver object, such as Auto()"),
 }
+"""What arguments of these names are, and what errors say was expected."""
 
 
 class Options(NamedTuple):
@@ -151,10 +152,10 @@ def propagated(
         deadline=deadline,
         note=getattr(bar, "set_postfix_str", _unheard),
     )
-    steps, interrupted = before, False
+    steps, interrupted = list(before), False
     try:
         for _, step in zip(bar, _following(task, options, setting, before), strict=False):
-            steps = [*steps, step]
+            steps.append(step)
     except KeyboardInterrupt:
         if not steps or not is_concrete([step.proof for step in steps]):
             raise
@@ -245,6 +246,12 @@ def deadline_of(time_limit: float | None) -> float:
     return time.monotonic() + real_number("time_limit", time_limit, 0.0)
 
 
+def require_kinds(**arguments: Any) -> None:
+    """Raise a `TypeError` that names the first argument that is not of the kind of its name."""
+    for name, value in arguments.items():
+        require_kind(name, value, *KINDS[name])
+
+
 def check_task(task: Task, options: Options) -> None:
     """Check what a user gave.
 
@@ -256,14 +263,7 @@ def check_task(task: Task, options: Options) -> None:
     """
     loop, X0, horizon, template, start = task
     relaxation, window = options.relaxation, options.window
-    for name, value, kind in (
-        ("loop", loop, ClosedLoop),
-        ("X0", X0, AbstractSet),
-        ("template", template, AbstractTemplate),
-        ("relaxation", relaxation, AbstractRelaxation),
-        ("solver", options.solver, AbstractSolver),
-    ):
-        require_kind(name, value, kind, EXAMPLES[kind])
+    require_kinds(loop=loop, X0=X0, template=template, relaxation=relaxation, solver=options.solver)
     require_double_precision(loop=loop, X0=X0, template=template)
     same_size(
         "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)

@@ -115,6 +115,10 @@ class AbstractSet(Replaceable, abc.ABC):
         """A matrix of half-widths, which maps the unit ball to about the size of the set."""
         return jnp.diag(self.bounding_box().widths / 2)
 
+    def bounds_along(self, directions: Float[Array, "m n"]) -> Float[Array, " m"]:
+        """Upper bounds of `a . x` over the set that cost little in compiled code: the support."""
+        return self.support(directions)
+
     def separation(self, other: PolyhedralSet) -> Float[Array, ""]:
         """How far the facets of another set may move outward before it meets this bounded one.
 

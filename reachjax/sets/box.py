@@ -100,8 +100,11 @@ class Box(PolyhedralSet):
     def facets(self) -> tuple[Float[Array, "2n n"], Float[Array, " 2n"]]:
         """`-x <= -lower`, then `x <= upper`."""
         self._single()
-        eye = jnp.eye(self.dimension)
-        return jnp.vstack([-eye, eye]), jnp.concatenate([-self.lower, self.upper])
+        with jax.ensure_compile_time_eval():  # normals are numbers also in compiled code
+            normals = jnp.asarray(np.vstack([-np.eye(self.dimension), np.eye(self.dimension)]))
+            if is_concrete(self):
+                return normals, jnp.concatenate([-self.lower, self.upper])
+        return normals, jnp.concatenate([-self.lower, self.upper])
 
     def _single(self) -> None:
         if self.steps is not None:

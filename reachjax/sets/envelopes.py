@@ -51,6 +51,10 @@ def support(A: Normals, b: Offsets, directions: Float[Array, "k n"]) -> Float[Ar
 
 def separation(A: Normals, b: Offsets, C: Normals, d: Offsets) -> Float[Array, ""]:
     """How far the facets of `C x <= d` may move outward before it meets `A x <= b`, or less."""
+    if not is_concrete((A, b, C, d)):
+        one, other = formulas.box_ends(A, b), formulas.box_ends(C, d)
+        if one is not None and other is not None:
+            return formulas.boxes_apart(one, other)
     return _values(_separation, 1, A, b, C, d)[0]
 
 

@@ -41,6 +41,35 @@ def box_ends(
     return lower * known, upper * known
 
 
+def boxes_apart(
+    one: tuple[Float[Array, " n"], Float[Array, " n"]],
+    other: tuple[Float[Array, " n"], Float[Array, " n"]],
+) -> Float[Array, ""]:
+    """How far the facets of one box may move outward before it meets another one; rounded down."""
+    gap = jnp.maximum(one[0] - other[1], other[0] - one[1]).max()
+    return gap - ROUNDED * jnp.abs(jax.lax.stop_gradient(gap))
+
+
+def offsets_along(
+    A: Float[Array, "m n"], b: Float[Array, " m"], directions: Float[Array, "k n"]
+) -> Float[Array, " k"] | None:
+    """The least offset of the facets whose normal is each direction, up to length and rounding.
+
+    None if there is a direction without a facet, or normals or directions are traced.
+    """
+    if not is_concrete((A, directions)):
+        return None
+    normals, wanted = np.asarray(A), np.asarray(directions)
+    sizes, lengths = (np.abs(rows).max(axis=1) for rows in (normals, wanted))
+    if not (sizes.all() and lengths.all()):
+        return None
+    apart = wanted[:, None] / lengths[:, None, None] - normals / sizes[:, None]
+    same = np.abs(apart).max(axis=2) <= ROUNDED
+    if not same.any(axis=1).all():
+        return None
+    return jnp.where(same, b * (lengths[:, None] / sizes), jnp.inf).min(axis=1)
+
+
 def _unless(bad: Array) -> Float[Array, ""]:
     """One, or NaN: as a factor it makes a value NaN together with its derivatives."""
     return jnp.where(bad, jnp.nan, 1.0)

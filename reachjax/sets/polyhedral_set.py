@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.numerics.checks import is_concrete, require_double_precision
 from reachjax.numerics.rounding import TINY, exponents, gamma, lengths, shifted
-from reachjax.sets import envelopes, outlines
+from reachjax.sets import envelopes, formulas, outlines
 from reachjax.sets.balance import balanced
 from reachjax.sets.base import AbstractSet, Matrix, Vector
 
@@ -73,13 +73,24 @@ class PolyhedralSet(AbstractSet):
         Of numbers, the set is exactly the same, or where offsets cannot be, larger; or smaller, if
         `inner`. Signs of what is computed from them then are right whatever underflows.
         """
+        if is_concrete(self):  # of numbers also while something else is compiled
+            with jax.ensure_compile_time_eval():
+                A, b = self.facets
+                C, d = balanced(np.asarray(A), np.asarray(b), inner)
+                return jnp.asarray(C), jnp.asarray(d), jnp.asarray(np.linalg.norm(C, axis=1))
         C, d = self.facets
-        if is_concrete(C, d):
-            C, d = balanced(np.asarray(C), np.asarray(d), inner)
-            return jnp.asarray(C), jnp.asarray(d), jnp.asarray(np.linalg.norm(C, axis=1))
         by = exponents(C)
         C, d = shifted(C, -by[:, None]), shifted(d, -by)
         return C, d, lengths(C)
+
+    def bounds_along(self, directions: Float[Array, "m n"]) -> Float[Array, " m"]:
+        """The support; in compiled code offsets of the facets, if each direction is one's normal.
+
+        An offset is looser than the support where its facet does not touch the set.
+        """
+        A, b = self.facets
+        known = None if is_concrete((A, b)) else formulas.offsets_along(A, b, directions)
+        return self.support(directions) if known is None else known
 
     def separation(self, other: PolyhedralSet) -> Float[Array, ""]:
         """How far the facets of another set may move outward before it meets this bounded one."""

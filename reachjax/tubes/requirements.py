@@ -68,7 +68,7 @@ class Requirement:
         """The same, of a set that holds every state at this time."""
         if self.inside:
             C, d, norms = self.region.facets_in_units(inner=True)
-            return Compared(reached.support(C), d, norms)
+            return Compared(reached.bounds_along(C), d, norms)
         return Compared(-reached.separation(self.region)[None], jnp.zeros(1), jnp.ones(1))
 
     def simulated(self, trajectories: np.ndarray) -> np.ndarray:

@@ -115,3 +115,43 @@ def test_compiled_sizes_and_boxes_are_those_of_plain_arrays(template):
 
     for compiled, plain in zip(jax.jit(sizes)(b), sizes(b), strict=True):
         np.testing.assert_allclose(compiled, plain, rtol=1e-12)
+
+
+def test_offsets_along_facets_bound_the_support_and_are_found_by_direction_alone():
+    A = np.array([[2.0, 0.0], [0.0, 1.0], [-1.0, -1.0], [1.0, 0.0], [3.0, 3.0]])
+    b = np.array([2.0, 1.0, 1.0, 0.5, 30.0])
+    wanted = np.array([[4.0, 0.0], [-0.5, -0.5], [1.0, 1.0]])
+    found = np.asarray(formulas.offsets_along(A, b, wanted))
+    np.testing.assert_allclose(found, [2.0, 0.5, 10.0])  # the least of two; the last is redundant
+    assert np.all(found >= np.asarray(Polytope(A, b).support(wanted)) * (1 - 1e-12))
+    assert formulas.offsets_along(A, b, np.array([[1.0, 2.0]])) is None
+    assert formulas.offsets_along(A, b, np.zeros((1, 2))) is None
+    assert jax.jit(lambda A: formulas.offsets_along(A, b, wanted) is None)(A)
+
+
+def test_compiled_bounds_are_offsets_along_facets_and_supports_elsewhere():
+    A, b, _ = polygon(5)
+    bounds = jax.jit(lambda b, D: Polytope(A, b).bounds_along(D))
+    elsewhere = np.array([[0.3, -0.8]])
+    np.testing.assert_allclose(bounds(b, elsewhere), Polytope(A, b).support(elsewhere), rtol=1e-9)
+    slopes = jax.jacobian(lambda b: Polytope(A, b).bounds_along(A[:1]))(jnp.asarray(b))
+    np.testing.assert_array_equal(slopes, np.eye(len(b))[:1])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_boxes_are_as_far_apart_as_linear_programs_say_with_the_same_slopes(seed):
+    rng = np.random.default_rng(seed)
+    lower, other = rng.normal(size=(2, 3))
+    upper, last = lower + rng.uniform(0.1, 1, 3), other + rng.uniform(0.1, 1, 3)
+
+    def apart(lower, upper):
+        return Box(lower, upper).separation(Box(other, last))
+
+    compiled = jax.jit(jax.value_and_grad(apart, argnums=(0, 1)))
+    assert "callback" not in str(jax.make_jaxpr(compiled)(lower, upper))
+    value, (by_lower, by_upper) = compiled(lower, upper)
+    exact = np.maximum(lower - last, other - upper).max()
+    assert exact - 1e-12 <= float(value) <= exact
+    assert float(value) == pytest.approx(float(apart(lower, upper)), rel=1e-9, abs=1e-12)
+    assert np.count_nonzero(by_lower) + np.count_nonzero(by_upper) == 1
+    assert by_lower.sum() - by_upper.sum() == 1

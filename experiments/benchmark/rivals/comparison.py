@@ -13,8 +13,8 @@ from numpy import ndarray
 from experiments.benchmark.cases import Settings
 from experiments.benchmark.rivals.methods import HIGHS, METHODS, Answer
 from experiments.benchmark.rivals.processes import Stopped, from_process
-from experiments.benchmark.rivals.task import Task
 from experiments.benchmark.timing import Timing, each_call
+from experiments.task import Task
 
 CERTIFIED = ("reach", "LinearBounds")
 """Methods whose bounds have to hold whatever rounding did."""

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 import reachjax as rj
 from experiments.benchmark.rivals.lesson import Layers, Lesson
-from experiments.benchmark.rivals.task import Task
+from experiments.task import Task
 
 PERIOD = 0.1
 """Seconds between two decisions."""
@@ -35,14 +35,14 @@ ROOM = DISTANCE - TIME_GAP * EGO_SPEED
 """What must stay above `STANDSTILL`."""
 
 
-def plant() -> rj.AffinePlant:
-    """Both cars."""
+def plant(period: float = PERIOD) -> rj.AffinePlant:
+    """Both cars, over a period in seconds."""
     A, B = np.zeros((7, 7)), np.zeros((7, 1))
     for first in (0, 3):
         A[first, first + 1] = A[first + 1, first + 2] = 1.0
         A[first + 2, first + 2] = -2.0
     A[2, 6] = B[5, 0] = 2.0
-    return rj.zero_order_hold(A, B, period=PERIOD)
+    return rj.zero_order_hold(A, B, period=period)
 
 
 def law(seen: Float[ndarray, "c 5"]) -> Float[ndarray, "c 1"]:
@@ -68,7 +68,7 @@ def folded(layers: Layers) -> Layers:
     """The network of the state, of which the lesson's sees five numbers."""
     rows = np.vstack([np.zeros((2, 7)), EGO_SPEED, DISTANCE, np.eye(7)[1] - EGO_SPEED])
     (W, b), *others = layers
-    return [(W @ rows, b + W[:, :2] @ [SET_SPEED, TIME_GAP]), *others]
+    return [(W @ rows, b + W[:, :2] @ np.array([SET_SPEED, TIME_GAP])), *others]
 
 
 def following(ahead: float = 0.0) -> Task:

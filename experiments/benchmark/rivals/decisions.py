@@ -15,8 +15,8 @@ from experiments.benchmark.cases import Settings
 from experiments.benchmark.rivals import cruise_control
 from experiments.benchmark.rivals.procedures import PROCEDURES, Decision
 from experiments.benchmark.rivals.processes import Stopped, from_process
-from experiments.benchmark.rivals.task import Task
 from experiments.benchmark.timing import Timing, each_call
+from experiments.task import Task
 
 AHEAD = (0.0, -25.0, -30.7, -30.72, -32.0, -35.0)
 """Metres by which the lead is farther ahead. The distance is kept from the first three sets; from

@@ -13,7 +13,7 @@ import reachjax as rj
 from experiments.benchmark.cases import Settings
 from experiments.benchmark.reference import basis_sizes, paper_step
 from experiments.benchmark.rivals.affine_forms import affine_bounds
-from experiments.benchmark.rivals.task import Task
+from experiments.task import Task
 from experiments.tightness.exact import exact_tube
 from experiments.tightness.program import Limits
 

@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_are
 
 import reachjax as rj
 from experiments.benchmark.rivals.lesson import Lesson
-from experiments.benchmark.rivals.task import Task
+from experiments.task import Task
 
 PERIOD = 0.25
 """Seconds between two decisions."""

@@ -12,7 +12,7 @@ import numpy as np
 import reachjax as rj
 from experiments.benchmark.cases import Settings
 from experiments.benchmark.rivals.affine_forms import affine_bounds
-from experiments.benchmark.rivals.task import Task
+from experiments.task import Task
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import numpy as np
 import reachjax as rj
 from experiments.benchmark.cases import Settings, he_network
 from experiments.benchmark.rivals import cruise_control, motion
-from experiments.benchmark.rivals.task import Task
 from experiments.double_integrator import study as double_integrator
 from experiments.double_integrator.problem import (
     GOAL_BOX,
@@ -19,6 +18,7 @@ from experiments.double_integrator.problem import (
 )
 from experiments.quadrotor import study as quadrotor
 from experiments.quadrotor.model import STEPS, goal_set, initial_set, safe_set
+from experiments.task import Task
 
 
 def planar(hidden: tuple[int, ...], settings: Settings) -> Task:

@@ -21,11 +21,11 @@ from experiments.benchmark.rivals.lesson import Lesson
 from experiments.benchmark.rivals.methods import HIGHS, METHODS, PAPER, Answer, chosen
 from experiments.benchmark.rivals.processes import Stopped, from_process
 from experiments.benchmark.rivals.table import NOTE, table
-from experiments.benchmark.rivals.task import Task
 from experiments.benchmark.rivals.tasks import TASKS, random_planar, random_pushed, tasks
 from experiments.benchmark.timing import Timing
 from experiments.double_integrator.problem import closed_loop as planar_loop
 from experiments.imitation import evaluate
+from experiments.task import Task
 from experiments.tightness.exact import SHARP, exact_maxima
 from tests.closed_loops import closed_loop, random_loop
 from tests.networks import box_region, saturating_network, simulate

@@ -1,4 +1,4 @@
-"""What rivals are given: a loop, where it starts, what its sets look like, what it has to do."""
+"""What a loop is asked: where it starts, what its sets look like, what it has to do."""
 
 from dataclasses import dataclass
 from typing import Any

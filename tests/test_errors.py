@@ -142,6 +142,7 @@ BAD_TYPES = {
     "tolerence": lambda: rj.Clarabel(tolerence=1e-8),
     "max_iter'": lambda: rj.SCS(max_iter=9),
     "repeat'": lambda: rj.PaperQC(repeat=True),
+    "PaperQC.repeated must be True or False, but 'no'": lambda: rj.PaperQC(repeated="no"),
     "stable'": lambda: rj.LocalBounds(stable=True),
     "relaxtion": lambda: reach(relaxtion=rj.PaperQC()),
     "inputbox": lambda: LOOP.replace(inputbox=X0),

@@ -63,6 +63,11 @@ class AbstractRelaxation(abc.ABC):
     linear_bounds: ClassVar[bool] = False
     by_forms: ClassVar[bool] = False
 
+    def __post_init__(self):
+        for name in ("repeated", "remove_stable"):
+            value = getattr(self, name, True)
+            require_kind(f"{type(self).__name__}.{name}", value, bool, "True or False")
+
     @property
     def cuts(self) -> CuttingPlanes | None:
         """By which rounds products are added; None if a program has all of them at once."""
@@ -98,6 +103,9 @@ class PaperQC(AbstractRelaxation):
         repeated: whether to include `lambda_ij`.
         remove_stable: whether neurons that interval bounds prove to be affine leave the basis,
             which the paper does not do.
+
+    Raises:
+        TypeError: one of them is neither True nor False.
     """
 
     repeated: bool = True
@@ -125,6 +133,9 @@ class LocalBounds(AbstractRelaxation):
     Args:
         repeated: whether to include `lambda_ij`.
         remove_stable: whether neurons that interval bounds prove to be affine leave the basis.
+
+    Raises:
+        TypeError: one of them is neither True nor False.
     """
 
     repeated: bool = True
@@ -219,6 +230,7 @@ class CuttingPlanes(AbstractRelaxation):
     linear_bounds: ClassVar[bool] = True
 
     def __post_init__(self):
+        super().__post_init__()
         whole_number("CuttingPlanes.rounds", self.rounds, 0)
         whole_number("CuttingPlanes.batch", self.batch, 1)
         if self.gap is not None:
@@ -264,6 +276,7 @@ class BranchAndCut(AbstractRelaxation):
     linear_bounds: ClassVar[bool] = True
 
     def __post_init__(self):
+        super().__post_init__()
         whole_number("BranchAndCut.nodes", self.nodes, 0)
         require_kind(
             "BranchAndCut.products_by", self.products_by, CuttingPlanes, "of type CuttingPlanes"

@@ -21,11 +21,10 @@ COLOURS = {
 WITHIN = 1.02
 """Imitation errors up to so many times that of plain training are called as good."""
 NOTE = f"""\
-P / R / U: networks proved, refuted, unknown;  as good: proved with an error within \
-{WITHIN - 1:.0%} of plain training
-error: on held-out samples, median, and its ratio to that of the same network trained plainly
-certified, simulated: widths over those of the same network trained plainly, medians
-penalties: steps that had one, of all steps, medians;  first: seconds of first calls, largest"""
+P / R / U: proved, refuted, unknown;  as good: proved, error within {WITHIN - 1:.0%} of plain
+error: on held-out samples, over that of plain training, median
+sets, hulls: certified and simulated widths over those of plain training, medians
+penalties: steps that had one, of all, medians;  first: seconds of first calls, largest"""
 
 
 def ratios(outcomes: Sequence[Outcome], plain: Sequence[Outcome]) -> Float[ndarray, " seeds"]:
@@ -61,19 +60,17 @@ def table(loop: str, group: dict[str, list[Outcome]]) -> Table:
                 way,
                 " / ".join(map(str, verdicts)),
                 int(np.sum(proved & (error <= WITHIN))),
-                f"{np.median([each.error for each in outcomes]):.4f}",
                 f"{np.median(error):.2f}",
                 f"{np.median(certified):.2f}",
                 f"{np.median(simulated):.2f}",
-                "-" if way == "none" else f"{penalised:.0f} of {steps:.0f}",
-                sum(each.skipped for each in outcomes),
+                "-" if way == "none" else f"{penalised:.0f}/{steps:.0f}",
                 f"{max(each.first for each in outcomes):.1f}",
             )
         )
     initials = " / ".join(name[0] for name in report.COLOURS)
     headings = (
-        *(initials, "as good", "error", "/ plain", "certified", "simulated"),
-        *("penalties", "skipped", "first"),
+        *(initials, "as good", "error", "sets", "hulls"),
+        *("penalties", "first"),
     )
     return report.table(loop, ("penalty",), headings, rows)
 
@@ -91,7 +88,9 @@ def draw(found: dict[str, dict[str, list[Outcome]]], path: Path) -> None:
             hollow = style | {"color": "none", "edgecolors": COLOURS[way]}
             ax.scatter(*(part[~proved] for part in at), **hollow)
         ax.axvline(WITHIN, color="black", linewidth=1, linestyle=":")
-        ax.set(title=loop, xscale="log", yscale="log")
+        ax.set(title=loop, xscale="log")
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_formatter("")
         ax.set_xlabel("imitation error / that of plain training")
     axes[0].set_ylabel("certified widths / those of plain training")
     report.legend_below(figure, title="penalty (filled: proved, hollow: not)")

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.loops.networks import AbstractNetwork
-from reachjax.loops.plants import AffinePlant
+from reachjax.loops.plants import AbstractPlant
 from reachjax.loops.units import AbstractUnit, AtUnit, clipped, evaluate
 from reachjax.numerics.checks import Numbers, require_kind, same_size, whole_number
 from reachjax.numerics.pytrees import Replaceable, pytree
@@ -28,6 +28,8 @@ class UnitLayer(NamedTuple):
     size: int
 
 
+PLANT = "a plant such as reachjax.AffinePlant"
+
 NETWORK = (
     "a network such as reachjax.MLP, which MLP.from_flax makes of a flax network, and "
     "MLP.from_layers of the pairs (W, b) of any other"
@@ -39,7 +41,7 @@ class ClosedLoop(Replaceable):
     """`x[t+1] = A_t x[t] + B_t proj(pi(x[t])) + c_t`; sizes are checked here, once.
 
     Args:
-        plant: the affine plant.
+        plant: the plant.
         controller: the network `pi`.
         input_box: what inputs are projected onto, constant or time-varying; `None`: no projection.
 
@@ -48,7 +50,7 @@ class ClosedLoop(Replaceable):
         ValueError: numbers of states, inputs or time steps disagree.
 
     Example:
-        >>> from reachjax import MLP
+        >>> from reachjax import MLP, AffinePlant
         >>> plant = AffinePlant([[1.0]], [[1.0]])
         >>> net = MLP.from_layers([([[-2.0]], [0.0])])
         >>> loop = ClosedLoop(plant, net, input_box=Box([-1.0], [1.0]))
@@ -56,12 +58,12 @@ class ClosedLoop(Replaceable):
         [2.5, 1.5, 0.5, -0.5]
     """
 
-    plant: AffinePlant
+    plant: AbstractPlant
     controller: AbstractNetwork
     input_box: Box | None = None
 
     def __post_init__(self):
-        require_kind("ClosedLoop.plant", self.plant, AffinePlant, "of type AffinePlant")
+        require_kind("ClosedLoop.plant", self.plant, AbstractPlant, PLANT)
         require_kind("ClosedLoop.controller", self.controller, AbstractNetwork, NETWORK)
         if self.input_box is not None:
             require_kind("ClosedLoop.input_box", self.input_box, Box, "of type Box")
@@ -112,7 +114,10 @@ class ClosedLoop(Replaceable):
 
     def input(self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
         """The projected input, for any kind of number and with `unit` at each layer of units."""
-        u = self.controller.propagate(x, unit)
+        return self.projected(self.controller.propagate(x, unit), t, unit)
+
+    def projected(self, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
+        """What the controller gives, projected onto the input box."""
         if self.input_box is None:
             return u
         box = self.input_box.at(t)
@@ -120,7 +125,7 @@ class ClosedLoop(Replaceable):
 
     def step(self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
         """The state at `t + 1`, for any kind of number and with `unit` at each layer of units."""
-        return self.plant.propagate(x, self.input(x, t, unit), t)
+        return self.plant.propagate(x, self.input(x, t, unit), t, unit)
 
     def simulate(
         self, x0: Float[ArrayLike, "*batch n"], horizon: int, start: int = 0

@@ -1,7 +1,11 @@
-"""Plants: affine, time-invariant or time-varying, `x[t+1] = A_t x[t] + B_t u[t] + c_t`."""
+"""Plants: what follows a state under an input.
+
+The affine one, time-invariant or time-varying, is `x[t+1] = A_t x[t] + B_t u[t] + c_t`.
+"""
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -10,8 +14,39 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from reachjax.loops.units import AtUnit, evaluate
 from reachjax.numerics.checks import Numbers, within_time_axis
 from reachjax.numerics.pytrees import Replaceable, converted, pytree
+
+
+class AbstractPlant(Replaceable, abc.ABC):
+    """What a loop needs of its plant: sizes, and its step over any kind of number."""
+
+    @property
+    @abc.abstractmethod
+    def states(self) -> int:
+        """The number `n_x` of states."""
+
+    @property
+    @abc.abstractmethod
+    def inputs(self) -> int:
+        """The number `n_u` of inputs."""
+
+    @property
+    @abc.abstractmethod
+    def steps(self) -> int | None:
+        """The number of times a time-varying plant is given for; `None` when time-invariant."""
+
+    @abc.abstractmethod
+    def propagate(self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
+        """The successor of `x` under input `u`, for any kind of number.
+
+        Args:
+            x: the state.
+            u: the input.
+            t: the time.
+            unit: what is done at each layer of units, of which an affine plant has none.
+        """
 
 
 def _one_array(constant: str, varying: str) -> Callable[..., Array]:
@@ -43,7 +78,7 @@ def _depth(value: Any) -> int:
 
 
 @pytree
-class AffinePlant(Replaceable):
+class AffinePlant(AbstractPlant):
     """The paper's system (LTV). A leading time axis on any of the three makes it time-varying.
 
     Args:
@@ -117,7 +152,7 @@ class AffinePlant(Replaceable):
         A, B, c = (varying[k][t] if k in varying else getattr(self, k) for k in ("A", "B", "c"))
         return A, B, c
 
-    def propagate(self, x: Any, u: Any, t: int | jax.Array = 0) -> Any:
+    def propagate(self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
         """The successor of `x` under input `u`, for any kind of number."""
         A, B, c = self.at(t)
         return A @ x + B @ u + c

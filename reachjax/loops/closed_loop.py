@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.loops.networks import AbstractNetwork
 from reachjax.loops.plants import AbstractPlant
-from reachjax.loops.units import AbstractUnit, AtUnit, clipped, evaluate
+from reachjax.loops.units import AbstractUnit, AtUnit, SmoothUnit, clipped, evaluate
 from reachjax.numerics.checks import Numbers, require_kind, same_size, whole_number
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.sets import Box
@@ -103,6 +103,23 @@ class ClosedLoop(Replaceable):
         return _recorded(structure, tuple(jnp.shape(leaf) for leaf in leaves))
 
     @property
+    def controller_layers(self) -> tuple[UnitLayer, ...]:
+        """Those of them that are the controller's, the first ones."""
+        leaves, structure = jax.tree.flatten(self.controller)
+        return _recorded(structure, tuple(jnp.shape(leaf) for leaf in leaves))
+
+    @property
+    def smooth_controller(self) -> bool:
+        """Whether the controller has units, and all of them are smooth."""
+        layers = self.controller_layers
+        return bool(layers) and all(isinstance(layer.unit, SmoothUnit) for layer in layers)
+
+    @property
+    def curved(self) -> bool:
+        """Whether any unit is smooth."""
+        return any(isinstance(layer.unit, SmoothUnit) for layer in self.unit_layers)
+
+    @property
     def units(self) -> int:
         """The number of units of one step."""
         return sum(layer.size for layer in self.unit_layers)
@@ -155,7 +172,7 @@ class ClosedLoop(Replaceable):
 
 @lru_cache(maxsize=256)
 def _recorded(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[UnitLayer, ...]:
-    """The layers of units that the forward pass of a loop of this structure meets.
+    """The layers of units that the forward pass of a loop or a network of this structure meets.
 
     Args:
         structure: of the loop as a tree.
@@ -167,10 +184,14 @@ def _recorded(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Unit
         layers.append(UnitLayer(unit, len(y)))
         return unit(y)
 
+    def passed(tree: Any, x: Array) -> Array:
+        return tree.step(x, 0, record) if loops else tree.propagate(x, record)
+
     leaves = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
-    loop = jax.tree.unflatten(structure, leaves)
-    state = jax.ShapeDtypeStruct((loop.states,), float)
-    jax.eval_shape(lambda loop, x: loop.step(x, 0, record), loop, state)
+    tree = jax.tree.unflatten(structure, leaves)
+    loops = isinstance(tree, ClosedLoop)
+    state = jax.ShapeDtypeStruct((tree.states if loops else tree.inputs,), float)
+    jax.eval_shape(passed, tree, state)
     return tuple(layers)
 
 

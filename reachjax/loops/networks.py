@@ -14,8 +14,9 @@ from typing import Any
 
 from jaxtyping import Array, ArrayLike, Float
 
+from reachjax.loops.functions import Function
 from reachjax.loops.units import AbstractActivation, AtUnit, ReLU, evaluate
-from reachjax.numerics.checks import Numbers, same_size
+from reachjax.numerics.checks import Numbers, same_size, whole_number
 from reachjax.numerics.pytrees import Replaceable, converted, pytree, static
 
 
@@ -163,3 +164,54 @@ class MLP(AbstractNetwork):
             x = self.activation.propagate(W @ x + b, unit)
         W, b = self.layers[-1]
         return W @ x + b
+
+
+@pytree
+class Network(AbstractNetwork):
+    """Any JAX function as a controller: skip connections, scalers, several activations.
+
+    The function is traced; its parameters are the arrays of the tree that it is, such as those of
+    `jax.tree_util.Partial(f, params)` or of a flax or equinox module, and stay differentiable. What
+    is computed of parameters alone is taken as it is computed.
+
+    Args:
+        f: of a vector `(inputs,)`, with a vector `(outputs,)` for a result.
+        inputs: how many there are.
+        outputs: how many there are.
+
+    Raises:
+        TypeError: `f` is no function, or contains a primitive that has no bounds, whose line the
+            error names.
+        ValueError: `f` cannot be called so, or its result has another shape.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> net = Network(lambda x: jnp.tanh(x[:1] - x[1:]), inputs=2, outputs=1)
+        >>> net([0.5, 0.5]).tolist()
+        [0.0]
+    """
+
+    f: Function
+
+    def __init__(self, f: Any, inputs: int | None = None, outputs: int | None = None):
+        if not isinstance(f, Function):
+            sizes = (whole_number("Network.inputs", inputs, 1),)
+            f = Function.of(f, sizes, whole_number("Network.outputs", outputs, 1), "Network.f")
+        self._set(f=f)
+
+    def __repr__(self) -> str:
+        return f"Network(inputs={self.inputs}, outputs={self.outputs})"
+
+    @property
+    def inputs(self) -> int:
+        """The number of inputs."""
+        return self.f.structure.inputs[0]
+
+    @property
+    def outputs(self) -> int:
+        """The number of outputs."""
+        return self.f.structure.outputs
+
+    def propagate(self, x: Any, unit: AtUnit) -> Any:
+        """The forward pass over any kind of number, with `unit` at each layer of units."""
+        return self.f.propagate((x,), unit)

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from reachjax.loops.functions import Function
 from reachjax.loops.units import AtUnit, evaluate
-from reachjax.numerics.checks import Numbers, within_time_axis
+from reachjax.numerics.checks import Numbers, whole_number, within_time_axis
 from reachjax.numerics.pytrees import Replaceable, converted, pytree
 
 
@@ -156,3 +157,59 @@ class AffinePlant(AbstractPlant):
         """The successor of `x` under input `u`, for any kind of number."""
         A, B, c = self.at(t)
         return A @ x + B @ u + c
+
+
+@pytree
+class NonlinearPlant(AbstractPlant):
+    """Any JAX function as a plant, `x[t+1] = f(x[t], u[t])`, traced as a `Network` is.
+
+    Args:
+        f: of a state `(states,)` and an input `(inputs,)`, with the successor for a result.
+        states: how many there are.
+        inputs: how many there are.
+
+    Raises:
+        TypeError: `f` is no function, or contains a primitive that has no bounds, whose line the
+            error names.
+        ValueError: `f` cannot be called so, or its result has another shape.
+
+    Example:
+        >>> def pendulum(x, u):
+        ...     return jnp.array([x[0] + 0.1 * x[1], x[1] + 0.1 * (jnp.sin(x[0]) + u[0])])
+        >>> plant = NonlinearPlant(pendulum, states=2, inputs=1)
+        >>> plant.propagate(jnp.array([0.0, 1.0]), jnp.array([-2.0])).tolist()
+        [0.1, 0.8]
+    """
+
+    f: Function
+
+    def __init__(self, f: Any, states: int | None = None, inputs: int | None = None):
+        if not isinstance(f, Function):
+            name = "NonlinearPlant"
+            n, m = whole_number(f"{name}.states", states, 1), whole_number(
+                f"{name}.inputs", inputs, 1
+            )
+            f = Function.of(f, (n, m), n, f"{name}.f")
+        self._set(f=f)
+
+    def __repr__(self) -> str:
+        return f"NonlinearPlant(states={self.states}, inputs={self.inputs})"
+
+    @property
+    def states(self) -> int:
+        """The number `n_x` of states."""
+        return self.f.structure.inputs[0]
+
+    @property
+    def inputs(self) -> int:
+        """The number `n_u` of inputs."""
+        return self.f.structure.inputs[1]
+
+    @property
+    def steps(self) -> int | None:
+        """None: the function does not know the time."""
+        return None
+
+    def propagate(self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
+        """The successor of `x` under input `u`, for any kind of number."""
+        return self.f.propagate((x, u), unit)

@@ -64,7 +64,7 @@ class AffineForms:
         """
         xp, (n, w) = namespace(start.center), start.spread.shape
         middle, zero = start.center[:, None], xp.zeros((n, 1))
-        empty = xp.zeros((n, (size or w) - w))
+        empty = xp.zeros((n, (size or start.count) - w))
         rows = xp.concatenate([middle, middle, start.spread, empty], axis=1)
         forms = cls(rows, xp.concatenate([zero, zero + xp.inf], axis=1))
         return forms.within(Ball.between(*forms.ends(start, cut=True)))
@@ -136,8 +136,14 @@ class AffineForms:
         center, middle = self.rows[:, 0], self.rows[:, 1]
         first = self.rows[:, 2 : 2 + w]
         lower, upper = start.cut_ends(first) if cut else start.ends(first)
+        own = w
+        if start.curved:
+            own = start.count
+            products = abs(self.rows[:, 2 + w : 2 + own]).sum(axis=1) * (1 + gamma(n))
+            ends = start.curved_ends(self.rows[:, 2 : 2 + own])
+            lower, upper = met(ends, (lower - products, upper + products))
         largest = abs(constant(center)) + constant(larger(-lower, upper))
-        rest = abs(self.rows[:, 2 + w :]).sum(axis=1) * (1 + gamma(n))
+        rest = abs(self.rows[:, 2 + own :]).sum(axis=1) * (1 + gamma(n))
         slack = rest + (self.radii[:, 0] + gamma(8) * largest) * (1 + gamma(n))
         by_forms = center + lower - slack, center + upper + slack
         reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(constant(middle))

@@ -1,4 +1,14 @@
-"""One step of the loop in affine forms: its own forward pass, run over them."""
+"""One step of the loop in affine forms: its own forward pass, run over them.
+
+A smooth unit is its quadratic model: with `y = c + d`, `d = g w + h`, where `w` are the columns of
+the initial state and `|g w| <= S`, `|h| <= R` for what else there is,
+
+    f(y) = p + s d + q (g w)^2 + e v,    |v| <= 1,    e = (error of the model) + |q| (2 S R + R^2),
+
+and `(g w)^2` is a row over products of the `w`, which are columns too (`initial`). What the units of
+a smooth controller leave out is summed up at its outputs, one column for each: a step adds as many
+columns for ten neurons as for a thousand. They stay columns, which the feedback contracts.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.units import AbstractUnit
+from reachjax.loops.units import AbstractUnit, SmoothUnit
 from reachjax.numerics.rounding import Ball, gamma, namespace
 from reachjax.programs.affine import AffineForms, Place, met
 from reachjax.programs.initial import Ends, InitialColumns, constant, settled
@@ -46,8 +56,44 @@ class UnitForms(NamedTuple):
     outputs: AffineForms
 
 
+class Merged(NamedTuple):
+    """What the units of a smooth controller leave out, as one column for each of its outputs.
+
+    Attributes:
+        outputs: forms of the outputs.
+        gap: `(n_u,)`, how much each has of its column.
+        places: `(n_u,)`, the columns; -1 where none is needed.
+    """
+
+    outputs: AffineForms
+    gap: Float[Array | np.ndarray, " n_u"]
+    places: Int[Array | np.ndarray, " n_u"]
+
+
+class StepForms(NamedTuple):
+    """What affine forms make of one step.
+
+    Attributes:
+        successor: of the state.
+        units: of each layer of units.
+        merged: of the controller's outputs, if it is smooth.
+    """
+
+    successor: AffineForms
+    units: tuple[UnitForms, ...]
+    merged: Merged | None
+
+
 Ranges = Callable[[AbstractUnit, AffineForms, Ends, Sequence[UnitForms]], Ends]
 """Bounds of a layer's inputs that are no worse than these, given the layers before."""
+
+
+def step_columns(loop: ClosedLoop) -> tuple[int, int]:
+    """How many columns a step adds, and how many it needs in between."""
+    merging = loop.smooth_controller
+    between = sum(layer.size for layer in loop.controller_layers) if merging else 0
+    kept = loop.units - between + (loop.plant.inputs if merging else 0)
+    return kept + loop.states, between
 
 
 def step_forms(
@@ -59,7 +105,8 @@ def step_forms(
     slopes: Float[Array | np.ndarray, " units"] | None = None,
     known: Box | None = None,
     ranges: Ranges | None = None,
-) -> tuple[AffineForms, tuple[UnitForms, ...]]:
+    scratch: int = 0,
+) -> StepForms:
     """One step of the loop, whose own forward pass is run over affine forms.
 
     Args:
@@ -67,19 +114,19 @@ def step_forms(
         state: forms of the state at time `t`.
         t: the time.
         start: what the first columns are.
-        place: where the columns of this step begin, `units + n_x` of them; None to append.
-        slopes: of the units; None for those of their lines. What is found holds for any.
+        place: where the columns of this step begin, as many as `step_columns` says; None to append.
+        slopes: of the units that are not smooth; None for those of their lines. What is found holds
+            for any.
         known: a box that surely holds the successor, where one is known.
         ranges: what else bounds the inputs of a layer, if anything does.
-
-    Returns:
-        Forms of the successor, and those of each layer of units.
+        scratch: where the columns begin that a step needs in between, if there is a place.
     """
     found: list[UnitForms] = []
-    done, width = 0, state.columns.shape[1]
+    done, width, merging = 0, state.columns.shape[1], loop.smooth_controller
+    free = place if not merging else scratch
 
     def apply(unit: AbstractUnit, y: AffineForms) -> AffineForms:
-        nonlocal done, width
+        nonlocal done, width, free
         here, done = slice(done, done + len(y.rows)), done + len(y.rows)
         slope = None if slopes is None else slopes[here]
         if place is None:  # branches that began alike must not share the columns they add
@@ -87,19 +134,75 @@ def step_forms(
         ends = _cut(unit, y, start)
         if ranges is not None:
             ends = ranges(unit, y, ends, found)
-        z, forms = _unit(unit, y, ends, None if place is None else place + here.start, slope)
+        own = None if place is None else free
+        if isinstance(unit, SmoothUnit):
+            z, forms = _smooth(unit, y, ends, own, start)
+        else:
+            z, forms = _unit(unit, y, ends, own, slope)
+        if place is not None:
+            free = free + len(y.rows)
         width = z.columns.shape[1]
         found.append(forms)
         return z
 
-    successor = loop.step(state, t, apply)
+    u, merged = loop.controller.propagate(state, apply), None
+    if merging:
+        u, merged = _merged(u, state.columns.shape[1], place, scratch)
+        width = u.columns.shape[1]
+        free = None if place is None else place + len(u.rows)
+    successor = loop.plant.propagate(state, loop.projected(u, t, apply), t, apply)
     if place is None:
         successor = successor.widened(width)
-    successor = _spilled(successor, None if place is None else place + done)
+    successor = _spilled(successor, free)
     ends = successor.ends(start)
     if known is not None:
         ends = met(ends, (known.lower, known.upper))
-    return successor.within(Ball.between(*ends)), tuple(found)
+    return StepForms(successor.within(Ball.between(*ends)), tuple(found), merged)
+
+
+def _merged(
+    forms: AffineForms, width: int, place: Place, scratch: int
+) -> tuple[AffineForms, Merged]:
+    """The same with all columns from some on as one for each number."""
+    xp, first = namespace(forms.rows), 2 + (width if place is None else scratch)
+    last = forms.rows[:, first:]
+    gap = abs(last).sum(axis=1) * (1 + gamma(last.shape[1]))
+    if place is None:
+        rows = forms.rows[:, :first]
+    else:
+        rows = xp.concatenate([forms.rows[:, :first], xp.zeros_like(last)], axis=1)
+    forms, places = AffineForms(rows, forms.radii).with_own(gap, place)
+    return forms, Merged(forms, gap, places)
+
+
+def _smooth(
+    unit: SmoothUnit, y: AffineForms, ends: Ends, place: Place, start: InitialColumns
+) -> tuple[AffineForms, UnitForms]:
+    """What a layer of smooth units makes of its inputs, whose bounds are known."""
+    xp, (lower, upper), w = namespace(y.rows), ends, start.spread.shape[1]
+    model, values = unit.quadratic(lower, upper), Ball.between(*unit.interval(lower, upper))
+    center, rows = y.rows[:, 0], y.rows[:, 2:]
+    off = center - model.center
+    middle = model.offset + (model.slope + model.curvature * off) * off
+    slope = model.slope + 2 * model.curvature * off
+    slope, curvature, middle = settled((slope, model.curvature, middle))
+    own = start.norms(rows[:, :w])
+    rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(rows.shape[1])) + y.radii[:, 0]
+    lost = abs(curvature) * (2 * own + rest) * rest
+    level, products = start.squared(rows[:, :w])
+    linear = slope[:, None] * rows
+    bent = linear[:, w : start.count] + curvature[:, None] * products
+    constants = xp.stack([middle + curvature * level, values.mid], axis=1)
+    rows = xp.concatenate([constants, linear[:, :w], bent, linear[:, start.count :]], axis=1)
+    size = abs(model.offset) + (abs(model.slope) + 2 * abs(curvature * off)) * abs(off)
+    size = size + abs(slope) * (own + rest) + abs(curvature) * own**2 + abs(slope * center)
+    error = constant(gamma(rows.shape[1] + 32) * size)
+    radius = constant(abs(slope) * y.radii[:, 0] * (1 + gamma(4))) + error
+    gap = settled((model.gap + lost) * (1 + gamma(16)))
+    z = AffineForms(rows, xp.stack([radius, values.rad], axis=1))
+    z, places = z.with_own(gap, place)
+    offset = middle - slope * center
+    return z, UnitForms(unit, y, lower, upper, slope, offset, gap, places, z)
 
 
 def _unit(

@@ -23,10 +23,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.units import AbstractUnit, Mark
+from reachjax.loops.units import AbstractUnit, Mark, SmoothUnit
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine import AffineForms, met
-from reachjax.programs.affine_steps import UnitForms, step_forms
+from reachjax.programs.affine_steps import Merged, UnitForms, step_forms
 from reachjax.programs.initial import Ends, InitialColumns
 from reachjax.sets import AbstractSet, Box
 
@@ -50,7 +50,8 @@ class Horizon:
         columns: `(p,)`, of the unit of each pair of facts whose product is zero.
         gaps: `(p,)`, how much of its column a unit's value has.
         origins: `(m, 3)`, of each fact the step, the unit's number among those of a step, and which
-            of its facts it is; -1 of the initial set.
+            of its facts it is; -1 of the initial set, -2 of products of its columns.
+        merged: of each step, what a smooth controller leaves out.
 
     Example:
         >>> import jax
@@ -66,9 +67,12 @@ class Horizon:
 
     def __init__(self, loop: ClosedLoop, X0: AbstractSet, box: Box, t: int = 0):
         self._loop, self._t = loop, t
-        self.start = InitialColumns.of(X0, box)
+        self.start = InitialColumns.of(X0, box, loop.curved)
         self.state = AffineForms.beginning(self.start)
         self.steps: list[tuple[UnitForms, ...]] = []
+        self.merged: list[Merged | None] = []
+        self._controllers = len(loop.controller_layers)
+        self._remainders = np.zeros(0, dtype=int)
         self._facts: list[AffineForms] = []
         self._zero: list[np.ndarray] = [np.zeros((0, 2), dtype=int)]
         self.columns, self.gaps = np.zeros(0, dtype=int), np.zeros(0)
@@ -77,6 +81,8 @@ class Horizon:
         if self.start.cut is not None:
             A, b = (np.asarray(part) for part in self.start.cut.facets)
             self._add(b - A @ self.state, np.full((len(b), 3), -1))
+        products = _product_facts(self.start)
+        self._add(products, np.full((len(products.rows), 3), -2))
 
     @property
     def facts(self) -> AffineForms:
@@ -88,6 +94,11 @@ class Horizon:
         return self._facts[0]
 
     @property
+    def width(self) -> int:
+        """How many columns there are."""
+        return self.facts.columns.shape[1]
+
+    @property
     def zero(self) -> Int[np.ndarray, "p 2"]:
         """Pairs of facts, one of which is zero at each state."""
         return np.concatenate(self._zero)
@@ -95,7 +106,8 @@ class Horizon:
     @property
     def varying(self) -> Int[np.ndarray, " v"]:
         """Columns of the initial state and of units, without those of rounding errors."""
-        return np.concatenate([np.arange(self.start.spread.shape[1]), np.unique(self.columns)])
+        of_units = np.concatenate([self.columns, self._remainders])
+        return np.concatenate([np.arange(self.start.count), np.unique(of_units)])
 
     def advance(self, multipliers: Multipliers | None = None) -> None:
         """One step more.
@@ -108,6 +120,8 @@ class Horizon:
             unit: AbstractUnit, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
         ) -> Ends:
             self._state_facts(found)
+            if isinstance(unit, SmoothUnit):  # its range is that of its form, but for little
+                return ends
             switching = np.flatnonzero(~unit.lines(*ends).affine)
             if multipliers is None or not (len(switching) and self._count):
                 return ends
@@ -125,21 +139,48 @@ class Horizon:
         t = self._t + len(self.steps)
         self._stated = 0
         with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
-            self.state, units = step_forms(self._loop, self.state, t, self.start, ranges=ranges)
+            self.state, units, merged = step_forms(
+                self._loop, self.state, t, self.start, ranges=ranges
+            )
             self._state_facts(units)
         self.steps.append(units)
+        self.merged.append(merged)
+        # those of units of a smooth controller are summed up in the merged ones
+        own = units if merged is None else units[self._controllers :]
+        smooth = [each.places for each in (*own, *([merged] if merged else [])) if _left_out(each)]
+        self._remainders = np.concatenate([self._remainders, *smooth])
+        self._remainders = self._remainders[self._remainders >= 0]
 
     def columns_at(self, state: Float[np.ndarray, " n_x"]) -> Float[np.ndarray, " n"]:
         """The columns of the trajectory from an initial state."""
-        found = np.zeros(self.facts.columns.shape[1])
+        found = np.zeros(self.width)
         first = self.start.back @ (state - self.start.center)
         found[: len(first)] = first
-        for layer in itertools.chain(*self.steps):
-            here = np.flatnonzero(layer.places >= 0)
-            inputs = layer.inputs[here]
-            y: Any = inputs.rows[:, 0] + inputs.columns @ found[: inputs.columns.shape[1]]
-            rest = layer.unit(y) - layer.slope[here] * y - layer.offset[here]
-            found[layer.places[here]] = rest / layer.gap[here]
+        i, j = self.start.pairs
+        found[len(first) : self.start.count] = np.where(
+            i == j, 2 * first[i] * first[j] - 1, first[i] * first[j]
+        )
+        x: Any = state
+        for k, (layers, merged) in enumerate(zip(self.steps, self.merged, strict=True)):
+            following, own = iter(layers), 0 if merged is None else self._controllers
+
+            def apply(
+                unit: AbstractUnit, y: Any, following: Any = following, own: int = own
+            ) -> Any:
+                nonlocal seen
+                z: Any = unit(y)
+                layer, seen = next(following), seen + 1
+                if seen > own:  # else its columns were merged
+                    _fill(found, layer.outputs, layer.gap, layer.places, z)
+                return z
+
+            seen = 0
+
+            u = self._loop.controller.propagate(x, apply)
+            if merged is not None:
+                _fill(found, *merged[:2], merged.places, u)
+            t = self._t + k
+            x = self._loop.plant.propagate(x, self._loop.projected(u, t, apply), t, apply)
         return found
 
     def narrow(self, lower: Float[np.ndarray, " n_x"], upper: Float[np.ndarray, " n_x"]) -> None:
@@ -185,6 +226,42 @@ class Horizon:
         self._facts.append(rows)
         self.origins = np.concatenate([self.origins, origins])
         self._count += len(rows.rows)
+
+
+def _left_out(each: UnitForms | Merged) -> bool:
+    """Whether columns are of what smooth units leave out."""
+    return isinstance(each, Merged) or isinstance(each.unit, SmoothUnit)
+
+
+def _fill(
+    found: Float[np.ndarray, " n"],
+    outputs: AffineForms,
+    gap: np.ndarray,
+    places: np.ndarray,
+    values: np.ndarray,
+) -> None:
+    """Set the columns that numbers have of their own, from their values and all other columns."""
+    here = np.flatnonzero(places >= 0)
+    width = outputs.columns.shape[1]
+    rest = values[here] - outputs.rows[here, 0] - outputs.columns[here] @ found[:width]
+    found[places[here]] = rest / gap[here]
+
+
+def _product_facts(start: InitialColumns) -> AffineForms:
+    """`(1 + a w_i) (1 + b w_j) >= 0` for all signs `a`, `b`, over the columns of a curved start."""
+    n, (i, j) = start.spread.shape[1], start.pairs
+    rows = []
+    for number, (one, other) in enumerate(zip(i, j, strict=True)):
+        signs = [(1, 1), (-1, -1)] if one == other else itertools.product((1, -1), repeat=2)
+        for a, b in signs:
+            row = np.zeros(2 + start.count)
+            row[2 + n + number] = 0.5 if one == other else a * b
+            row[:2] = 1.5 if one == other else 1.0, 2.0  # a square is half of 1 and its column
+            row[2 + one] += a
+            row[2 + other] += b
+            rows.append(row)
+    radii = np.tile([0.0, 2.0], (len(rows), 1))  # each is in [0, 4]
+    return AffineForms(np.reshape(rows, (-1, 2 + start.count)), radii)
 
 
 def joined(parts: Sequence[AffineForms]) -> AffineForms:

@@ -7,6 +7,15 @@ the set is smaller than `q + M w`, a set `S` that also holds it cuts off more: f
     r . w  <=  sup_S a - a . q + |r - a M|,
 
 since `x_0` is in `S`; `a = r M^+` leaves nothing over but rounding.
+
+Where a loop has smooth units, products of the `w` are columns too, `2 w_i^2 - 1` and `w_i w_j`, all of
+them in `[-1, 1]`: forms over both are polynomials of degree two of the initial state. Over the box
+
+    g w + q (2 w^2 - 1)  <=  g^2 / (8 |q|) + |q|  if q < 0 and |g| <= 4 |q|,  else |g| + q,
+
+and from `(1 - s_i w_i) (1 - s_j w_j) >= 0`, `s_i` being the sign of `g_i`, where `q s_i s_j < 0`,
+
+    q w_i w_j  <=  |q| - m s_i w_i - m s_j w_j  for any m in [0, |q|].
 """
 
 from __future__ import annotations
@@ -17,7 +26,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.numerics.pytrees import pytree, static
+from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
 from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
 from reachjax.sets.polyhedra import support
@@ -29,7 +38,7 @@ Ends = tuple[Any, Any]
 
 
 @pytree
-class InitialColumns:
+class InitialColumns(Replaceable):
     """The columns `w` of an initial set, `x_0 = center + spread w`.
 
     Attributes:
@@ -38,6 +47,7 @@ class InitialColumns:
         back: `(n, n)`, nearly the pseudoinverse of `spread`.
         cut: a set that also holds `x_0`, where there is one: a box, or on the host a polytope.
         round: whether `|w| <= 1` in the 2-norm; in that of the largest entry if not.
+        curved: whether products of the `w` are columns too.
     """
 
     center: Float[Array | np.ndarray, " n"]
@@ -45,21 +55,55 @@ class InitialColumns:
     back: Float[Array | np.ndarray, "n n"]
     cut: PolyhedralSet | None
     round: bool = static()
+    curved: bool = static(default=False)
 
     @classmethod
-    def of(cls, X: AbstractSet, box: Box) -> InitialColumns:
+    def of(cls, X: AbstractSet, box: Box, curved: bool = False) -> InitialColumns:
         """Those of a set, numpy arrays if the set has numpy arrays.
 
         Args:
             X: the set. A polytope is itself the cut on the host, and is held by its box in JAX.
             box: around it.
+            curved: whether products of columns are columns too.
         """
         cut, ball = X.parts
         if cut is not None and cut.needs_programs and namespace(*cut.facets) is not np:
             cut = box
         if ball is not None:
-            return _of_ball(ball, cut)
-        return _of_box(box, cut if cut is not None and cut.needs_programs else None)
+            found = _of_ball(ball, cut)
+        else:
+            found = _of_box(box, cut if cut is not None and cut.needs_programs else None)
+        return found.replace(curved=curved)
+
+    @property
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which `w_i` and `w_j` each product is of, `i <= j`; none unless it is curved."""
+        n = self.spread.shape[1]
+        return np.triu_indices(n if self.curved else 0)
+
+    @property
+    def count(self) -> int:
+        """How many columns there are, products among them."""
+        return self.spread.shape[1] + len(self.pairs[0])
+
+    def squared(self, rows: Rows) -> tuple[Any, Rows]:
+        """`(r . w)^2` for each row: its constant, and its coefficients of the products."""
+        i, j = self.pairs
+        products = rows[:, i] * rows[:, j] * np.where(i == j, 0.5, 2.0)
+        return (rows**2).sum(axis=1) / 2, products
+
+    def curved_ends(self, rows: Rows) -> Ends:
+        """Bounds of each row over all columns, products among them, by the formulas above."""
+        n, error = self.spread.shape[1], gamma(4 * rows.shape[1] + 16)
+        size = abs(rows).sum(axis=1)
+        rest = abs(rows[:, n:]).sum(axis=1)
+        below, above = self.ends(rows[:, :n])
+        if not self.round:
+            above = smaller(above + rest, _highest(rows, self.pairs))
+            below = larger(below - rest, -_highest(-rows, self.pairs))
+        else:
+            below, above = below - rest, above + rest
+        return below - constant(error * size), above + constant(error * size)
 
     def norms(self, rows: Rows) -> Any:
         """What `r . w` does not exceed for each row, whatever the cut."""
@@ -97,6 +141,27 @@ class InitialColumns:
         lower = least - at - constant((error + gamma(4) * abs(least)) * (1 + gamma(n)))
         upper = most - at + constant((error + gamma(4) * abs(most)) * (1 + gamma(n)))
         return larger(-norms, lower), smaller(norms, upper)
+
+
+def _highest(rows: Rows, pairs: tuple[np.ndarray, np.ndarray]) -> Any:
+    """The largest value of each row over the box, as above; plain rounding."""
+    xp, n = namespace(rows), int(pairs[1].max(initial=-1)) + 1
+    linear, signs = list(abs(rows[:, :n]).T), xp.where(rows[:, :n] < 0, -1.0, 1.0)
+    total, squares = 0.0, {}
+    for i, j, q in zip(*pairs, rows[:, n:].T, strict=True):
+        if i == j:
+            squares[i] = q
+            continue
+        total = total + abs(q)
+        against = q * signs[:, i] * signs[:, j] < 0
+        taken = xp.where(against, smaller(abs(q), smaller(linear[i], linear[j])), 0.0)
+        linear[i], linear[j] = linear[i] - taken, linear[j] - taken
+    for i, g in enumerate(linear):
+        q = squares[i]
+        inside = (q < 0) & (g < -4 * q)
+        depth = xp.where(inside, -q, 1.0)
+        total = total + xp.where(inside, g**2 / (8 * depth) + depth, g + q)
+    return total
 
 
 def _of_box(box: Box, cut: PolyhedralSet | None) -> InitialColumns:

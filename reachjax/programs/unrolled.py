@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.programs.affine import AffineForms
-from reachjax.programs.affine_steps import UnitForms, step_forms
+from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
 from reachjax.programs.initial import InitialColumns, constant
 from reachjax.sets import AbstractSet, Box
 
@@ -65,13 +65,13 @@ def unrolled(
     """
     loop, X0, box, known = jax.device_get((loop, X0, box, known))
     with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
-        start = InitialColumns.of(X0, box)
+        start = InitialColumns.of(X0, box, loop.curved)
         state = AffineForms.beginning(start)
     for k, rows in enumerate(np.asarray(directions)):
         with np.errstate(all="ignore"):
             given = None if slopes is None else np.asarray(slopes[k])
             held = None if known is None else known[k]
-            state, units = step_forms(loop, state, t + k, start, slopes=given, known=held)
+            state, units, _ = step_forms(loop, state, t + k, start, slopes=given, known=held)
             found = _bounds(rows @ state, units, start)
         yield found
 
@@ -88,18 +88,19 @@ def unrolled_at_once(
 
     A polytope counts as the box around it.
     """
-    start = InitialColumns.of(X0, box)
-    n, steps = loop.states, len(directions)
-    more = loop.units + n  # columns of one step
+    start = InitialColumns.of(X0, box, loop.curved)
+    (more, between), steps = step_columns(loop), len(directions)
+    first, end = start.count, start.count + steps * more
 
     # a derivative computes a step again: storing what it needs of it is most of what is compiled
     @partial(jax.checkpoint, prevent_cse=False)
     def advance(state: AffineForms, step: tuple[Array, Array]) -> tuple[AffineForms, ByForms]:
         k, rows = step
-        state, units = step_forms(loop, state, t + k, start, place=n + k * more)
+        place = first + k * more
+        state, units, _ = step_forms(loop, state, t + k, start, place=place, scratch=end)
         return state, _bounds(rows @ state, units, start)
 
-    state = AffineForms.beginning(start, n + steps * more)
+    state = AffineForms.beginning(start, end + between)
     return jax.lax.scan(advance, state, (jnp.arange(steps), directions))[1]
 
 

@@ -77,7 +77,7 @@ class Replay(Replaceable):
                 for which in range(2)
             )
         step, unit, kind = horizon.origins.T
-        of_units, of_set = step >= 0, step < 0
+        of_units, of_set = step >= 0, step == -1
         found = np.zeros((facets, steps, kind.max(initial=0) + 1, units))
         found[:, step[of_units], kind[of_units], unit[of_units]] = multipliers[:, of_units]
         initial = columns[:, : horizon.start.spread.shape[1]]

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import is_concrete, owned
+from reachjax.programs.unrolled import unrolled_at_once
 from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import SolverStatus
@@ -80,6 +81,7 @@ def sets_by_branching(
             ladder.spend(int(np.sum(proof.nodes)))
             work -= len(proof.by_products) * ladder.width**4
         ladder.horizon.narrow(*_ends(*_fixed(X)))
+    by_forms = _by_forms(setting, X0, box, template, horizon)
     left = (horizon - len(known)) / horizon
     ladder.grant(left * of_programs)
     work = max(work, left * PRODUCTS)
@@ -101,12 +103,19 @@ def sets_by_branching(
                 f"the loop's states at t = {setting.start + k} overflow or are not numbers: check "
                 "the weights of loop.controller and the entries of loop.plant"
             )
-        offsets = _offsets(setting, X0, box, directions, climbed, ladder, horizon, k)
+        offsets = proved = owned(climbed.bounds)
+        if not is_concrete(setting.loop, X0, directions):
+            if by_forms is not None:
+                moving = by_forms[k - 1]
+            else:
+                moving = _replayed(setting, X0, box, directions, climbed, ladder, horizon, k)
+            moving = jnp.where(jnp.isfinite(moving), moving, 0.0)  # what overflows has none
+            offsets = proved + (moving - jax.lax.stop_gradient(moving))
         gaps = climbed.bounds - climbed.attained
         opened = np.flatnonzero(gaps > setting.gap * ranges)
         opened = opened[np.argsort(-gaps[opened], kind="stable")]
         products = None
-        if ladder.width <= LARGEST and time.monotonic() < end:
+        if ladder.width <= LARGEST and not loop.curved and time.monotonic() < end:
             cost = ladder.width**4
             opened = opened[: int(min(work / cost, len(opened)))]
             work -= len(opened) * cost
@@ -122,7 +131,7 @@ def sets_by_branching(
         ladder.horizon.narrow(*_ends(*_fixed(X)))
 
 
-def _offsets(
+def _replayed(
     setting: Setting,
     X0: AbstractSet,
     box: Box,
@@ -132,14 +141,24 @@ def _offsets(
     horizon: int,
     k: int,
 ) -> Float[Array, " f"]:
-    """What is proved, with its derivative where it is asked for."""
-    proved = owned(climbed.bounds)
-    if is_concrete(setting.loop, X0, directions):
-        return proved
+    """Numbers with the derivatives of what is proved, as of trajectories that attain it."""
     held = Replay.of(ladder.horizon, *ladder.settled(climbed), horizon)
-    moving = replayed(setting.loop, X0, box, directions, held, k, setting.start)
-    moving = jnp.where(jnp.isfinite(moving), moving, 0.0)  # what overflows has no derivative
-    return proved + (moving - jax.lax.stop_gradient(moving))
+    return replayed(setting.loop, X0, box, directions, held, k, setting.start)
+
+
+def _by_forms(
+    setting: Setting, X0: AbstractSet, box: Box, template: Template, horizon: int
+) -> Float[Array, "N f"] | None:
+    """Numbers with the derivatives of what affine forms prove: about all of the bounds.
+
+    None where bounds are attained, and none are asked for.
+    """
+    directions = template.directions[:horizon]
+    if is_concrete(setting.loop, X0, directions) or not setting.loop.curved:
+        return None
+    if template.steps is None:
+        directions = jnp.broadcast_to(template.directions, (horizon, *template.directions.shape))
+    return unrolled_at_once(setting.loop, X0, box, directions, setting.start).offsets
 
 
 def _with_products(

@@ -52,6 +52,20 @@ def smaller(one: Any, other: Any) -> Any:
     return namespace(one, other).where(one > other, other, one)
 
 
+def settled(parts: Any) -> Any:
+    """One rounding of numbers for all that is made of them, whatever a compiler fuses.
+
+    They define what a column stands for, which must be the same wherever it is.
+    """
+    on_host = namespace(*jax.tree.leaves(parts)) is np
+    return parts if on_host else jax.lax.optimization_barrier(parts)
+
+
+def constant(numbers: Any) -> Any:
+    """What derivatives take for a constant: what rounding may add does not depend on anything."""
+    return jax.lax.stop_gradient(numbers) if namespace(numbers) is not np else numbers
+
+
 def gamma(operations: int) -> float:
     """Relative error bound of `operations` rounded operations, with some to spare."""
     count = (operations + 8) * UNIT

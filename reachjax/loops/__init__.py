@@ -5,7 +5,23 @@ from reachjax.loops.discretisation import runge_kutta, zero_order_hold
 from reachjax.loops.networks import MLP, AbstractNetwork, Network
 from reachjax.loops.plants import AbstractPlant, AffinePlant, NonlinearPlant
 from reachjax.loops.residual import Residual
-from reachjax.loops.units import AbstractActivation, AbstractUnit, HardTanh, LeakyReLU, ReLU
+from reachjax.loops.units import (
+    AbstractActivation,
+    AbstractUnit,
+    Atan,
+    Cos,
+    Exp,
+    HardTanh,
+    LeakyReLU,
+    Log,
+    Reciprocal,
+    ReLU,
+    Sigmoid,
+    Sin,
+    Sqrt,
+    Square,
+    Tanh,
+)
 
 __all__ = [
     "MLP",
@@ -14,13 +30,23 @@ __all__ = [
     "AbstractPlant",
     "AbstractUnit",
     "AffinePlant",
+    "Atan",
     "ClosedLoop",
+    "Cos",
+    "Exp",
     "HardTanh",
     "LeakyReLU",
+    "Log",
     "Network",
     "NonlinearPlant",
     "ReLU",
+    "Reciprocal",
     "Residual",
+    "Sigmoid",
+    "Sin",
+    "Sqrt",
+    "Square",
+    "Tanh",
     "runge_kutta",
     "zero_order_hold",
 ]

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from reachjax.loops.units import AbstractActivation, HardTanh, LeakyReLU, ReLU
+from reachjax.loops.units import AbstractActivation, HardTanh, LeakyReLU, ReLU, Sigmoid, Tanh
 from reachjax.numerics.checks import is_concrete
 
 ADVICE = "give its layers by MLP.from_layers"
@@ -42,7 +42,9 @@ def read_activation(activation: Any) -> Any:
         return activation
     with jax.ensure_compile_time_eval():
         leak = -float(np.asarray(activation(jnp.asarray(-1.0))))
-        known = [ReLU(), HardTanh(), *([LeakyReLU(leak)] if 0 <= leak < 1 else [])]
+        known = [ReLU(), HardTanh(), Tanh(), Sigmoid()]
+        if 0 <= leak < 1:
+            known.append(LeakyReLU(leak))
         for each in known:
             if _agree(activation, each):
                 return each

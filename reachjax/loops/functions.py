@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from reachjax.loops.primitives import Equation, Unsupported, recorded
+from reachjax.loops.primitives import Equation, UnsupportedError, recorded
 from reachjax.loops.recording import Operand, Recorder, Value
 from reachjax.loops.units import AtUnit, evaluate
-from reachjax.numerics.checks import described
+from reachjax.numerics.checks import described, is_concrete
 from reachjax.numerics.pytrees import pytree, static
 
 Sizes = tuple[int, ...]
@@ -42,7 +42,7 @@ class Structure(NamedTuple):
 
 
 class _Held:
-    """An array that is no number to be differentiated, such as a key: the same if it is the same."""
+    """An array that is no number to be differentiated, such as a key."""
 
     def __init__(self, array: Any):
         self.array = array
@@ -79,7 +79,8 @@ class Function:
         leaves, tree = jax.tree.flatten(function)
         numbers = [_is_float(leaf) for leaf in leaves]
         parameters = tuple(
-            jnp.asarray(leaf, float) for leaf, is_number in zip(leaves, numbers, strict=True)
+            jnp.asarray(leaf, float)
+            for leaf, is_number in zip(leaves, numbers, strict=True)
             if is_number
         )
         others = tuple(
@@ -206,15 +207,15 @@ def _equation(recorder: Recorder, equation: Any, operands: Sequence[Operand]) ->
             return _unrolled(recorder, params, operands)
         if name == "cond":
             which, *given = operands
-            if hasattr(which, "place") or isinstance(which, jax.core.Tracer):
-                raise Unsupported("which branch is taken must not depend on inputs")
+            if hasattr(which, "place") or not is_concrete(which):
+                raise UnsupportedError("which branch is taken must not depend on inputs")
             return _walked(recorder, params["branches"][int(which)], given)
         for inner in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
             if inner in params:
                 return _walked(recorder, params[inner], operands)
         found = recorded(recorder, Equation(equation), operands)
         return found if isinstance(found, list) else [found]
-    except Unsupported as reason:
+    except UnsupportedError as reason:
         raise TypeError(
             f"the primitive {name!r}{_line(equation)} cannot be certified: {reason}"
         ) from None

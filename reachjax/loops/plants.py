@@ -186,8 +186,9 @@ class NonlinearPlant(AbstractPlant):
     def __init__(self, f: Any, states: int | None = None, inputs: int | None = None):
         if not isinstance(f, Function):
             name = "NonlinearPlant"
-            n, m = whole_number(f"{name}.states", states, 1), whole_number(
-                f"{name}.inputs", inputs, 1
+            n, m = (
+                whole_number(f"{name}.states", states, 1),
+                whole_number(f"{name}.inputs", inputs, 1),
             )
             f = Function.of(f, (n, m), n, f"{name}.f")
         self._set(f=f)

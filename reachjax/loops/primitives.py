@@ -50,34 +50,47 @@ class Equation:
         return jax.tree.map(np.asarray, found) if is_known(found) else found
 
 
-class Unsupported(Exception):
+class UnsupportedError(Exception):
     """That a primitive cannot be certified, and what to do."""
 
 
+# fmt: off
 DISCONTINUOUS = (
-    "sign round floor ceil argmax argmin sort is_finite rem and or not xor nextafter "
-    "shift_left reduce_and reduce_or top_k"
-).split()
+    "sign", "round", "floor", "ceil", "argmax", "argmin", "sort", "is_finite", "rem", "and",
+    "or", "not", "xor", "nextafter", "shift_left", "reduce_and", "reduce_or", "top_k",
+)
+"""Primitives that jump."""
+
+MOVING = (
+    "reshape", "squeeze", "expand_dims", "transpose", "broadcast_in_dim", "slice", "rev",
+    "dynamic_slice", "gather", "split",
+)
+"""Primitives that only move entries."""
+# fmt: on
 
 
 def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
     """The value, or a list of them, of one equation.
 
     Raises:
-        Unsupported: there is no rule for it.
+        UnsupportedError: there is no rule for it.
     """
     if not any(isinstance(each, Value | Comparison) for each in operands):
         return equation.evaluate(*operands)
     rule = RULES.get(equation.name)
     if any(isinstance(each, Comparison) for each in operands) and rule is not _selected:
-        raise Unsupported(
+        raise UnsupportedError(
             "a comparison of numbers may only choose between two of them that agree where it "
             "changes, as jnp.where(y > 0, y, 0.1 * y) does"
         )
     if rule is None and equation.name in DISCONTINUOUS:
-        raise Unsupported("it is discontinuous: bounds of what follows would be those of its range")
+        raise UnsupportedError(
+            "it is discontinuous: bounds of what follows would be those of its range"
+        )
     if rule is None:
-        raise Unsupported("there are no bounds for it: write it with primitives that have some")
+        raise UnsupportedError(
+            "there are no bounds for it: write it with primitives that have some"
+        )
     return rule(recorder, equation, operands)
 
 
@@ -109,15 +122,17 @@ def _moved(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) 
     """Primitives that only move entries: done to their numbers."""
     value, *others = operands
     if not isinstance(value, Value) or not all(map(is_known, others)):
-        raise Unsupported("which entries it takes must not depend on inputs or traced parameters")
+        raise UnsupportedError(
+            "which entries it takes must not depend on inputs or traced parameters"
+        )
     with jax.ensure_compile_time_eval():
         numbers = jnp.arange(value.size).reshape(value.shape)
         moved = equation.evaluate(numbers, *others)
     if isinstance(moved, list | tuple):
         return [recorder.picked(value, np.asarray(part)) for part in moved]  # type: ignore[return-value]
     index = np.asarray(moved)
-    if index.size and not (0 <= index.min() and index.max() < value.size):
-        raise Unsupported("it takes entries that there are not")
+    if index.size and not (index.min() >= 0 and index.max() < value.size):
+        raise UnsupportedError("it takes entries that there are not")
     return recorder.picked(value, index)
 
 
@@ -152,7 +167,7 @@ def _linear(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
 def _padded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
     value, around = operands
     if isinstance(around, Value) or not is_known(around) or np.asarray(around) != 0:
-        raise Unsupported("it must pad with zeros")
+        raise UnsupportedError("it must pad with zeros")
     return _linear(recorder, equation, [value, np.asarray(around)])
 
 
@@ -186,12 +201,12 @@ def _contracted(recorder: Recorder, equation: Equation, operands: Sequence[Opera
 
 @_entrywise
 def _sum(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    return recorder.added(*operands)
+    return recorder.added(operands[0], operands[1])
 
 
 @_entrywise
 def _difference(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    return recorder.added(*operands, -1)
+    return recorder.added(operands[0], operands[1], -1)
 
 
 @_entrywise
@@ -233,7 +248,7 @@ def _integer_power(recorder: Recorder, equation: Equation, operands: Sequence[Op
 def _power(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
     value, power = operands
     if isinstance(power, Value) or not is_known(power) or len(np.unique(power)) != 1:
-        raise Unsupported("the exponent must be one known number")
+        raise UnsupportedError("the exponent must be one known number")
     exponent = float(np.unique(power)[0])
     if exponent.is_integer():
         return _raised(recorder, value, int(exponent))
@@ -264,7 +279,7 @@ def _smallest(recorder: Recorder, equation: Equation, operands: Sequence[Operand
 def _clamped(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
     least, value, most = operands
     if not isinstance(value, Value) or isinstance(least, Value) or isinstance(most, Value):
-        raise Unsupported("its limits must be constants: use jnp.minimum and jnp.maximum")
+        raise UnsupportedError("its limits must be constants: use jnp.minimum and jnp.maximum")
     low, high = (each.reshape(-1) for each in (least, most))
     place = value.place
     return recorder._added(value.shape, lambda found, unit: clipped(found[place], low, high, unit))
@@ -307,18 +322,22 @@ def _whether_different(
     one, other = operands
     if isinstance(one, Value) and isinstance(other, Value) and one.place == other.place:
         return np.full(equation.shape, equation.name == "eq")
-    raise Unsupported("it is discontinuous: bounds of what follows would be those of its range")
+    raise UnsupportedError(
+        "it is discontinuous: bounds of what follows would be those of its range"
+    )
 
 
 def _selected(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
     which, *cases = operands
     if not isinstance(which, Comparison):
         if isinstance(which, Value):
-            raise Unsupported("what is chosen must not depend on numbers that depend on inputs")
+            raise UnsupportedError(
+                "what is chosen must not depend on numbers that depend on inputs"
+            )
         cases = [_same_shape(recorder, each, equation.shape) for each in cases]
         return _chosen(recorder, np.asarray(which) if is_known(which) else which, cases)
     if len(cases) != 2:
-        raise Unsupported("it must choose between two numbers")
+        raise UnsupportedError("it must choose between two numbers")
     condition = _same_shape(recorder, which.value, equation.shape)
     below, above = (_same_shape(recorder, each, equation.shape) for each in cases)
     return _bent(recorder, condition, below, above)
@@ -332,11 +351,15 @@ def _chosen(recorder: Recorder, which: Any, cases: Sequence[Operand]) -> Value:
         which = np.broadcast_to(np.asarray(which, int), cases[0].shape)
         return recorder.picked(joined, which * count + np.arange(count).reshape(which.shape))
     total: Any = None
+    part: Any
     for number, each in enumerate(cases):
         weight = jnp.broadcast_to(which == number, each.shape).astype(float)
         part = recorder.scaled(each, weight) if isinstance(each, Value) else weight * each
         both = isinstance(total, Value) or isinstance(part, Value)
-        total = part if total is None else recorder.added(total, part) if both else total + part
+        if total is None:
+            total = part
+        else:
+            total = recorder.added(total, part) if both else total + part
     return total
 
 
@@ -357,7 +380,7 @@ def _bent(recorder: Recorder, condition: Value, below: Operand, above: Operand) 
                 slope = np.broadcast_to(slope, (condition.size,)).reshape(condition.shape)
                 bend = recorder.scaled(recorder.rectified(condition), slope)
                 return recorder.added(bend, below)
-    raise Unsupported(
+    raise UnsupportedError(
         "where values are chosen by a comparison, both must be affine in what is compared and "
         "agree where it changes, as in jnp.where(y > 0, y, 0.1 * y): use jnp.maximum, jnp.minimum "
         "or jnp.clip"
@@ -404,7 +427,7 @@ def _negated(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
 
 def _cast(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
     if equation.kind != np.float64:
-        raise Unsupported(
+        raise UnsupportedError(
             f"it rounds to {equation.kind}: compute in 64-bit floats, for example by not giving "
             "layers a dtype"
         )
@@ -416,17 +439,13 @@ def _itself(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
 
 
 RULES: dict[str, Rule] = {
-    **dict.fromkeys(
-        "reshape squeeze expand_dims transpose broadcast_in_dim slice rev dynamic_slice gather "
-        "split".split(),
-        _moved,
-    ),
+    **dict.fromkeys(MOVING, _moved),
     **dict.fromkeys(("concatenate", "stack"), _joined),
     **dict.fromkeys(
-        "reduce_sum cumsum conv_general_dilated reduce_window_sum".split(),
+        ["reduce_sum", "cumsum", "conv_general_dilated", "reduce_window_sum"],
         _linear,
     ),
-    **dict.fromkeys("copy copy_p stop_gradient optimization_barrier".split(), _itself),
+    **dict.fromkeys(["copy", "copy_p", "stop_gradient", "optimization_barrier"], _itself),
     "convert_element_type": _cast,
     "pad": _padded,
     "dot_general": _contracted,

@@ -17,7 +17,7 @@ from jaxtyping import Int
 from reachjax.loops.units import AbstractUnit, AtUnit, ReLU
 from reachjax.loops.units.powers import Square
 from reachjax.numerics.checks import is_concrete
-from reachjax.numerics.rounding import namespace
+from reachjax.numerics.rounding import Ball, namespace
 
 Shape = tuple[int, ...]
 
@@ -88,7 +88,7 @@ class Recorder:
         self._count += 1
         return Value(self._count - 1, shape, link)
 
-    def picked(self, value: Value, index: Int[np.ndarray, "..."]) -> Value:
+    def picked(self, value: Value, index: Int[np.ndarray, ...]) -> Value:
         """Entries of a value, by their numbers in the flat vector, as an array of that shape."""
         place, flat = value.place, np.asarray(index).ravel()
         if np.array_equal(flat, np.arange(value.size)):
@@ -117,7 +117,7 @@ class Recorder:
         if not isinstance(other, Value):
             return self.shifted(one, sign * other)
         if not isinstance(one, Value):
-            return self.shifted(other if sign > 0 else self.scaled(other, -1.0), one)
+            return self.shifted(other if sign > 0 else self.scaled(other, np.array(-1.0)), one)
         link, first, second = None, one.place, other.place
         if shared := common(one, other):
             by_one, by_other = shared
@@ -164,14 +164,14 @@ class Recorder:
             return self.unit(Square(), one)
         total, difference = self.added(one, other), self.added(one, other, -1)
         squares = [self.unit(Square(), part) for part in (total, difference)]
-        found = self.scaled(self.added(*squares, -1), 0.25)
+        found = self.scaled(self.added(squares[0], squares[1], -1), np.array(0.25))
         first, second, third = one.place, other.place, found.place
 
         def met(numbers: list[Any], unit: AtUnit) -> Any:
-            # some kinds know more of a product than the difference of two squares tells
-            product = numbers[third]
-            meet = getattr(product, "meeting_product", None)
-            return product if meet is None else meet(numbers[first], numbers[second])
+            squares, factors = numbers[third], (numbers[first], numbers[second])
+            # the difference of two squares forgets what a product of intervals knows
+            known = type(squares) is Ball and all(type(each) is Ball for each in factors)
+            return squares.meeting(factors[0].times(factors[1])) if known else squares
 
         return self._added(one.shape, met)
 

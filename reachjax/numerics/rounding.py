@@ -52,6 +52,20 @@ def smaller(one: Any, other: Any) -> Any:
     return namespace(one, other).where(one > other, other, one)
 
 
+def settled(parts: Any) -> Any:
+    """One rounding of numbers for all that is made of them, whatever a compiler fuses.
+
+    They define what a column stands for, which must be the same wherever it is.
+    """
+    on_host = namespace(*jax.tree.leaves(parts)) is np
+    return parts if on_host else jax.lax.optimization_barrier(parts)
+
+
+def constant(numbers: Any) -> Any:
+    """What derivatives take for a constant: what rounding may add does not depend on anything."""
+    return jax.lax.stop_gradient(numbers) if namespace(numbers) is not np else numbers
+
+
 def gamma(operations: int) -> float:
     """Relative error bound of `operations` rounded operations, with some to spare."""
     count = (operations + 8) * UNIT
@@ -179,3 +193,14 @@ class Ball:
 
     def __getitem__(self, index) -> Self:
         return type(self)(self.mid[index], self.rad[index])
+
+    def meeting(self, other: Self) -> Self:
+        """Numbers that both hold."""
+        lower = larger(self.lower, other.lower)
+        return type(self).between(lower, larger(lower, smaller(self.upper, other.upper)))
+
+    def times(self, other: Self) -> Self:
+        """Products, entry by entry: `|a b - m n| <= |m| s + |n| r + r s`."""
+        mid = self.mid * other.mid
+        spread = abs(self.mid) * other.rad + abs(other.mid) * self.rad + self.rad * other.rad
+        return self._rebuilt(mid, spread * (1 + gamma(4)), gamma(1) * abs(mid) + TINY)

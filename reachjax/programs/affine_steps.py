@@ -5,9 +5,9 @@ the initial state and `|g w| <= S`, `|h| <= R` for what else there is,
 
     f(y) = p + s d + q (g w)^2 + e v,    |v| <= 1,    e = (error of the model) + |q| (2 S R + R^2),
 
-and `(g w)^2` is a row over products of the `w`, which are columns too (`initial`). What the units of
-a smooth controller leave out is summed up at its outputs, one column for each: a step adds as many
-columns for ten neurons as for a thousand. They stay columns, which the feedback contracts.
+and `(g w)^2` is a row over products of the `w`, which are columns too (`initial`). What the units
+of a smooth controller leave out is summed up at its outputs, one column for each: a step adds as
+many columns for ten neurons as for a thousand. They stay columns, which the feedback contracts.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def step_forms(
     """
     found: list[UnitForms] = []
     done, width, merging = 0, state.columns.shape[1], loop.smooth_controller
-    free = place if not merging else scratch
+    free = scratch if merging and place is not None else place
 
     def apply(unit: AbstractUnit, y: AffineForms) -> AffineForms:
         nonlocal done, width, free
@@ -134,12 +134,11 @@ def step_forms(
         ends = _cut(unit, y, start)
         if ranges is not None:
             ends = ranges(unit, y, ends, found)
-        own = None if place is None else free
         if isinstance(unit, SmoothUnit):
-            z, forms = _smooth(unit, y, ends, own, start)
+            z, forms = _smooth(unit, y, ends, free, start)
         else:
-            z, forms = _unit(unit, y, ends, own, slope)
-        if place is not None:
+            z, forms = _unit(unit, y, ends, free, slope)
+        if free is not None:
             free = free + len(y.rows)
         width = z.columns.shape[1]
         found.append(forms)

@@ -65,9 +65,11 @@ def loop_bounds(
             also = known[done : done + len(y.mid)]
             lower = jnp.maximum(y.lower, also.lower)
             y = Ball.between(lower, jnp.maximum(lower, jnp.minimum(y.upper, also.upper)))
-        z = Ball.between(*unit.interval(y.lower, y.upper))
         # the ends of `y` may be rounded differently where the midpoint and the radius are formed
         rounding = gamma(8) * (abs(y.mid) + y.rad)
+        if not unit.nonexpansive:
+            y, rounding = Ball(y.mid, y.rad + 2 * rounding), jnp.zeros_like(rounding)
+        z = Ball.between(*unit.interval(y.lower, y.upper))
         lines = unit.lines(y.lower, y.upper)
         constant = lines.affine & (lines.above.slope == 0)
         mid = jnp.where(constant, lines.above.offset, z.mid)

@@ -236,9 +236,9 @@ def _left_out(each: UnitForms | Merged) -> bool:
 def _fill(
     found: Float[np.ndarray, " n"],
     outputs: AffineForms,
-    gap: np.ndarray,
-    places: np.ndarray,
-    values: np.ndarray,
+    gap: Any,
+    places: Any,
+    values: Any,
 ) -> None:
     """Set the columns that numbers have of their own, from their values and all other columns."""
     here = np.flatnonzero(places >= 0)

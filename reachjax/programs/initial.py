@@ -8,8 +8,8 @@ the set is smaller than `q + M w`, a set `S` that also holds it cuts off more: f
 
 since `x_0` is in `S`; `a = r M^+` leaves nothing over but rounding.
 
-Where a loop has smooth units, products of the `w` are columns too, `2 w_i^2 - 1` and `w_i w_j`, all of
-them in `[-1, 1]`: forms over both are polynomials of degree two of the initial state. Over the box
+Where a loop has smooth units, products of the `w` are columns too, `2 w_i^2 - 1` and `w_i w_j`, all
+in `[-1, 1]`: forms over both are polynomials of degree two of the initial state. Over the box
 
     g w + q (2 w^2 - 1)  <=  g^2 / (8 |q|) + |q|  if q < 0 and |g| <= 4 |q|,  else |g| + q,
 
@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.pytrees import Replaceable, pytree, static
-from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
+from reachjax.numerics.rounding import Ball, constant, gamma, larger, namespace, settled, smaller
 from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
 from reachjax.sets.polyhedra import support
 
@@ -183,20 +183,6 @@ def _of_ball(ball: Ellipsoid, cut: PolyhedralSet | None) -> InitialColumns:
 def _ball_map(ball: Ellipsoid) -> tuple[Array, Array, Array]:
     spread = ball.from_ball()
     return settled((ball.center, spread, jax.numpy.linalg.inv(spread)))
-
-
-def settled(parts: Any) -> Any:
-    """One rounding of numbers for all that is made of them, whatever a compiler fuses.
-
-    They define what a column stands for, which must be the same wherever it is.
-    """
-    on_host = namespace(*jax.tree.leaves(parts)) is np
-    return parts if on_host else jax.lax.optimization_barrier(parts)
-
-
-def constant(numbers: Any) -> Any:
-    """What derivatives take for a constant: what rounding may add does not depend on anything."""
-    return jax.lax.stop_gradient(numbers) if namespace(numbers) is not np else numbers
 
 
 def _ends(cut: PolyhedralSet, directions: Rows) -> Ends:

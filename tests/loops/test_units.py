@@ -136,6 +136,8 @@ def test_a_slope_that_is_none_is_refused(slope, error, message):
         (nnx.leaky_relu, rj.LeakyReLU(0.01)),
         (partial(nnx.leaky_relu, negative_slope=0.3), rj.LeakyReLU(0.3)),
         (nnx.hard_tanh, rj.HardTanh()),
+        (nnx.tanh, rj.Tanh()),
+        (nnx.sigmoid, rj.Sigmoid()),
     ],
 )
 def test_flax_functions_are_read_as_the_activation_that_computes_them(function, activation):
@@ -151,5 +153,5 @@ def test_flax_functions_are_read_as_the_activation_that_computes_them(function, 
 
 def test_a_function_that_is_no_activation_is_named():
     module = nnx.Sequential(nnx.Linear(2, 1, rngs=nnx.Rngs(0)))
-    with pytest.raises(ValueError, match=r"what one of ReLU, HardTanh.* does, but .*tanh"):
-        rj.MLP.from_flax(module, activation=nnx.tanh)
+    with pytest.raises(ValueError, match=r"what one of ReLU, HardTanh.* does, but .*softplus"):
+        rj.MLP.from_flax(module, activation=nnx.softplus)

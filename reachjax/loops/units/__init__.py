@@ -13,23 +13,44 @@ from reachjax.loops.units.base import (
     evaluate,
 )
 from reachjax.loops.units.clip import clipped
+from reachjax.loops.units.exponential import Exp, Log
+from reachjax.loops.units.extremes import absolute, maximum, minimum
 from reachjax.loops.units.hard_tanh import HardTanh
+from reachjax.loops.units.hyperbolic import Sigmoid, Tanh
 from reachjax.loops.units.leaky_relu import LeakyReLU
+from reachjax.loops.units.powers import Reciprocal, Sqrt, Square
 from reachjax.loops.units.relu import ReLU
+from reachjax.loops.units.smooth import Quadratic, SmoothUnit
+from reachjax.loops.units.trigonometric import Atan, Cos, Sin
 
 __all__ = [
     "AbstractActivation",
     "AbstractUnit",
     "AtUnit",
+    "Atan",
     "Block",
+    "Cos",
+    "Exp",
     "Facts",
     "HardTanh",
     "LeakyReLU",
     "Line",
     "Lines",
+    "Log",
     "Mark",
     "Product",
+    "Quadratic",
     "ReLU",
+    "Reciprocal",
+    "Sigmoid",
+    "Sin",
+    "SmoothUnit",
+    "Sqrt",
+    "Square",
+    "Tanh",
+    "absolute",
     "clipped",
     "evaluate",
+    "maximum",
+    "minimum",
 ]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import abc
 import enum
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
@@ -118,8 +118,12 @@ class AbstractActivation(abc.ABC):
 class AbstractUnit(AbstractActivation):
     """One relation `z = f(y)`, which adds one column to a basis.
 
-    `f` is nonexpansive, `|f(y) - f(y')| <= |y - y'|`; bounds rely on it where inputs are rounded.
+    Attributes:
+        nonexpansive: whether `|f(y) - f(y')| <= |y - y'|`. Bounds of a step rely on it where inputs
+            are rounded, and take no other units.
     """
+
+    nonexpansive: ClassVar[bool] = True
 
     @abc.abstractmethod
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:

@@ -1,0 +1,130 @@
+"""Square, square root and reciprocal."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from reachjax.loops.units.smooth import POLE, SLACK, Quadratic, SmoothUnit, nearest
+from reachjax.numerics.rounding import TINY, constant, gamma, larger, namespace, settled, smaller
+
+
+@dataclasses.dataclass(frozen=True)
+class Square(SmoothUnit):
+    """`y^2`.
+
+    Example:
+        >>> import numpy as np
+        >>> [end.round(3).tolist() for end in Square().interval(np.array([-1.0]), np.array([2.0]))]
+        [[0.0], [4.0]]
+    """
+
+    nonexpansive = False
+    image = (0.0, math.inf)
+
+    def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`y^2`."""
+        return y * y
+
+    def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`2 y`."""
+        return 2 * y
+
+    def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
+        """`2 y = s` at `s / 2`."""
+        return (slope / 2,)
+
+    def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
+        """`f''' = 0`."""
+        return namespace(lower, upper).zeros_like(lower)
+
+    @np.errstate(all="ignore")
+    def quadratic(self, lower: Array, upper: Array) -> Quadratic:
+        """`c^2 + 2 c (y - c) + (y - c)^2`, of which only `c^2` is rounded."""
+        xp, center = namespace(lower, upper), settled(lower / 2 + upper / 2)
+        offset = settled(center * center)
+        gap = gamma(1) * constant(offset) + TINY
+        known = self.defined(lower, upper) & (gap < math.inf)
+        middle, offset, one = (xp.where(known, each, 0.0) for each in (center, offset, 1.0))
+        return Quadratic(middle, offset, 2 * middle, one, xp.where(known, gap, math.inf))
+
+
+@dataclasses.dataclass(frozen=True)
+class Sqrt(SmoothUnit):
+    """`sqrt y` where `y >= 0`.
+
+    Example:
+        >>> import numpy as np
+        >>> [end.round(3).tolist() for end in Sqrt().interval(np.array([0.0]), np.array([4.0]))]
+        [[0.0], [2.0]]
+    """
+
+    nonexpansive = False
+    image = (0.0, math.inf)
+    flushed = 2.0**-510  # roots of what compiled code takes for 0
+
+    def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`sqrt y`, with derivative 0 at 0, where it has none."""
+        xp = namespace(y)
+        return xp.where(y == 0, 0.0, xp.sqrt(xp.where(y == 0, 1.0, y)))
+
+    def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
+        """Where no input is negative."""
+        return (lower >= 0) & (upper < math.inf)
+
+    def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`1 / (2 sqrt y)`."""
+        xp = namespace(y)
+        return xp.where(y == 0, math.inf, 0.5 / xp.sqrt(xp.where(y == 0, 1.0, y)))
+
+    def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
+        """`1 / (2 sqrt y) = s` at `1 / (2 s)^2`."""
+        root = 0.5 / slope
+        return (root * root,)
+
+    def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
+        """`f''' = 3/8 y^(-5/2)`, which decreases."""
+        xp, known = namespace(lower, upper), lower > POLE
+        y = xp.where(known, smaller(lower, 1 / POLE), 1.0)
+        return xp.where(known, 0.375 / (y * y * xp.sqrt(y)) * (1 + SLACK) + TINY, math.inf)
+
+
+@dataclasses.dataclass(frozen=True)
+class Reciprocal(SmoothUnit):
+    """`1 / y`, on intervals on either side of 0.
+
+    Example:
+        >>> import numpy as np
+        >>> lower, upper = np.array([-2.0, -1.0]), np.array([-1.0, 1.0])
+        >>> [end.round(3).tolist() for end in Reciprocal().interval(lower, upper)]
+        [[-1.0, -inf], [-0.5, inf]]
+    """
+
+    nonexpansive = False
+
+    def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`1 / y`."""
+        return 1 / y
+
+    def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
+        """Where all inputs are positive, or all are negative."""
+        return (nearest(lower, upper) >= TINY) & super().defined(lower, upper)
+
+    def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`-1 / y^2`."""
+        return -1 / (y * y)
+
+    def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
+        """`-1 / y^2 = s` at `1 / sqrt(-s)` and its negative."""
+        point = 1 / namespace(slope, lower).sqrt(larger(-slope, TINY))
+        return point, -point
+
+    def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
+        """`|f'''| = 6 / y^4`, largest where `|y|` is smallest."""
+        xp, size = namespace(lower, upper), nearest(lower, upper)
+        known = size > POLE
+        y = xp.where(known, smaller(size, 1 / POLE), 1.0)
+        return xp.where(known, 6 / (y * y * y * y) * (1 + SLACK) + TINY, math.inf)

@@ -1,0 +1,221 @@
+"""Units `z = f(y)` that bend smoothly, and what Taylor and interpolation say of them.
+
+On an interval `f(y) - s y` is extreme at an end or where `f'(y) = s`; that gives bounds for any
+slope, and lines. The quadratic through `f` at the Chebyshev nodes `c` and `c +- sqrt(3)/2 r` of an
+interval of middle `c` and half width `r` is off by at most `r^3/24 max |f'''|`.
+
+Library functions are taken to be off by a few roundings, and their errors are bounded where they
+are used: no bound relies on how a slope, a stationary point or a coefficient was found.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from functools import reduce
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark, Product
+from reachjax.numerics.rounding import (
+    TINY,
+    UNIT,
+    constant,
+    gamma,
+    larger,
+    namespace,
+    settled,
+    smaller,
+)
+
+SLACK = 64 * UNIT
+"""Relative error allowed of a library function. Those of numpy and XLA that are used here were off
+by 7 units at most (XLA's tanh near 20), and by 2 to 4 otherwise."""
+
+THIN = 1e-7
+"""Intervals shorter than this part of their size are thin: differences of values lose so many
+digits that a derivative in the middle is the better slope, and no quadratic beats a line."""
+
+SQUARES = 1e-100
+"""Half widths below this, or above its inverse, have squares next to underflow or overflow."""
+
+POLE = 1e-60
+"""Nearer to a pole, third derivatives are taken to be infinite: powers of it would overflow."""
+
+
+class Quadratic(NamedTuple):
+    """`|f(y) - (offset + slope (y - center) + curvature (y - center)^2)| <= gap`, `(k,)` each.
+
+    It holds for every real `y` of the interval and the coefficients as they are, in exact
+    arithmetic. Where nothing is known the gap is infinite and the rest is 0.
+    """
+
+    center: Array
+    offset: Array
+    slope: Array
+    curvature: Array
+    gap: Array
+
+
+class SmoothUnit(AbstractUnit):
+    """A unit three times differentiable where it is defined.
+
+    Attributes:
+        image: bounds of all its values.
+        flushed: what numbers too small for floats may add to an error of its value.
+    """
+
+    image: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
+    flushed: ClassVar[float] = 1024 * TINY
+
+    @abc.abstractmethod
+    def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`f'(y)`."""
+
+    @abc.abstractmethod
+    def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
+        """Points among which are those of `[lower, upper]` where `f(y) - slope y` is extreme.
+
+        To half the digits of floats: an error counts by its square. Other points do no harm,
+        wherever they are, and neither does NaN.
+        """
+
+    @abc.abstractmethod
+    def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
+        """An upper bound of `|f'''|` on `[lower, upper]`, infinite next to a pole."""
+
+    def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
+        """Where `f` is defined on all of `[lower, upper]`, and its value can be trusted."""
+        return (abs(lower) < math.inf) & (abs(upper) < math.inf)
+
+    @np.errstate(all="ignore")
+    def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """What remains of the value if nothing is taken from it; NaN where an end is."""
+        xp, (least, most) = namespace(lower, upper), self.image
+        low, high = self.remainder(xp.zeros_like(lower), lower, upper)
+        unknown = xp.isnan(lower) | xp.isnan(upper)
+        low, high = larger(low, least), smaller(high, most)
+        return xp.where(unknown, math.nan, low), xp.where(unknown, math.nan, high)
+
+    @np.errstate(all="ignore")
+    def remainder(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """Bounds of `f(y) - slope y`, from both ends and its stationary points.
+
+        They hold for any slope, and are infinite where the unit is not defined.
+        """
+        xp = namespace(slope, lower, upper)
+        slope, lower, upper = settled((slope, lower, upper))
+        fine = self.defined(lower, upper) & (abs(slope) < math.inf)
+        slope = xp.where(fine, slope, 0.0)
+        lower, upper = (xp.where(fine, end, 1.0) for end in (lower, upper))
+        # by the envelope theorem a derivative needs no derivatives of the stationary points
+        inner = self.stationary(*map(constant, (slope, lower, upper)))
+        low, high = [], []
+        for y in (lower, upper, *(_within(point, lower, upper) for point in inner)):
+            value, product = self(y), slope * y
+            rounding = constant(
+                SLACK * (abs(value) + abs(product))
+                + (self.flushed + TINY * (abs(slope) + abs(y)))  # of what underflows
+            )
+            rest = value - product
+            known = fine & (abs(rest) < math.inf) & (rounding < math.inf)
+            low.append(xp.where(known, rest - rounding, -math.inf))
+            high.append(xp.where(known, rest + rounding, math.inf))
+        return reduce(smaller, low), reduce(larger, high)
+
+    def lines(self, lower: Array, upper: Array) -> Lines:
+        """Two lines of the slope of the chord, that touch: never the same.
+
+        Where the unit is not defined they are infinitely far from each other.
+        """
+        slope = settled(self._chord(lower, upper))
+        low, high = self.remainder(slope, lower, upper)
+        return Lines(below=Line(slope, low), above=Line(slope, high))
+
+    @np.errstate(all="ignore")
+    def _chord(self, lower: Array, upper: Array) -> Float[Array, " k"]:
+        """The slope of the chord; of the tangent in the middle where differences lose digits."""
+        xp, fine = namespace(lower, upper), self.defined(lower, upper)
+        lower, upper = (xp.where(fine, end, 1.0) for end in (lower, upper))
+        first, last = self(lower), self(upper)
+        width, rise = upper - lower, last - first
+        lost = abs(rise) <= THIN * (abs(first) + abs(last))
+        thin = (width <= THIN * (abs(lower) + abs(upper))) | ((width <= THIN) & lost)
+        tangent = self.derivative(lower / 2 + upper / 2)
+        slope = xp.where(thin, tangent, rise / xp.where(thin, 1.0, width))
+        return xp.where(fine & (abs(slope) < math.inf), slope, 0.0)
+
+    @np.errstate(all="ignore")
+    def quadratic(self, lower: Array, upper: Array) -> Quadratic:
+        """The interpolant at Chebyshev nodes, or the lines where those leave less out.
+
+        The error at the nodes is measured. Between them it is at most 5/3 of that (the nodes'
+        Lebesgue constant), here 2, beside the error of an exact interpolant.
+        """
+        xp = namespace(lower, upper)
+        lower, upper = settled((lower, upper))
+        center = settled(lower / 2 + upper / 2)
+        linear = self._linear(center, lower, upper)
+        fine = self.defined(lower, upper)
+        lower, upper, middle = (xp.where(fine, y, 1.0) for y in (lower, upper, center))
+        radius = larger(upper - middle, middle - lower) * (1 + gamma(2)) + TINY
+        wide = fine & (radius > THIN * abs(middle))
+        wide = wide & (radius > SQUARES) & (radius < 1 / SQUARES)
+        radius = xp.where(wide, radius, 1.0)
+        step = math.sqrt(0.75) * radius
+        nodes = [middle + xp.where(wide, k * step, 0.0) for k in (-1, 0, 1)]
+        before, at, after = map(self, nodes)
+        slope = (after - before) / (2 * step)
+        curvature = ((after - at) - (at - before)) / (2 * step * step)
+        offset, slope, curvature = settled((at, slope, curvature))
+        errors = []
+        for node in nodes:
+            y, value = node - middle, self(node)
+            terms = offset, slope * y, curvature * y * y
+            rounding = SLACK * abs(value) + gamma(8) * sum(map(abs, terms)) + self.flushed
+            errors.append(abs(value - sum(terms)) + constant(rounding))
+        third = self.third(lower, upper)
+        wide, third = wide & (third < math.inf), xp.where(third < math.inf, third, 0.0)
+        # nodes may be off by some `UNIT |c|`, that is `1e-8 r`
+        between = radius * radius * radius / 24 * third * (1 + THIN)
+        gap = (between + 2 * reduce(larger, errors)) * (1 + gamma(4))
+        better = wide & (gap < linear.gap)
+        curved = Quadratic(middle, offset, slope, curvature, gap)
+        chosen = [xp.where(better, *pair) for pair in zip(curved, linear, strict=True)]
+        known = reduce(lambda a, b: a & b, (abs(each) < math.inf for each in chosen))
+        *chosen, gap = (xp.where(known, each, 0.0) for each in chosen)
+        return Quadratic(*settled((*chosen, xp.where(known, gap, math.inf))))
+
+    def _linear(self, center: Array, lower: Array, upper: Array) -> Quadratic:
+        """The lines as a quadratic without curvature."""
+        (slope, low), (_, high) = self.lines(lower, upper)
+        start, half = slope * center, low / 2 + high / 2
+        gap = high / 2 - low / 2 + gamma(4) * constant(abs(start) + abs(low) + abs(high))
+        gap = gap + TINY * constant(abs(slope) + abs(center) + 2)
+        return Quadratic(center, start + half, slope, namespace(slope).zeros_like(slope), gap)
+
+    def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:
+        """The value is over the line below and under the line above."""
+        below, above = self.lines(lower, upper)
+        blocks = (
+            Block(above.slope * y + above.offset - z, "under", Mark.BOUND),
+            Block(z - (below.slope * y + below.offset), "over", Mark.BOUND),
+        )
+        return Facts(blocks, (), (Product("under", "over", Mark.BOUND),))
+
+
+def _within(point: Array, lower: Array, upper: Array) -> Array:
+    """The point of `[lower, upper]` nearest to this one; `lower` for NaN."""
+    return smaller(upper, larger(lower, point))
+
+
+def nearest(lower: Array, upper: Array) -> Array:
+    """The least size `|y|` of the numbers in `[lower, upper]`."""
+    return larger(larger(lower, -upper), 0.0)
+
+
+def farthest(lower: Array, upper: Array) -> Array:
+    """The largest size `|y|` of the numbers in `[lower, upper]`."""
+    return larger(-lower, upper)

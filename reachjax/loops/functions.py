@@ -139,7 +139,12 @@ class Function:
         """The parameters, so that this can be traced, and the steps with what they end in."""
         closed, sizes = self._traced, self.structure.inputs
         recorder = Recorder([(size,) for size in sizes])
-        (wanted,) = _walked(recorder, closed, [*self.parameters, *recorder.inputs])
+        try:
+            (wanted,) = _walked(recorder, closed, [*self.parameters, *recorder.inputs])
+        except UnsupportedError as error:
+            raise TypeError(
+                f"the primitive {error.primitive!r}{error.line} cannot be certified: {error}"
+            ) from None
         return self.parameters, (recorder, wanted)
 
 
@@ -196,7 +201,7 @@ def _equation(recorder: Recorder, equation: Any, operands: Sequence[Operand]) ->
     """What one equation makes of its operands.
 
     Raises:
-        TypeError: there is no rule for its primitive.
+        UnsupportedError: there is no rule for its primitive.
     """
     name, params = equation.primitive.name, equation.params
     try:
@@ -213,12 +218,24 @@ def _equation(recorder: Recorder, equation: Any, operands: Sequence[Operand]) ->
         for inner in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
             if inner in params:
                 return _walked(recorder, params[inner], operands)
-        found = recorded(recorder, Equation(equation), operands)
-        return found if isinstance(found, list) else [found]
-    except UnsupportedError as reason:
-        raise TypeError(
-            f"the primitive {name!r}{_line(equation)} cannot be certified: {reason}"
-        ) from None
+        key = name, tuple(map(_identity, operands)), str(params)
+        if key not in recorder.known:  # what is written twice is done once
+            found = recorded(recorder, Equation(equation), operands)
+            recorder.known[key] = found if isinstance(found, list) else [found], operands
+        return recorder.known[key][0]
+    except UnsupportedError as error:
+        error.primitive = error.primitive or name
+        error.line = error.line or _line(equation)
+        raise
+
+
+def _identity(operand: Operand) -> Any:
+    """What two operands have in common only if they are the same."""
+    if isinstance(operand, Value):
+        return operand.place, operand.shape
+    if isinstance(operand, np.ndarray) and operand.size == 1:
+        return str(operand.dtype), operand.shape, operand.item()
+    return id(operand)
 
 
 def _unrolled(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any
 
 import jax
@@ -44,14 +45,23 @@ class Equation:
 
     def evaluate(self, *operands: Any) -> Any:
         """Plain arrays in, plain arrays out: numpy's if all are."""
-        found = self._primitive.bind(*operands, **self.params)
-        if not all(isinstance(each, np.ndarray | np.generic) for each in operands):
-            return found
-        return jax.tree.map(np.asarray, found) if is_known(found) else found
+        if not is_known(operands):
+            return self._primitive.bind(*operands, **self.params)
+        with jax.ensure_compile_time_eval():  # known numbers stay known where others are traced
+            found = self._primitive.bind(*operands, **self.params)
+        on_host = all(isinstance(each, np.ndarray | np.generic) for each in operands)
+        return jax.tree.map(np.asarray, found) if on_host else found
 
 
 class UnsupportedError(Exception):
-    """That a primitive cannot be certified, and what to do."""
+    """That a primitive cannot be certified, and what to do.
+
+    Attributes:
+        primitive: its name, once it is known.
+        line: where a user wrote it, the same.
+    """
+
+    primitive, line = "", ""
 
 
 # fmt: off
@@ -350,17 +360,11 @@ def _chosen(recorder: Recorder, which: Any, cases: Sequence[Operand]) -> Value:
         count = math.prod(cases[0].shape)
         which = np.broadcast_to(np.asarray(which, int), cases[0].shape)
         return recorder.picked(joined, which * count + np.arange(count).reshape(which.shape))
-    total: Any = None
-    part: Any
+    parts: list[Any] = []
     for number, each in enumerate(cases):
         weight = jnp.broadcast_to(which == number, each.shape).astype(float)
-        part = recorder.scaled(each, weight) if isinstance(each, Value) else weight * each
-        both = isinstance(total, Value) or isinstance(part, Value)
-        if total is None:
-            total = part
-        else:
-            total = recorder.added(total, part) if both else total + part
-    return total
+        parts.append(recorder.scaled(each, weight) if isinstance(each, Value) else weight * each)
+    return reduce(recorder.added, parts)
 
 
 def _bent(recorder: Recorder, condition: Value, below: Operand, above: Operand) -> Value:

@@ -69,11 +69,13 @@ class Recorder:
 
     Attributes:
         inputs: their values.
+        known: results of equations, and their operands, which are so kept alive.
     """
 
     def __init__(self, shapes: Sequence[Shape]):
         self._steps: list[Step] = []
         self._count = len(shapes)
+        self.known: dict[Any, tuple[list[Operand], Sequence[Operand]]] = {}
         self.inputs = [Value(place, shape) for place, shape in enumerate(shapes)]
 
     def run(self, numbers: Sequence[Any], unit: AtUnit, wanted: Value) -> Any:
@@ -112,10 +114,10 @@ class Recorder:
         link = Link(value, 1.0, by)
         return self._added(value.shape, lambda found, unit: found[place] + by, link)
 
-    def added(self, one: Operand, other: Operand, sign: int = 1) -> Value:
-        """`one + sign other`, of which one at least is a value; both of one shape."""
+    def added(self, one: Operand, other: Operand, sign: int = 1) -> Any:
+        """`one + sign other`, both of one shape."""
         if not isinstance(other, Value):
-            return self.shifted(one, sign * other)
+            return self.shifted(one, sign * other) if isinstance(one, Value) else one + sign * other
         if not isinstance(one, Value):
             return self.shifted(other if sign > 0 else self.scaled(other, np.array(-1.0)), one)
         link, first, second = None, one.place, other.place

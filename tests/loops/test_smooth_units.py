@@ -86,13 +86,34 @@ def inside(unit):
     return y, np.vectorize(TRUTHS[unit].value, otypes=[object])(y)
 
 
-def said(function, compiled, *numbers):
-    """What a function gives for numpy arrays, or compiled for those of JAX."""
+WIDTH = 512
+"""How many intervals compiled code takes: it is compiled once a unit."""
+
+
+@cache
+def compiled_of(unit):
+    """All that a unit says, compiled together."""
+
+    def found(slope, lower, upper):
+        ends = lower, upper
+        said = {name: getattr(unit, name)(*ends) for name in ("interval", "lines", "quadratic")}
+        return {**said, "third": unit.third(*ends), "remainder": unit.remainder(slope, *ends)}
+
+    return jax.jit(found)
+
+
+def said(unit, what, compiled, lower, upper, *slope):
+    """What a unit says of intervals: in numpy, or in compiled code."""
     if not compiled:
-        result = function(*numbers)
-        assert not any(isinstance(each, jax.Array) for each in jax.tree.leaves(result))
-        return result
-    return jax.device_get(jax.jit(function)(*map(jnp.asarray, numbers)))
+        found = getattr(unit, what)(*slope, lower, upper)
+        assert not any(isinstance(each, jax.Array) for each in jax.tree.leaves(found))
+        return found
+    size = len(lower)
+    given = np.ones((3, WIDTH))
+    for row, numbers in zip(given, (*(slope or (1.0,)), lower, upper), strict=True):
+        row[:size] = numbers
+    found = jax.device_get(compiled_of(unit)(*map(jnp.asarray, given))[what])
+    return jax.tree.map(lambda part: part[:size], found)
 
 
 def holds(low, values, high):
@@ -107,14 +128,14 @@ def test_values_and_derivatives_are_those_of_the_function(unit):
     for own, exact in ((unit, truth.value), (unit.derivative, truth.derivative)):
         expected = np.array([float(exact(mpf(each))) for each in y])
         for compiled in (False, True):
-            found = said(own, compiled, y)
+            found = jax.jit(own)(jnp.asarray(y)) if compiled else own(y)
             np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-300)
 
 
 @on_both
 @each_unit
 def test_intervals_hold_every_value_and_are_sharp(unit, compiled):
-    lower, upper = said(unit.interval, compiled, *intervals(unit))
+    lower, upper = said(unit, "interval", compiled, *intervals(unit))
     _, values = inside(unit)
     assert holds(lower, values, upper)
     usual = np.all(abs(intervals(unit)) < 1e5, axis=0)
@@ -141,7 +162,7 @@ def test_a_remainder_holds_for_any_slope(unit, compiled):
         np.zeros(len(part)),
         np.full(len(part), 1e-310),
     ):
-        low, high = said(unit.remainder, compiled, slope, *ends)
+        low, high = said(unit, "remainder", compiled, *ends, slope)
         assert holds(low, values - exactly(slope) * y, high)
         # where the function touches this slope, too, which is extreme if it is neither end
         point = exactly(inner)
@@ -152,7 +173,7 @@ def test_a_remainder_holds_for_any_slope(unit, compiled):
 @on_both
 @each_unit
 def test_lines_are_below_and_above_every_value_and_never_the_same(unit, compiled):
-    lines = said(unit.lines, compiled, *intervals(unit))
+    lines = said(unit, "lines", compiled, *intervals(unit))
     y, values = inside(unit)
     below, above = (exactly(slope) * y + exactly(offset) for slope, offset in lines)
     assert np.all(below <= values)
@@ -164,7 +185,7 @@ def test_lines_are_below_and_above_every_value_and_never_the_same(unit, compiled
 @each_unit
 def test_quadratics_are_no_farther_from_every_value_than_they_say(unit, compiled):
     ends, (y, values) = intervals(unit), inside(unit)
-    found = said(unit.quadratic, compiled, *ends)
+    found = said(unit, "quadratic", compiled, *ends)
     known = np.isfinite(found.gap)
     assert all(np.isfinite(part).all() for part in found[:4])
     assert known[np.all(abs(ends) < 1e5, axis=0)].all() or unit == rj.Exp()
@@ -173,7 +194,7 @@ def test_quadratics_are_no_farther_from_every_value_than_they_say(unit, compiled
     polynomial = offset + slope * off + curvature * off * off
     assert np.all(abs(values[:, known] - polynomial) <= gap)
     (slope, low), (_, high) = (
-        (part[known] for part in line) for line in said(unit.lines, compiled, *ends)
+        (part[known] for part in line) for line in said(unit, "lines", compiled, *ends)
     )
     size = abs(slope * found.center[known]) + abs(low) + abs(high)
     size = 1e-14 * size + 4 * TINY * abs(found.center[known]) + 1e-150  # no worse than the lines
@@ -191,14 +212,14 @@ def test_quadratics_close_in_with_the_cube_of_the_width(unit):
 @on_both
 @each_unit
 def test_third_derivatives_are_bounded(unit, compiled):
-    bounds = said(unit.third, compiled, *intervals(unit))
+    bounds = said(unit, "third", compiled, *intervals(unit))
     y, _ = inside(unit)
     sizes = abs(np.vectorize(TRUTHS[unit].third, otypes=[object])(y))
     assert np.all(sizes <= exactly(bounds))
     # and where they are extreme
     for at in (0.0, 1.0, 1.1462158347805889, math.pi / 2, math.pi):
         at = at if TRUTHS[unit].side == "both" else 0.3 + at
-        bound = said(unit.third, compiled, np.array([at - 0.1]), np.array([at + 0.2]))
+        bound = said(unit, "third", compiled, np.array([at - 0.1]), np.array([at + 0.2]))
         size = max(abs(TRUTHS[unit].third(mpf(at) + mpf(k) / 100)) for k in range(-10, 20))
         assert size <= mpf(bound[0]) <= size * mpf(1.2) + mpf(1e-12)
 
@@ -210,20 +231,20 @@ def test_what_is_said_of_nothing_is_infinite_and_never_a_wrong_number(unit, comp
     ends = np.array([[-inf, inf], [1.0, inf], [nan, 1.0], [1.0, nan], [nan, nan]]).T
     slope = np.full(5, 0.5)
     for low, high in (
-        said(unit.remainder, compiled, slope, *ends),
-        [line.offset for line in said(unit.lines, compiled, *ends)],
+        said(unit, "remainder", compiled, *ends, slope),
+        [line.offset for line in said(unit, "lines", compiled, *ends)],
     ):
         assert np.all(low == -inf)
         assert np.all(high == inf)
-    found = said(unit.quadratic, compiled, *ends)
+    found = said(unit, "quadratic", compiled, *ends)
     assert np.all(found.gap == inf)
     assert not any(part.any() for part in found[:4])
-    low, high = said(unit.interval, compiled, *ends)
+    low, high = said(unit, "interval", compiled, *ends)
     assert np.isnan([low[2:], high[2:]]).all()
     assert np.all((low[:2] <= -1) | (low[:2] == unit.image[0]))
     assert np.all(high[:2] == unit.image[1])
     for wrong in (inf, -inf, nan):
-        low, high = said(unit.remainder, compiled, np.array([wrong]), np.ones(1), 2 * np.ones(1))
+        low, high = said(unit, "remainder", compiled, np.ones(1), 2 * np.ones(1), np.array([wrong]))
         assert low == -inf
         assert high == inf
 
@@ -239,13 +260,13 @@ OUTSIDE = {
 @pytest.mark.parametrize("unit", OUTSIDE, ids=str)
 def test_outside_of_the_domain_bounds_are_infinite(unit, compiled):
     ends = np.array(OUTSIDE[unit]).T
-    low, high = said(unit.remainder, compiled, np.zeros(ends.shape[1]), *ends)
+    low, high = said(unit, "remainder", compiled, *ends, np.zeros(ends.shape[1]))
     assert np.all(low == -math.inf)
     assert np.all(high == math.inf)
-    low, high = said(unit.interval, compiled, *ends)
+    low, high = said(unit, "interval", compiled, *ends)
     assert np.all(low == unit.image[0])
     assert np.all(high == math.inf)
-    lines, found = (said(f, compiled, *ends) for f in (unit.lines, unit.quadratic))
+    lines, found = (said(unit, what, compiled, *ends) for what in ("lines", "quadratic"))
     assert not lines.above.slope.any()
     assert np.all(lines.above.offset == math.inf)
     assert np.all(lines.below.offset == -math.inf)
@@ -297,14 +318,15 @@ def test_remainders_and_quadratics_have_derivatives(unit):
 @each_unit
 def test_facts_are_not_negative_and_hold_of_no_far_value(unit):
     lower, upper = np.array([0.4, 1.0, 1.3]), np.array([0.5, 2.0, 4.0])
-    for part in np.linspace(0, 1, 7):
-        y = lower + part * (upper - lower)
-        facts = unit.facts(y, unit(y), lower, upper)
+    y = lower + (upper - lower) / 3
+    facts = unit.facts(y, unit(y), lower, upper)
+    for point in (lower, y, upper):
+        facts = unit.facts(point, unit(point), lower, upper)
         assert [block.mark for block in facts.blocks] == [Mark.BOUND, Mark.BOUND]
         assert np.all(facts["under"] >= 0)
         assert np.all(facts["over"] >= 0)
         assert {name for product in facts.products for name in product[:2]} == {"under", "over"}
-    width = facts["under"] + facts["over"]
+    width = facts["under"] + facts["over"]  # both lines have one slope
     assert np.all(unit.facts(y, unit(y) + 1.01 * width, lower, upper)["under"] < 0)
     assert np.all(unit.facts(y, unit(y) - 1.01 * width, lower, upper)["over"] < 0)
 

@@ -119,8 +119,8 @@ class AbstractUnit(AbstractActivation):
     """One relation `z = f(y)`, which adds one column to a basis.
 
     Attributes:
-        nonexpansive: whether `|f(y) - f(y')| <= |y - y'|`. Bounds of a step rely on it where inputs
-            are rounded, and take no other units.
+        nonexpansive: whether `|f(y) - f(y')| <= |y - y'|`. `loop_bounds` relies on it where inputs
+            are rounded, and holds for such units only.
     """
 
     nonexpansive: ClassVar[bool] = True

@@ -32,7 +32,7 @@ from reachjax.numerics.rounding import (
 
 SLACK = 64 * UNIT
 """Relative error allowed of a library function. Those of numpy and XLA that are used here were off
-by 7 units at most (XLA's tanh near 20), and by 2 to 4 otherwise."""
+by 7 units at most on a CPU (XLA's tanh near 20), and by 1 to 4 otherwise."""
 
 THIN = 1e-7
 """Intervals shorter than this part of their size are thin: differences of values lose so many

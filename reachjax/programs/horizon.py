@@ -72,7 +72,8 @@ class Horizon:
         self.steps: list[tuple[UnitForms, ...]] = []
         self.merged: list[Merged | None] = []
         self._controllers = len(loop.controller_layers)
-        self._remainders = np.zeros(0, dtype=int)
+        self._varying = np.zeros(0, dtype=int)
+        self._width = self.start.count
         self._facts: list[AffineForms] = []
         self._zero: list[np.ndarray] = [np.zeros((0, 2), dtype=int)]
         self.columns, self.gaps = np.zeros(0, dtype=int), np.zeros(0)
@@ -87,7 +88,8 @@ class Horizon:
     @property
     def facts(self) -> AffineForms:
         """Rows `(m, n)` that are never negative: those of the initial set, then those of units."""
-        width = max(part.columns.shape[1] for part in (self.state, *self._facts))
+        widths = (part.columns.shape[1] for part in (self.state, *self._facts))
+        width = self._width = max(self._width, *widths)
         if len(self._facts) != 1 or self._facts[0].columns.shape[1] != width:
             none = AffineForms(np.zeros((0, width + 2)), np.zeros((0, 2)))
             self._facts = [joined([none, *(part.widened(width) for part in self._facts)])]
@@ -105,9 +107,8 @@ class Horizon:
 
     @property
     def varying(self) -> Int[np.ndarray, " v"]:
-        """Columns of the initial state and of units, without those of rounding errors."""
-        of_units = np.concatenate([self.columns, self._remainders])
-        return np.concatenate([np.arange(self.start.count), np.unique(of_units)])
+        """Columns of the initial state and of units, as they came; not those of rounding errors."""
+        return np.concatenate([np.arange(self.start.count), self._varying])
 
     def advance(self, multipliers: Multipliers | None = None) -> None:
         """One step more.
@@ -120,6 +121,7 @@ class Horizon:
             unit: AbstractUnit, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
         ) -> Ends:
             self._state_facts(found)
+            self._width = max(self._width, y.columns.shape[1])
             if isinstance(unit, SmoothUnit):  # its range is that of its form, but for little
                 return ends
             switching = np.flatnonzero(~unit.lines(*ends).affine)
@@ -147,9 +149,9 @@ class Horizon:
         self.merged.append(merged)
         # those of units of a smooth controller are summed up in the merged ones
         own = units if merged is None else units[self._controllers :]
-        smooth = [each.places for each in (*own, *([merged] if merged else [])) if _left_out(each)]
-        self._remainders = np.concatenate([self._remainders, *smooth])
-        self._remainders = self._remainders[self._remainders >= 0]
+        for each in (*own, *([merged] if merged else [])):
+            if _left_out(each):
+                self._varying = np.append(self._varying, each.places[each.places >= 0])
 
     def columns_at(self, state: Float[np.ndarray, " n_x"]) -> Float[np.ndarray, " n"]:
         """The columns of the trajectory from an initial state."""
@@ -220,6 +222,8 @@ class Horizon:
         pairs = [np.stack([first[one], first[other]], axis=1) for one, other in facts.zero]
         self._zero += pairs
         self.columns = np.append(self.columns, np.tile(layer.places[switching], len(pairs)))
+        if pairs:
+            self._varying = np.append(self._varying, layer.places[switching])
         self.gaps = np.append(self.gaps, np.tile(layer.gap[switching], len(pairs)))
 
     def _add(self, rows: AffineForms, origins: Int[np.ndarray, "k 3"]) -> None:

@@ -1,0 +1,202 @@
+"""Loops of smooth units: no state is outside, sets are tight, and their sizes have derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from tests.networks import he_network
+
+HORIZON = 4
+
+
+def pendulum(p, x, u):
+    return jnp.array([x[0] + 0.1 * x[1], x[1] + 0.1 * (p * jnp.sin(x[0]) - 0.2 * x[1] + u[0])])
+
+
+def van_der_pol(x, u):
+    return x + 0.1 * jnp.array([x[1], (1 - x[0] ** 2) * x[1] - x[0] + u[0]])
+
+
+def car(x, u):
+    return x + 0.2 * jnp.array([jnp.cos(x[2]), jnp.sin(x[2]), u[0] / (1 + x[0] ** 2)])
+
+
+def scalar(x, u):
+    return 0.5 * x + jnp.exp(-(x**2)) / 3 + 0.1 * u
+
+
+def tank(x, u):
+    return x + 0.1 * jnp.array([u[0] - jnp.sqrt(x[0]), jnp.sqrt(x[0]) - jnp.sqrt(x[1])])
+
+
+def tanh_net(states, inputs, seed=0, hidden=(6,), activation=None):
+    layers = he_network((states, *hidden, inputs), seed)
+    return rj.MLP.from_layers(layers, activation=activation or rj.Tanh())
+
+
+def loops():
+    """Names, loops and initial sets."""
+    law = jax.tree_util.Partial(lambda p, x: -jnp.tanh(p @ x) * 2, jnp.array([[1.5, 1.0]]))
+    swing = rj.NonlinearPlant(jax.tree_util.Partial(pendulum, 5.0), 2, 1)
+    line = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
+    small = rj.Box([0.2, -0.3], [0.4, -0.1])
+    ball = rj.Ellipsoid([0.3, -0.2], [[0.01, 0.002], [0.002, 0.02]])
+    corner = rj.Polytope([[-1.0, 0], [0, -1], [1, 1]], [-0.2, 0.3, 0.2])
+    unit = rj.Box([-1.0], [1.0])
+    return {
+        "pendulum": (rj.ClosedLoop(swing, tanh_net(2, 1)), small),
+        "boxed": (rj.ClosedLoop(swing, rj.Network(law, 2, 1), unit), small),
+        "sigmoid": (rj.ClosedLoop(line, tanh_net(2, 1, 1, (5, 4), rj.Sigmoid())), small),
+        "rectified": (rj.ClosedLoop(swing, tanh_net(2, 1, 2, (4, 3), rj.ReLU()), unit), small),
+        "ball": (rj.ClosedLoop(swing, tanh_net(2, 1)), ball),
+        "polytope": (rj.ClosedLoop(rj.NonlinearPlant(van_der_pol, 2, 1), tanh_net(2, 1, 3)), corner),
+        "car": (
+            rj.ClosedLoop(rj.NonlinearPlant(car, 3, 1), tanh_net(3, 1, 4, (4,), rj.ReLU())),
+            rj.Box([0.0, 0.0, 0.2], [0.1, 0.2, 0.5]),
+        ),
+        "scalar": (
+            rj.ClosedLoop(rj.NonlinearPlant(scalar, 1, 1), tanh_net(1, 1, 5)),
+            rj.Box([-1.0], [0.5]),
+        ),
+        "tank": (
+            rj.ClosedLoop(rj.NonlinearPlant(tank, 2, 1), tanh_net(2, 1, 6)),
+            rj.Box([1.0, 0.8], [1.3, 1.0]),
+        ),
+        "a point": (rj.ClosedLoop(swing, tanh_net(2, 1)), rj.Box([0.2, -0.3], [0.2, -0.3])),
+        "wide": (rj.ClosedLoop(swing, tanh_net(2, 1)), rj.Box([-2.0, -2.0], [3.0, 1.0])),
+    }
+
+
+LOOPS = loops()
+
+
+@pytest.fixture(params=LOOPS)
+def case(request):
+    return LOOPS[request.param]
+
+
+def trajectories(loop, X0, count=3000):
+    try:
+        states = jnp.concatenate([X0.corners(), X0.sample(jax.random.key(0), count)])
+    except RuntimeError:
+        states = X0.corners()
+    return np.asarray(loop.simulate(states, HORIZON))
+
+
+def outside(tube, runs):
+    """By how much a simulated state is outside at most, beyond what rounding explains."""
+    worst = -np.inf
+    for t in range(1, tube.horizon + 1):
+        A, b = (np.asarray(part) for part in tube.sets[t].facets)
+        worst = max(worst, (runs[:, t] @ A.T - b - 1e-13 * (1 + abs(b))).max())
+    return worst
+
+
+RELAXATIONS = [rj.LinearBounds(), rj.BranchAndCut(), rj.LocalBounds(repeated=False)]
+
+
+@pytest.mark.parametrize("relaxation", RELAXATIONS, ids=lambda r: type(r).__name__)
+def test_no_state_is_outside(case, relaxation):
+    loop, X0 = case
+    template = rj.Template.box(loop.states)
+    window = 1 if isinstance(relaxation, rj.LocalBounds) else None
+    tube = rj.reach(loop, X0, HORIZON, template, relaxation, window, samples=50)
+    runs = trajectories(loop, X0)
+    assert outside(tube, runs) <= 0
+    for t in range(1, HORIZON + 1):
+        proof = tube.proof(t)
+        np.testing.assert_allclose(proof.recheck(), proof.bounds, atol=1e-9)
+        assert np.all(proof.gaps >= -1e-12 * (1 + abs(np.asarray(proof.bounds))))
+
+
+def test_compiled_sets_are_those_of_the_host(case):
+    loop, X0 = case
+    template = rj.Template.box(loop.states)
+
+    def offsets(loop, X0):
+        tube = rj.reach(loop, X0, HORIZON, template, rj.LinearBounds())
+        return jnp.stack([X.facets[1] for X in tube.sets[1:]])
+
+    compiled, on_host = jax.jit(offsets)(loop, X0), offsets(loop, X0)
+    if X0.parts[0] is not None and X0.parts[0].needs_programs:  # a box holds it in compiled code
+        assert np.all(compiled >= on_host - 1e-12)
+    else:
+        np.testing.assert_allclose(compiled, on_host, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "sigmoid", "boxed", "car", "tank", "scalar"])
+def test_sets_are_tight(name):
+    loop, X0 = LOOPS[name]
+    tube = rj.reach(loop, X0, HORIZON, rj.Template.box(loop.states))
+    runs = trajectories(loop, X0, 20_000)
+    for t in range(1, HORIZON + 1):
+        offsets = np.asarray(tube.sets[t].b)
+        widths = offsets[::2] + offsets[1::2]
+        assert np.all(widths <= 1.1 * np.ptp(runs[:, t], axis=0))
+
+
+@pytest.mark.parametrize("relaxation", RELAXATIONS[:2], ids=lambda r: type(r).__name__)
+@pytest.mark.parametrize("name", ["pendulum", "boxed", "ball", "tank"])
+def test_derivatives_are_central_differences(name, relaxation):
+    loop, X0 = LOOPS[name]
+    template = rj.Template.box(loop.states)
+
+    def size(given):
+        loop, X0 = given
+        return rj.log_widths(rj.reach(loop, X0, HORIZON, template, relaxation, samples=20))
+
+    flat, restore = jax.flatten_util.ravel_pytree((loop, X0))
+    slopes = jax.flatten_util.ravel_pytree(jax.grad(size)((loop, X0)))[0]
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        direction, step = rng.normal(size=flat.shape), 1e-6
+        ends = [size(restore(flat + sign * step * direction)) for sign in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * step)
+        assert slopes @ direction == pytest.approx(float(difference), rel=1e-4)
+
+
+def test_a_remainder_that_is_infinite_says_where_and_what_to_do():
+    loop = rj.ClosedLoop(
+        rj.NonlinearPlant(lambda x, u: 1 / x + u, 1, 1), rj.Network(lambda x: 0 * x, 1, 1)
+    )
+    message = r"Reciprocal at t = 0 .*\[-1.*, 1.*\].*cells"
+    for relaxation in RELAXATIONS[:2]:
+        with pytest.raises(ValueError, match=message):
+            rj.reach(loop, rj.Box([-1.0], [1.0]), 1, rj.Template.box(1), relaxation)
+    with pytest.raises(ValueError, match=message):
+        rj.decide(loop, rj.Box([-1.0], [1.0]), 1, goal=rj.Box([-9.0], [9.0]))
+
+
+def test_specifications_are_decided():
+    loop, X0 = LOOPS["pendulum"]
+    runs = trajectories(loop, X0)
+    low, high = runs[:, -1].min(axis=0), runs[:, -1].max(axis=0)
+    goal, small = rj.Box(low - 0.05, high + 0.05), rj.Box(low + 0.01, high)
+    tube = rj.reach(loop, X0, HORIZON, rj.Template.box(2))
+    assert rj.verify(tube, goal=goal).status.name == "PROVED"
+    assert rj.verify(tube, goal=small).status.name == "REFUTED"
+    assert rj.decide(loop, X0, HORIZON, goal=goal).status.name == "PROVED"
+    assert rj.decide(loop, X0, HORIZON, goal=small).status.name == "REFUTED"
+
+
+def test_ellipsoids_and_mixed_sets_hold_every_state():
+    loop, X0 = LOOPS["pendulum"]
+    runs = trajectories(loop, X0)
+    template = rj.MixedTemplate(rj.Template.box(2), rj.EllipsoidTemplate())
+    for each in (rj.EllipsoidTemplate(), template):
+        tube = rj.reach(loop, X0, 2, each, rj.LocalBounds(repeated=False), 1)
+        for t in (1, 2):
+            assert np.all(np.asarray(tube.sets[t].contains(runs[:, t], 1e-9)))
+
+
+def test_cells_hold_every_state_together():
+    loop, X0 = LOOPS["wide"]
+    tube = rj.reach_partitioned(
+        loop, X0, 2, rj.Template.box(2), rj.LinearBounds(), cells=(3, 2), samples=20
+    )
+    runs = trajectories(loop, X0)
+    for t in (1, 2):
+        inside = [np.asarray(X.contains(runs[:, t], 1e-9)) for X in tube.sets(t)]
+        assert np.all(np.any(inside, axis=0))

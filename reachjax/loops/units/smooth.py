@@ -112,17 +112,16 @@ class SmoothUnit(AbstractUnit):
         lower, upper = (xp.where(fine, end, 1.0) for end in (lower, upper))
         # by the envelope theorem a derivative needs no derivatives of the stationary points
         inner = self.stationary(*map(constant, (slope, lower, upper)))
-        low, high = [], []
-        for y in (lower, upper, *(_within(point, lower, upper) for point in inner)):
-            value, product = self(y), slope * y
-            rounding = constant(
-                SLACK * (abs(value) + abs(product))
-                + (self.flushed + TINY * (abs(slope) + abs(y)))  # of what underflows
-            )
-            rest = value - product
-            known = fine & (abs(rest) < math.inf) & (rounding < math.inf)
-            low.append(xp.where(known, rest - rounding, -math.inf))
-            high.append(xp.where(known, rest + rounding, math.inf))
+        y = xp.stack([lower, upper, *(_within(point, lower, upper) for point in inner)])
+        value, product = self(y), slope * y
+        rounding = constant(
+            SLACK * (abs(value) + abs(product))
+            + (self.flushed + TINY * (abs(slope) + abs(y)))  # of what underflows
+        )
+        rest = value - product
+        known = fine & (abs(rest) < math.inf) & (rounding < math.inf)
+        low = xp.where(known, rest - rounding, -math.inf)
+        high = xp.where(known, rest + rounding, math.inf)
         return reduce(smaller, low), reduce(larger, high)
 
     def lines(self, lower: Array, upper: Array) -> Lines:
@@ -165,17 +164,16 @@ class SmoothUnit(AbstractUnit):
         wide = wide & (radius > SQUARES) & (radius < 1 / SQUARES)
         radius = xp.where(wide, radius, 1.0)
         step = math.sqrt(0.75) * radius
-        nodes = [middle + xp.where(wide, k * step, 0.0) for k in (-1, 0, 1)]
-        before, at, after = map(self, nodes)
+        nodes = xp.stack([middle + xp.where(wide, k * step, 0.0) for k in (-1, 0, 1)])
+        values = self(nodes)
+        before, at, after = values
         slope = (after - before) / (2 * step)
         curvature = ((after - at) - (at - before)) / (2 * step * step)
         offset, slope, curvature = settled((at, slope, curvature))
-        errors = []
-        for node in nodes:
-            y, value = node - middle, self(node)
-            terms = offset, slope * y, curvature * y * y
-            rounding = SLACK * abs(value) + gamma(8) * sum(map(abs, terms)) + self.flushed
-            errors.append(abs(value - sum(terms)) + constant(rounding))
+        y = nodes - middle
+        terms = offset, slope * y, curvature * y * y
+        rounding = SLACK * abs(values) + gamma(8) * sum(map(abs, terms)) + self.flushed
+        errors = abs(values - sum(terms)) + constant(rounding)
         third = self.third(lower, upper)
         wide, third = wide & (third < math.inf), xp.where(third < math.inf, third, 0.0)
         # nodes may be off by some `UNIT |c|`, that is `1e-8 r`

@@ -220,6 +220,7 @@ def _equation(recorder: Recorder, equation: Any, operands: Sequence[Operand]) ->
                 return _walked(recorder, params[inner], operands)
         key = name, tuple(map(_identity, operands)), str(params)
         if key not in recorder.known:  # what is written twice is done once
+            recorder.line = _line(equation) or recorder.line
             found = recorded(recorder, Equation(equation), operands)
             recorder.known[key] = found if isinstance(found, list) else [found], operands
         return recorder.known[key][0]

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from reachjax.loops.units import AbstractUnit, AtUnit, ReLU
+from reachjax.loops.units import AbstractUnit, AtUnit, ReLU, UnboundedError
 from reachjax.loops.units.powers import Square
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.rounding import Ball, namespace
@@ -70,11 +70,13 @@ class Recorder:
     Attributes:
         inputs: their values.
         known: results of equations, and their operands, which are so kept alive.
+        line: where a user wrote the equation at hand.
     """
 
     def __init__(self, shapes: Sequence[Shape]):
         self._steps: list[Step] = []
         self._count = len(shapes)
+        self.line = ""
         self.known: dict[Any, tuple[list[Operand], Sequence[Operand]]] = {}
         self.inputs = [Value(place, shape) for place, shape in enumerate(shapes)]
 
@@ -153,8 +155,15 @@ class Recorder:
 
     def unit(self, unit: AbstractUnit, value: Value) -> Value:
         """A layer of units."""
-        place = value.place
-        return self._added(value.shape, lambda found, at: at(unit, found[place]))
+        place, line = value.place, self.line
+
+        def applied(found: list[Any], at: AtUnit) -> Any:
+            try:
+                return at(unit, found[place])
+            except UnboundedError as error:
+                raise UnboundedError(*error.given, line=line) from None
+
+        return self._added(value.shape, applied)
 
     def rectified(self, value: Value) -> Value:
         """`max(value, 0)`."""

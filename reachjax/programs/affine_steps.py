@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.units import AbstractUnit, SmoothUnit
+from reachjax.loops.units import AbstractUnit, SmoothUnit, UnboundedError
 from reachjax.numerics.rounding import Ball, gamma, namespace
 from reachjax.programs.affine import AffineForms, Place, met
 from reachjax.programs.initial import Ends, InitialColumns, constant, settled
@@ -136,6 +136,8 @@ def step_forms(
             ends = ranges(unit, y, ends, found)
         if isinstance(unit, SmoothUnit):
             z, forms = _smooth(unit, y, ends, free, start)
+            if place is None:
+                _require_bounds(forms, int(t))
         else:
             z, forms = _unit(unit, y, ends, free, slope)
         if free is not None:
@@ -157,6 +159,18 @@ def step_forms(
     if known is not None:
         ends = met(ends, (known.lower, known.upper))
     return StepForms(successor.within(Ball.between(*ends)), tuple(found), merged)
+
+
+def _require_bounds(forms: UnitForms, t: int) -> None:
+    """Raise an error where a unit has no bounds although its inputs have.
+
+    Raises:
+        UnboundedError: that is so.
+    """
+    lost = ~np.isfinite(forms.gap) & np.isfinite(forms.lower) & np.isfinite(forms.upper)
+    if lost.any():
+        (k, *_) = np.flatnonzero(lost)
+        raise UnboundedError(forms.unit, t, float(forms.lower[k]), float(forms.upper[k]))
 
 
 def _merged(

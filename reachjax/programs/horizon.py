@@ -15,7 +15,6 @@ Everything here is numpy on the host.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -27,7 +26,8 @@ from reachjax.loops.units import AbstractUnit, Mark, SmoothUnit
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine import AffineForms, met
 from reachjax.programs.affine_steps import Merged, UnitForms, step_forms
-from reachjax.programs.initial import Ends, InitialColumns
+from reachjax.programs.initial import Ends, InitialColumns, product_facts
+from reachjax.programs.unrolled import FactWeights
 from reachjax.sets import AbstractSet, Box
 
 Multipliers = Callable[[AffineForms], Float[np.ndarray, "k m"]]
@@ -82,7 +82,7 @@ class Horizon:
         if self.start.cut is not None:
             A, b = (np.asarray(part) for part in self.start.cut.facets)
             self._add(b - A @ self.state, np.full((len(b), 3), -1))
-        products = _product_facts(self.start)
+        products = AffineForms(*product_facts(self.start))
         self._add(products, np.full((len(products.rows), 3), -2))
 
     @property
@@ -185,6 +185,21 @@ class Horizon:
             x = self._loop.plant.propagate(x, self._loop.projected(u, t, apply), t, apply)
         return found
 
+    def weights(self, multipliers: Float[np.ndarray, "f m"], steps: int) -> FactWeights:
+        """Multipliers of the facts so far by what they are of, for so many steps."""
+        step, unit, which = self.origins.T
+        units = sum(len(layer.places) for layer in self.steps[0])
+        found = np.zeros((len(multipliers), steps, which.max(initial=0) + 1, units))
+        of_units = step >= 0
+        found[:, step[of_units], which[of_units], unit[of_units]] = multipliers[:, of_units]
+        ranges = np.zeros((steps, 2, units))
+        for known, layers in zip(ranges, self.steps, strict=False):
+            for number, name in enumerate(("lower", "upper")):
+                parts = [getattr(layer, name) for layer in layers]
+                known[number] = np.concatenate([np.zeros(0), *parts])
+        of_set, of_products = (multipliers[:, step == kind] for kind in (-1, -2))
+        return FactWeights(found, of_set, of_products, ranges)
+
     def narrow(self, lower: Float[np.ndarray, " n_x"], upper: Float[np.ndarray, " n_x"]) -> None:
         """Meet the state with bounds that surely hold it."""
         ends = met(self.state.ends(self.start), (lower, upper))
@@ -249,23 +264,6 @@ def _fill(
     width = outputs.columns.shape[1]
     rest = values[here] - outputs.rows[here, 0] - outputs.columns[here] @ found[:width]
     found[places[here]] = rest / gap[here]
-
-
-def _product_facts(start: InitialColumns) -> AffineForms:
-    """`(1 + a w_i) (1 + b w_j) >= 0` for all signs `a`, `b`, over the columns of a curved start."""
-    n, (i, j) = start.spread.shape[1], start.pairs
-    rows = []
-    for number, (one, other) in enumerate(zip(i, j, strict=True)):
-        signs = [(1, 1), (-1, -1)] if one == other else itertools.product((1, -1), repeat=2)
-        for a, b in signs:
-            row = np.zeros(2 + start.count)
-            row[2 + n + number] = 0.5 if one == other else a * b
-            row[:2] = 1.5 if one == other else 1.0, 2.0  # a square is half of 1 and its column
-            row[2 + one] += a
-            row[2 + other] += b
-            rows.append(row)
-    radii = np.tile([0.0, 2.0], (len(rows), 1))  # each is in [0, 4]
-    return AffineForms(np.reshape(rows, (-1, 2 + start.count)), radii)
 
 
 def joined(parts: Sequence[AffineForms]) -> AffineForms:

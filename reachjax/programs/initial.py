@@ -20,6 +20,7 @@ and from `(1 - s_i w_i) (1 - s_j w_j) >= 0`, `s_i` being the sign of `g_i`, wher
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import jax
@@ -201,3 +202,26 @@ def _ends(cut: PolyhedralSet, directions: Rows) -> Ends:
             return lower, upper
         lower[known], upper[known] = -found[:count], found[count:]
     return lower, upper
+
+
+def product_facts(start: InitialColumns) -> tuple[np.ndarray, np.ndarray]:
+    """`(1 + a w_i) (1 + b w_j) >= 0` for all signs `a`, `b`, over the columns of a curved start.
+
+    None of a ball: there they say little, and its programs are not solved to many digits.
+
+    Returns:
+        Rows and radii of forms (`affine.AffineForms`).
+    """
+    n, (i, j) = start.spread.shape[1], start.pairs
+    rows = []
+    for number, (one, other) in enumerate(zip(i, j, strict=True) if not start.round else ()):
+        signs = [(1, 1), (-1, -1)] if one == other else itertools.product((1, -1), repeat=2)
+        for a, b in signs:
+            row = np.zeros(2 + start.count)
+            row[2 + n + number] = 0.5 if one == other else a * b
+            row[:2] = 1.5 if one == other else 1.0, 2.0  # a square is half of 1 and its column
+            row[2 + one] += a
+            row[2 + other] += b
+            rows.append(row)
+    radii = np.tile([0.0, 2.0], (len(rows), 1))  # each is in [0, 4]
+    return np.reshape(rows, (-1, 2 + start.count)), radii

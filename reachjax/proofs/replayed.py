@@ -76,12 +76,9 @@ class Replay(Replaceable):
                 np.concatenate([part[which] for part in parts] or [np.zeros((facets, 0))], axis=1)
                 for which in range(2)
             )
-        step, unit, kind = horizon.origins.T
-        of_units, of_set = step >= 0, step == -1
-        found = np.zeros((facets, steps, kind.max(initial=0) + 1, units))
-        found[:, step[of_units], kind[of_units], unit[of_units]] = multipliers[:, of_units]
+        weights = horizon.weights(multipliers, steps)
         initial = columns[:, : horizon.start.spread.shape[1]]
-        return cls(initial, slopes, offsets, found, multipliers[:, of_set])
+        return cls(initial, slopes, offsets, weights.of_units, weights.of_set)
 
 
 def _lines(

@@ -99,7 +99,9 @@ def _first(program: Program, layout: FactLayout) -> Bool[np.ndarray, " m"]:
     first = np.zeros(len(there), dtype=bool)
     first[[0, *layout.set_facets[0], *layout.cone_rows]] = True
     for units in layout.units:
-        switching = there[np.array(units.marked(Mark.SECTOR))].all(axis=0)
+        # a smooth unit has no facts but those of its bounds
+        blocks = units.marked(Mark.SECTOR) or units.marked(Mark.BOUND)
+        switching = there[np.array(blocks)].all(axis=0)
         first[np.array(list(units.rows.values()))[:, switching]] = True
     return first
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import is_concrete, owned
-from reachjax.programs.unrolled import unrolled_at_once
+from reachjax.programs.unrolled import weighed_at_once
 from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import SolverStatus
@@ -81,7 +81,6 @@ def sets_by_branching(
             ladder.spend(int(np.sum(proof.nodes)))
             work -= len(proof.by_products) * ladder.width**4
         ladder.horizon.narrow(*_ends(*_fixed(X)))
-    by_forms = _by_forms(setting, X0, box, template, horizon)
     left = (horizon - len(known)) / horizon
     ladder.grant(left * of_programs)
     work = max(work, left * PRODUCTS)
@@ -105,10 +104,8 @@ def sets_by_branching(
             )
         offsets = proved = owned(climbed.bounds)
         if not is_concrete(setting.loop, X0, directions):
-            if by_forms is not None:
-                moving = by_forms[k - 1]
-            else:
-                moving = _replayed(setting, X0, box, directions, climbed, ladder, horizon, k)
+            derivative = _weighed if loop.curved else _replayed
+            moving = derivative(setting, X0, box, directions, climbed, ladder, horizon, k)
             moving = jnp.where(jnp.isfinite(moving), moving, 0.0)  # what overflows has none
             offsets = proved + (moving - jax.lax.stop_gradient(moving))
         gaps = climbed.bounds - climbed.attained
@@ -146,19 +143,24 @@ def _replayed(
     return replayed(setting.loop, X0, box, directions, held, k, setting.start)
 
 
-def _by_forms(
-    setting: Setting, X0: AbstractSet, box: Box, template: Template, horizon: int
-) -> Float[Array, "N f"] | None:
-    """Numbers with the derivatives of what affine forms prove: about all of the bounds.
+def _weighed(
+    setting: Setting,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[Array, "f n_x"],
+    climbed: Climbed,
+    ladder: Ladder,
+    horizon: int,
+    k: int,
+) -> Float[Array, " f"]:
+    """Numbers with the derivatives of what forms and the facts that decide prove.
 
-    None where bounds are attained, and none are asked for.
+    What a smooth loop's forms leave out is part of its bounds, which no trajectory attains.
     """
-    directions = template.directions[:horizon]
-    if is_concrete(setting.loop, X0, directions) or not setting.loop.curved:
-        return None
-    if template.steps is None:
-        directions = jnp.broadcast_to(template.directions, (horizon, *template.directions.shape))
-    return unrolled_at_once(setting.loop, X0, box, directions, setting.start).offsets
+    by_form = climbed.rungs == Rung.AFFINE_FORM
+    multipliers = np.where(by_form[:, None], 0.0, climbed.multipliers)
+    held = ladder.horizon.weights(multipliers, horizon)
+    return weighed_at_once(setting.loop, X0, box, directions, held, setting.start)[k - 1]
 
 
 def _with_products(

@@ -12,7 +12,7 @@ import pytest
 from mpmath import mpf
 
 import reachjax as rj
-from reachjax.loops.units import Mark, SmoothUnit, absolute, evaluate, maximum, minimum
+from reachjax.loops.units import Mark, SmoothUnit
 from reachjax.loops.units.smooth import SLACK
 from reachjax.numerics.rounding import TINY
 
@@ -342,10 +342,3 @@ def test_units_that_are_nonexpansive_are(unit):
 def test_a_sigmoid_is_the_logistic_function():
     y = np.linspace(-30, 30, 601)
     np.testing.assert_allclose(rj.Sigmoid()(y), 1 / (1 + np.exp(-y)), atol=1e-15)
-
-
-def test_extremes_are_those_of_numpy():
-    a, b = np.random.default_rng(0).normal(size=(2, 50))
-    np.testing.assert_allclose(absolute(a, evaluate), abs(a), atol=1e-15)
-    np.testing.assert_allclose(maximum(a, b, evaluate), np.maximum(a, b), atol=1e-15)
-    np.testing.assert_allclose(minimum(a, b, evaluate), np.minimum(a, b), atol=1e-15)

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import reachjax as rj
 from tests.networks import he_network
 
-HORIZON = 4
+HORIZON = 3
 
 
 def pendulum(p, x, u):
@@ -41,6 +42,7 @@ def loops():
     law = jax.tree_util.Partial(lambda p, x: -jnp.tanh(p @ x) * 2, jnp.array([[1.5, 1.0]]))
     swing = rj.NonlinearPlant(jax.tree_util.Partial(pendulum, 5.0), 2, 1)
     line = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
+    oscillator = rj.NonlinearPlant(van_der_pol, 2, 1)
     small = rj.Box([0.2, -0.3], [0.4, -0.1])
     ball = rj.Ellipsoid([0.3, -0.2], [[0.01, 0.002], [0.002, 0.02]])
     corner = rj.Polytope([[-1.0, 0], [0, -1], [1, 1]], [-0.2, 0.3, 0.2])
@@ -51,7 +53,7 @@ def loops():
         "sigmoid": (rj.ClosedLoop(line, tanh_net(2, 1, 1, (5, 4), rj.Sigmoid())), small),
         "rectified": (rj.ClosedLoop(swing, tanh_net(2, 1, 2, (4, 3), rj.ReLU()), unit), small),
         "ball": (rj.ClosedLoop(swing, tanh_net(2, 1)), ball),
-        "polytope": (rj.ClosedLoop(rj.NonlinearPlant(van_der_pol, 2, 1), tanh_net(2, 1, 3)), corner),
+        "polytope": (rj.ClosedLoop(oscillator, tanh_net(2, 1, 3)), corner),
         "car": (
             rj.ClosedLoop(rj.NonlinearPlant(car, 3, 1), tanh_net(3, 1, 4, (4,), rj.ReLU())),
             rj.Box([0.0, 0.0, 0.2], [0.1, 0.2, 0.5]),
@@ -126,15 +128,24 @@ def test_compiled_sets_are_those_of_the_host(case):
         np.testing.assert_allclose(compiled, on_host, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["pendulum", "sigmoid", "boxed", "car", "tank", "scalar"])
-def test_sets_are_tight(name):
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [
+        ("pendulum", 1.01),
+        ("sigmoid", 1.01),
+        ("boxed", 1.03),
+        ("tank", 1.01),
+        ("car", 1.25),
+    ],
+)
+def test_sets_are_tight(name, most):
     loop, X0 = LOOPS[name]
     tube = rj.reach(loop, X0, HORIZON, rj.Template.box(loop.states))
     runs = trajectories(loop, X0, 20_000)
     for t in range(1, HORIZON + 1):
         offsets = np.asarray(tube.sets[t].b)
         widths = offsets[::2] + offsets[1::2]
-        assert np.all(widths <= 1.1 * np.ptp(runs[:, t], axis=0))
+        assert np.all(widths <= most * np.ptp(runs[:, t], axis=0))
 
 
 @pytest.mark.parametrize("relaxation", RELAXATIONS[:2], ids=lambda r: type(r).__name__)
@@ -145,28 +156,34 @@ def test_derivatives_are_central_differences(name, relaxation):
 
     def size(given):
         loop, X0 = given
-        return rj.log_widths(rj.reach(loop, X0, HORIZON, template, relaxation, samples=20))
+        tube = rj.reach(loop, X0, HORIZON, template, relaxation, samples=20, gap=1e-7)
+        return sum(rj.log_widths(X).sum() for X in tube.sets[1:])
 
-    flat, restore = jax.flatten_util.ravel_pytree((loop, X0))
-    slopes = jax.flatten_util.ravel_pytree(jax.grad(size)((loop, X0)))[0]
+    if isinstance(X0, rj.Ellipsoid):  # whose shape stays symmetric
+        fixed, X0 = X0, X0.center
+        sized, size = size, lambda given: sized((given[0], fixed.replace(center=given[1])))
+    flat, restore = ravel_pytree((loop, X0))
+    slopes = ravel_pytree(jax.grad(size)((loop, X0)))[0]
     rng = np.random.default_rng(0)
     for _ in range(3):
         direction, step = rng.normal(size=flat.shape), 1e-6
         ends = [size(restore(flat + sign * step * direction)) for sign in (1, -1)]
         difference = (ends[0] - ends[1]) / (2 * step)
-        assert slopes @ direction == pytest.approx(float(difference), rel=1e-4)
+        # ranges of rectifiers that linear programs found have the derivatives of their forms
+        mixed = name == "boxed" and relaxation == rj.BranchAndCut()
+        assert slopes @ direction == pytest.approx(float(difference), rel=0.02 if mixed else 1e-4)
 
 
 def test_a_remainder_that_is_infinite_says_where_and_what_to_do():
     loop = rj.ClosedLoop(
         rj.NonlinearPlant(lambda x, u: 1 / x + u, 1, 1), rj.Network(lambda x: 0 * x, 1, 1)
     )
-    message = r"Reciprocal at t = 0 .*\[-1.*, 1.*\].*cells"
+    message = r"Reciprocal .in .*test_nonlinear.* at t = 0 has inputs in .-1, 1., .*cells"
     for relaxation in RELAXATIONS[:2]:
         with pytest.raises(ValueError, match=message):
             rj.reach(loop, rj.Box([-1.0], [1.0]), 1, rj.Template.box(1), relaxation)
     with pytest.raises(ValueError, match=message):
-        rj.decide(loop, rj.Box([-1.0], [1.0]), 1, goal=rj.Box([-9.0], [9.0]))
+        rj.decide(loop, rj.Box([-1.0], [1.0]), 1, goal=rj.Box([-1e9], [1e9]))
 
 
 def test_specifications_are_decided():

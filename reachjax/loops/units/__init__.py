@@ -14,13 +14,12 @@ from reachjax.loops.units.base import (
 )
 from reachjax.loops.units.clip import clipped
 from reachjax.loops.units.exponential import Exp, Log
-from reachjax.loops.units.extremes import absolute, maximum, minimum
 from reachjax.loops.units.hard_tanh import HardTanh
 from reachjax.loops.units.hyperbolic import Sigmoid, Tanh
 from reachjax.loops.units.leaky_relu import LeakyReLU
 from reachjax.loops.units.powers import Reciprocal, Sqrt, Square
 from reachjax.loops.units.relu import ReLU
-from reachjax.loops.units.smooth import Quadratic, SmoothUnit
+from reachjax.loops.units.smooth import Quadratic, SmoothUnit, UnboundedError
 from reachjax.loops.units.trigonometric import Atan, Cos, Sin
 
 __all__ = [
@@ -48,9 +47,7 @@ __all__ = [
     "Sqrt",
     "Square",
     "Tanh",
-    "absolute",
+    "UnboundedError",
     "clipped",
     "evaluate",
-    "maximum",
-    "minimum",
 ]

@@ -59,6 +59,27 @@ class Quadratic(NamedTuple):
     gap: Array
 
 
+class UnboundedError(ValueError):
+    """That a unit has no bounds on the range of its inputs.
+
+    Args:
+        unit: which one.
+        t: the time.
+        lower: of the range.
+        upper: the same.
+        line: where a user wrote it; nothing where that is not known.
+    """
+
+    def __init__(self, unit: AbstractUnit, t: int, lower: float, upper: float, line: str = ""):
+        name = type(unit).__name__
+        super().__init__(
+            f"{name}{line} at t = {t} has inputs in [{lower:g}, {upper:g}], on which it has no "
+            "bounds: keep them away from what is outside of its domain, or take smaller cells of "
+            "X0 (reach_partitioned, or decide(..., cells=...))"
+        )
+        self.given = unit, t, lower, upper
+
+
 class SmoothUnit(AbstractUnit):
     """A unit three times differentiable where it is defined.
 

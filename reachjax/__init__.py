@@ -83,12 +83,12 @@ from reachjax.training import (
 )
 from reachjax.tubes.decisions import decide
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
-from reachjax.tubes.plotting import plot_set, plot_tube
+from reachjax.tubes.plotting import plot_cells, plot_set, plot_tube
 from reachjax.tubes.reach import Interrupted, ReachTube, reach, reach_step
 from reachjax.tubes.requirements import shortfall
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.tubes.specs import verify
-from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
+from reachjax.tubes.verdicts import Counterexample, DecidedCell, Verdict, VerdictStatus
 
 __version__ = "0.1.0"
 
@@ -120,6 +120,7 @@ __all__ = [
     "Counterexample",
     "CuttingPlanes",
     "CvxpySolver",
+    "DecidedCell",
     "Ellipsoid",
     "EllipsoidCertificate",
     "EllipsoidTemplate",
@@ -162,6 +163,7 @@ __all__ = [
     "keep_compilations",
     "log_volume",
     "log_widths",
+    "plot_cells",
     "plot_set",
     "plot_tube",
     "reach",

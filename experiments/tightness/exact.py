@@ -170,6 +170,7 @@ def _successor(loop: rj.ClosedLoop, program: Program, state: ndarray, t: int) ->
     """Rows of the state one step later."""
     net = loop.controller
     assert isinstance(net, rj.MLP)
+    assert isinstance(loop.plant, rj.AffinePlant)
     *hidden, (W, b) = net.layers
     z = state
     for V, a in hidden:

@@ -269,6 +269,21 @@ def require_bar(progress: Any) -> None:
         )
 
 
+def require_executor(executor: Any) -> None:
+    """Check that an executor is None or has the interface of those of `concurrent.futures`.
+
+    Raises:
+        TypeError: it is neither.
+    """
+    if executor is not None and (
+        isinstance(executor, type) or not callable(getattr(executor, "submit", None))
+    ):
+        raise TypeError(
+            "executor must be an object with a method submit, as those of concurrent.futures are, "
+            f"but {described(executor)} arrived"
+        )
+
+
 def described(value: Any) -> str:
     """A short word for what arrived: classes and plain values as they are, objects by kind."""
     if isinstance(value, type | str | int | float | list | None):

@@ -75,7 +75,11 @@ def halves(X: AbstractSet, box: Box, scale: Float[np.ndarray, " n"]) -> list[Cel
         >>> [cell.part.upper.tolist() for cell in halves(X, X, np.ones(2))]
         [[1.0, 1.0], [1.0, 2.0]]
     """
-    axis = int(np.argmax(np.asarray(box.widths) / scale))
+    return halves_along(X, box, int(np.argmax(np.asarray(box.widths) / scale)))
+
+
+def halves_along(X: AbstractSet, box: Box, axis: int) -> list[Cell]:
+    """The parts of a set in a box on either side of its middle along one coordinate."""
     middle = box.center[axis]
     below = Box(box.lower, box.upper.at[axis].set(middle))
     above = Box(box.lower.at[axis].set(middle), box.upper)

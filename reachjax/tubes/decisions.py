@@ -9,6 +9,9 @@ until it is decided.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import Executor
+
 import jax
 import numpy as np
 
@@ -17,7 +20,9 @@ from reachjax.loops.batches import trajectories
 from reachjax.numerics.checks import (
     is_concrete,
     owned,
+    require_bar,
     require_double_precision,
+    require_executor,
     require_kind,
     same_size,
     whole_number,
@@ -28,11 +33,13 @@ from reachjax.proofs.branches import BranchCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated, Simulations
 from reachjax.sets import AbstractSet, PolyhedralSet
-from reachjax.tubes.ladder import WORK, Climbed, Ladder, Target
-from reachjax.tubes.propagation import deadline_of, require_kinds, simulations_from
+from reachjax.tubes.cell_decisions import CellTask, decided_by_cells, roots
+from reachjax.tubes.ladder import WORK, Climbed, Ladder
+from reachjax.tubes.propagation import Progress, deadline_of, require_kinds, simulations_from
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Requirement, requirements
 from reachjax.tubes.steps import boxed
+from reachjax.tubes.targets import target_of
 from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
 
 FEW = 50
@@ -40,9 +47,6 @@ FEW = 50
 
 PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
 """How far an initial state is brought towards the middle of the set, so that it surely is in it."""
-
-BELOW = 1e-9
-"""How far below zero a linear program should be, as a part of its form's range, to prove that."""
 
 
 def decide(
@@ -58,6 +62,9 @@ def decide(
     samples: int = 1000,
     seed: int = 0,
     time_limit: float | None = None,
+    cells: int | Sequence[int] | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
 ) -> Verdict:
     """Decide a reach-avoid specification without a tube.
 
@@ -76,9 +83,18 @@ def decide(
         seed: of the samples.
         time_limit: seconds, after which nothing is solved any more. None: until all is decided or
             budgets are used up.
+        cells: a number for each coordinate: the equal parts of the box around the initial set to
+            begin with. Or a number in all, which begins with the whole set. Cells that stay
+            undecided are halved where it matters most, until all are decided or the time is over,
+            or there are as many as the number says. None: the whole set is bounded at once, and has
+            certificates.
+        executor: runs the cells: any with the interface of `concurrent.futures`, such as a
+            `ProcessPoolExecutor`. None: one after the other, here.
+        progress: wraps the iteration over cells to show a progress bar, such as `tqdm.tqdm`.
 
     Returns:
-        The verdict, with a certificate of each requirement that is proved after the first time.
+        The verdict, with a certificate of each requirement that is proved after the first time, or
+        with what is known of each cell.
 
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
@@ -116,6 +132,12 @@ def decide(
     required = requirements(loop.states, horizon, goal, avoid, safe)
     loop, X0 = owned(fixed)
     simulations = simulations_from(loop, X0, horizon, start, samples, seed)
+    if cells is not None:
+        counts, most = roots(X0, cells)
+        require_executor(executor)
+        require_bar(progress)
+        task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
+        return decided_by_cells(task, X0, counts, most, simulations, deadline, executor, progress)
     decision = _Decision(loop, X0, horizon, start, required, simulations)
     decision.at_first()
     on_host, begun, around = jax.device_get((loop, X0, boxed(X0, "X0")))
@@ -201,7 +223,7 @@ class _Decision:
 
     def _decided(self, key: tuple[str, int], item: Requirement, ladder: Ladder) -> None:
         """Bound one requirement at the time that the ladder has come to."""
-        target, units = _target(item, ladder, self._simulations)
+        target, units = target_of(item, ladder, self._simulations)
         left = sum(other.time >= item.time for other in self._open.values())
         climbed = ladder.climbed(target, (left - 1) * len(target.forms), ladder.until(1 / left))
         right = climbed.bounds <= 0 if item.inside else climbed.bounds < 0
@@ -239,35 +261,6 @@ class _Decision:
             row[item.time] = np.fmin(row[item.time], rooms.min())
             found += suspects(item, rooms, runs)
         self._example = counterexample(self._loop, self._X0, found, self._start)
-
-
-def _target(
-    item: Requirement, ladder: Ladder, simulations: Simulations | None
-) -> tuple[Target, np.ndarray]:
-    """What must be below zero: the excess over each facet, or the depth in the set."""
-    parts = item.region.facets_in_units(inner=item.inside)
-    C, d, norms = (np.asarray(part) for part in parts)
-    state, start = ladder.horizon.state, ladder.horizon.start
-    if item.inside:
-        excess = C @ state + (-d)
-        forms = [excess[i : i + 1] for i in range(len(d))]
-    else:
-        forms = [(1 / norms) * (d - C @ state)]
-
-    def values(after: np.ndarray) -> np.ndarray:
-        excess = after @ C.T - d
-        return excess if item.inside else (-excess / norms).min(axis=1, keepdims=True)
-
-    sizes = [np.subtract(*form.ends(start)[::-1]).max() for form in forms]
-
-    def enough(number: int, bound: float, attained: float) -> bool:
-        return bound <= -BELOW * sizes[number] or attained > 0
-
-    if simulations is None:
-        known = Simulated.nothing(np.asarray(start.center), len(forms))
-    else:
-        known = simulations.known(values(simulations.trajectories[:, len(ladder.horizon.steps)]))
-    return Target(forms, values, enough, known), norms if item.inside else np.ones(1)
 
 
 def _certificate(climbed: Climbed, known: Simulated, least: bool) -> BranchCertificate:

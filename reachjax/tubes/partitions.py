@@ -23,6 +23,7 @@ from reachjax.numerics.checks import (
     real_number,
     require_bar,
     require_double_precision,
+    require_executor,
     require_kind,
     whole_number,
     wrapped,
@@ -166,13 +167,7 @@ def reach_partitioned(
     require_double_precision(loop=loop, X0=X0, template=template)
     if not is_concrete(loop, X0, template):
         raise ValueError("partitions need numbers: call reach_partitioned outside of jax.jit")
-    if executor is not None and (
-        isinstance(executor, type) or not callable(getattr(executor, "submit", None))
-    ):
-        raise TypeError(
-            "executor must be an object with a method submit, as those of concurrent.futures are, "
-            f"but {described(executor)} arrived"
-        )
+    require_executor(executor)
     require_bar(progress)
     X0 = owned(X0)
     options = {

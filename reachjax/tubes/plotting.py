@@ -11,11 +11,17 @@ from reachjax.numerics.checks import require_kind
 from reachjax.sets import AbstractSet
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
+from reachjax.tubes.verdicts import Verdict, VerdictStatus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SET = {"facecolor": "none", "edgecolor": "tab:red", "linewidth": 1.4}
+CELL_COLORS = {
+    VerdictStatus.PROVED: "tab:green",
+    VerdictStatus.UNKNOWN: "tab:gray",
+    VerdictStatus.REFUTED: "tab:red",
+}
 SAMPLE_STYLE = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
 
 
@@ -104,6 +110,50 @@ def plot_tube(
     _plot_cell(first, ax, samples, i, j, ("simulated", "initial set", "certified"))
     for cell in others:
         _plot_cell(cell, ax, samples, i, j, (None, None, None))
+    ax.set_xlabel(f"$x_{{{i + 1}}}$")
+    ax.set_ylabel(f"$x_{{{j + 1}}}$")
+    return ax
+
+
+def plot_cells(
+    verdict: Verdict, ax: Axes | None = None, coordinates: tuple[int, int] = (0, 1)
+) -> Axes:
+    """Draw which cells of an initial set are proved, refuted and undecided.
+
+    Of sets of more than two dimensions it draws the cells' shadows, the undecided ones above the
+    proved ones, and the refuted ones above all.
+
+    Args:
+        verdict: of `decide(..., cells=...)`.
+        ax: where to draw; a new figure by default.
+        coordinates: the two states to draw, counted from 0: the horizontal axis, then the vertical
+            one.
+
+    Raises:
+        TypeError: it is no verdict.
+        ValueError: it has no cells, or the coordinates are not two of its states.
+    """
+    require_kind("verdict", verdict, Verdict, "a Verdict, as decide(...) returns it")
+    if not verdict.cells:
+        raise ValueError("verdict has no cells: give decide(..., cells=...) a number of them")
+    i, j = _two_of(len(verdict.cells[0].lower), coordinates)
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Patch, Rectangle
+
+    ax, handles = _axes(ax), []
+    for status, color in CELL_COLORS.items():
+        cells = [cell for cell in verdict.cells if cell.status is status]
+        if not cells:
+            continue
+        boxes = [
+            Rectangle((cell.lower[i], cell.lower[j]), *(cell.upper - cell.lower)[[i, j]])
+            for cell in cells
+        ]
+        look = {"facecolor": color, "edgecolor": "white", "linewidth": 0.4, "alpha": 0.8}
+        ax.add_collection(PatchCollection(boxes, **look))
+        handles.append(Patch(facecolor=color, label=f"{status.value}: {len(cells)}"))
+    ax.autoscale_view()
+    ax.legend(handles=handles)
     ax.set_xlabel(f"$x_{{{i + 1}}}$")
     ax.set_ylabel(f"$x_{{{j + 1}}}$")
     return ax

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -45,6 +46,22 @@ class Counterexample:
     inputs: Float[np.ndarray, "h n_u"]
 
 
+class DecidedCell(NamedTuple):
+    """What is known of one cell of an initial set.
+
+    Attributes:
+        lower: `(n_x,)`, of its box.
+        upper: `(n_x,)`.
+        status: of the cell alone: refuted is one in which a counterexample begins.
+        margin: the smallest certified one.
+    """
+
+    lower: Float[np.ndarray, " n_x"]
+    upper: Float[np.ndarray, " n_x"]
+    status: VerdictStatus
+    margin: float
+
+
 @dataclasses.dataclass(frozen=True)
 class Verdict:
     """What is known of a specification, part by part.
@@ -59,6 +76,7 @@ class Verdict:
             bounds hold, but may be loose.
         certificates: of a verdict without a tube, what each requirement that is proved rests on,
             by its name and its time.
+        cells: of a decision by cells, what is known of each, see `plot_cells`.
     """
 
     status: VerdictStatus
@@ -67,6 +85,7 @@ class Verdict:
     counterexample: Counterexample | None = None
     unsolved: int = 0
     certificates: Mapping[tuple[str, int], AbstractProof] = dataclasses.field(default_factory=dict)
+    cells: tuple[DecidedCell, ...] = ()
 
     def __bool__(self) -> bool:
         raise TypeError("a verdict has three values: compare verdict.status with VerdictStatus")
@@ -89,6 +108,10 @@ class Verdict:
                 f"  counterexample: from {np.round(e.states[0], 4).tolist()} it breaks "
                 f"{e.requirement} at t = {e.time} by {e.violation:.4g}"
             )
+        if self.cells:
+            counts = [sum(each.status is status for each in self.cells) for status in VerdictStatus]
+            proved, refuted, unknown = counts
+            lines.append(f"  cells: {proved} proved, {refuted} refuted, {unknown} undecided")
         if self.unsolved:
             lines.append(
                 f"  {self.unsolved} programs were not solved to tolerance: their bounds hold, but "

@@ -164,7 +164,7 @@ def test_forms_keep_what_later_programs_need():
     case = controlled(rj.ReLU(), seed=3)
     loop, box = jax.device_get((case.loop, box_of(2)))
     start = InitialColumns.of(box, box)
-    state, layers = step_forms(loop, AffineForms.beginning(start), 0, start)
+    state, layers, _ = step_forms(loop, AffineForms.beginning(start), 0, start)
     x = np.asarray(rj.Box(box.lower, box.upper).sample(jax.random.key(0), 500))
     w = (x - start.center) / np.diag(start.spread)
     eta = np.zeros((500, state.columns.shape[1]))
@@ -259,6 +259,6 @@ def test_branches_that_began_alike_have_columns_of_their_own():
     assert tube.sets[1].b[0] >= 0.5
     assert tube.proof(1).recheck()[0] >= 0.5
     start = InitialColumns.of(*jax.device_get((box, box)))
-    _, layers = step_forms(jax.device_get(loop), AffineForms.beginning(start), 0, start)
+    _, layers, _ = step_forms(jax.device_get(loop), AffineForms.beginning(start), 0, start)
     places = np.concatenate([layer.places for layer in layers])
     assert len(np.unique(places)) == len(places) == 2

@@ -25,6 +25,7 @@ def affine_bounds(
 ) -> Float[ndarray, "horizon m"]:
     """Bounds of directions `(m, n_x)` of the states after `1 .. horizon` steps, ReLUs only."""
     assert isinstance(loop.controller, rj.MLP)
+    assert isinstance(loop.plant, rj.AffinePlant)
     layers = [(np.asarray(W), np.asarray(b)) for W, b in loop.controller.layers]
     lower, upper = np.asarray(X0.lower), np.asarray(X0.upper)
     x = np.hstack([(lower + upper)[:, None], np.diag(upper - lower)]) / 2

@@ -106,6 +106,7 @@ def by_paper(task: Task, settings: Settings) -> Answer:
 
 def _paper_data(task: Task, X: rj.PolyhedralSet, t: int) -> dict:
     """What `paper_step` takes beside its directions."""
+    assert isinstance(task.loop.plant, rj.AffinePlant)
     A, B, c = map(np.asarray, task.loop.plant.at(t))
     set_A, set_b = map(np.asarray, X.facets)
     lower = upper = None

@@ -1,0 +1,307 @@
+"""Verdicts by cells: each cell of an initial set is proved, or halved, or left undecided.
+
+A cell is bounded by forms, whose remainders fall with the third power of its width, and where
+rectifiers switch by linear programs. It is left at the first requirement that is not proved: what
+comes later would only be worse. Halves are taken along the coordinate that moves the inputs of
+units most. Of a cell nothing is kept but its box and its margins.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.loops.batches import trajectories
+from reachjax.loops.units import SmoothUnit
+from reachjax.numerics.checks import described, whole_number, wrapped
+from reachjax.proofs.witnesses import Simulations
+from reachjax.sets import AbstractSet, Box
+from reachjax.tubes.cells import Cell, grid, halves_along
+from reachjax.tubes.ladder import WORK, Ladder
+from reachjax.tubes.refutations import Suspect, counterexample, suspects
+from reachjax.tubes.requirements import Requirement
+from reachjax.tubes.steps import boxed
+from reachjax.tubes.targets import target_of
+from reachjax.tubes.verdicts import Counterexample, DecidedCell, Verdict, VerdictStatus
+
+Margins = dict[str, Float[np.ndarray, " h+1"]]
+
+SHOTS = 64
+"""How many trajectories are simulated from a cell that is not proved."""
+
+FEW = 50
+"""Linear programs that a bound may take in a cell: halving it is the other way."""
+
+AHEAD = 4
+"""How many cells an executor is given for each of its workers, at least."""
+
+
+class CellTask(NamedTuple):
+    """What is decided of every cell.
+
+    Attributes:
+        loop: of numpy arrays.
+        horizon: the number of steps.
+        start: the time of the initial set.
+        required: the requirements.
+        nodes: how many linear programs a bound may take.
+    """
+
+    loop: ClosedLoop
+    horizon: int
+    start: int
+    required: tuple[Requirement, ...]
+    nodes: int
+
+
+class Outcome(NamedTuple):
+    """What is found of a cell.
+
+    Attributes:
+        proved: whether all requirements are.
+        margins: of those that were looked at; NaN of the others.
+        axis: along which it should be halved.
+    """
+
+    proved: bool
+    margins: Margins
+    axis: int
+
+    @property
+    def margin(self) -> float:
+        """The smallest."""
+        return float(min(np.nanmin(row) for row in self.margins.values() if np.isfinite(row).any()))
+
+
+def roots(X0: AbstractSet, cells: Any) -> tuple[list[Cell], int | None]:
+    """The cells to begin with, and how many there may be in all.
+
+    Raises:
+        TypeError: `cells` is neither a number nor one for each coordinate.
+        ValueError: there is not a positive number for each coordinate.
+    """
+    if isinstance(cells, np.ndarray | jax.Array) and cells.ndim < 2:
+        cells = cells.tolist()
+    if isinstance(cells, int | np.integer) and not isinstance(cells, bool):
+        box = boxed(X0, "X0")
+        return [Cell(box, X0)], whole_number("cells", cells, 1)
+    if isinstance(cells, Sequence) and not isinstance(cells, str):
+        return grid(X0, cells), None
+    raise TypeError(
+        f"cells must be a whole number, or one for each coordinate, but {described(cells)} arrived"
+    )
+
+
+def decided_by_cells(
+    task: CellTask,
+    X0: AbstractSet,
+    begun: Sequence[Cell],
+    most: int | None,
+    simulations: Simulations | None,
+    deadline: float,
+    executor: Executor | None = None,
+    progress: Callable[[Iterable[Any]], Iterable[Any]] | None = None,
+) -> Verdict:
+    """The verdict on all cells.
+
+    Args:
+        task: what is decided.
+        X0: the initial set.
+        begun: the cells to begin with.
+        most: how many cells there may be; None: as many as it takes.
+        simulations: trajectories from the set.
+        deadline: when to stop, as `time.monotonic` says it.
+        executor: runs the cells; None: here.
+        progress: wraps the iteration over cells.
+    """
+    run = _Run(task, X0, most, deadline)
+    if simulations is not None:
+        run.seen(simulations.trajectories)
+    if run.example is None:
+        for _ in wrapped(progress, run.results(begun, executor)):
+            if run.example is not None:
+                break
+    return run.verdict()
+
+
+class _Run:
+    """What is known of all cells so far.
+
+    Attributes:
+        example: a counterexample, once one is found.
+    """
+
+    def __init__(self, task: CellTask, X0: AbstractSet, most: int | None, deadline: float):
+        self._task, self._X0, self._most, self._deadline = task, X0, most, deadline
+        self._loop = jax.device_put(task.loop)
+        self._done: list[DecidedCell] = []
+        self._count = 0
+        blank = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
+        self._margins, self._simulated = blank, {name: row.copy() for name, row in blank.items()}
+        self.example: Counterexample | None = None
+
+    def results(self, begun: Sequence[Cell], executor: Executor | None) -> Iterator[int]:
+        """How many cells are decided, after each that is bounded."""
+        open_cells = list(begun)[::-1]
+        self._count = len(open_cells)
+        running: dict[Future, Cell] = {}
+        workers = 1 if executor is None else AHEAD * getattr(executor, "_max_workers", AHEAD)
+        try:
+            while open_cells or running:
+                while open_cells and len(running) < workers:
+                    cell = open_cells.pop()
+                    part = jax.device_get(cell.part)
+                    running[_submitted(executor, self._task, part, self._deadline)] = cell
+                finished, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    open_cells += self._judged(running.pop(future), future.result())[::-1]
+                    yield len(self._done)
+                if self.example is not None:
+                    return
+        finally:
+            for future in running:
+                future.cancel()
+
+    def _judged(self, cell: Cell, outcome: Outcome) -> list[Cell]:
+        """The halves of a cell that is not proved, as long as there may be more."""
+        if outcome.proved:
+            self._kept(cell, outcome, VerdictStatus.PROVED)
+            return []
+        self._shoot(cell)
+        late = time.monotonic() >= self._deadline
+        full = self._most is not None and self._count >= self._most
+        flat = not float(cell.box.widths[outcome.axis]) > 0
+        if late or full or flat or self.example is not None:
+            self._kept(cell, outcome, VerdictStatus.UNKNOWN)
+            return []
+        found = halves_along(self._X0, cell.box, outcome.axis)
+        self._count += len(found) - 1
+        return found
+
+    def _kept(self, cell: Cell, outcome: Outcome, status: VerdictStatus) -> None:
+        lower, upper = np.asarray(cell.box.lower), np.asarray(cell.box.upper)
+        if self.example is not None:
+            first = self.example.states[0]
+            if np.all((lower <= first) & (first <= upper)):
+                status = VerdictStatus.REFUTED
+        self._done.append(DecidedCell(lower, upper, status, outcome.margin))
+        for item in self._task.required:
+            row, margin = self._margins[item.name], outcome.margins[item.name][item.time]
+            if np.isnan(margin):
+                margin = -np.inf  # nothing was looked at
+            row[item.time] = np.fmin(row[item.time], margin)
+
+    def _shoot(self, cell: Cell) -> None:
+        """Simulate a few trajectories from a cell: corners and points."""
+        rng = np.random.default_rng(len(self._done))
+        lower, upper = np.asarray(cell.box.lower), np.asarray(cell.box.upper)
+        ends = rng.uniform(size=(SHOTS, len(lower)))
+        ends[: SHOTS // 2] = ends[: SHOTS // 2] > 0.5
+        states = np.clip(lower + ends * (upper - lower), lower, upper)
+        states = states[np.asarray(self._X0.contains(states))]
+        if len(states):
+            self.seen(trajectories(self._task.loop, states, self._task.horizon, self._task.start))
+
+    def seen(self, runs: np.ndarray) -> None:
+        """What trajectories show, a counterexample perhaps."""
+        runs = runs[np.isfinite(runs).all(axis=(1, 2))]
+        found: list[Suspect] = []
+        for item in self._task.required if len(runs) else ():
+            rooms = item.simulated(runs)
+            row = self._simulated[item.name]
+            row[item.time] = np.fmin(row[item.time], rooms.min())
+            found += suspects(item, rooms, runs)
+        self.example = counterexample(self._loop, self._X0, found, self._task.start)
+
+    def verdict(self) -> Verdict:
+        """All of it."""
+        statuses = {each.status for each in self._done}
+        status = VerdictStatus.PROVED if statuses == {VerdictStatus.PROVED} else None
+        if self.example is not None:
+            status = VerdictStatus.REFUTED
+        return Verdict(
+            status or VerdictStatus.UNKNOWN,
+            self._margins,
+            self._simulated,
+            self.example,
+            cells=tuple(self._done),
+        )
+
+
+def _submitted(executor: Executor | None, *given: Any) -> Future:
+    if executor is not None:
+        return executor.submit(outcome_of, *given)
+    future: Future = Future()
+    future.set_result(outcome_of(*given))
+    return future
+
+
+def outcome_of(task: CellTask, part: AbstractSet, deadline: float) -> Outcome:
+    """What is found of one cell, wherever it runs.
+
+    Args:
+        task: what is decided.
+        part: of the initial set, of numpy arrays.
+        deadline: when to stop, as `time.monotonic` says it.
+    """
+    with jax.enable_x64(True):
+        box = boxed(jax.device_put(part), "X0")
+        begun = _open_box(part, box)
+        around = jax.device_get(box)
+        margins = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
+        nodes = min(FEW, task.nodes)
+        ladder = Ladder(task.loop, begun, around, task.start, nodes, deadline, WORK)
+        for k in range(task.horizon + 1):
+            if k:
+                ladder.advance(tighten=False)
+            for item in task.required:
+                if item.time == k:
+                    proved, margin = _bounded(item, ladder, part)
+                    margins[item.name][k] = margin
+                    if not proved:
+                        return Outcome(False, margins, _axis(ladder, item))
+        return Outcome(True, margins, 0)
+
+
+def _open_box(part: AbstractSet, box: Box) -> AbstractSet:
+    """The cell as it is; a polytope that is its box as a box."""
+    return jax.device_get(box) if isinstance(part, Box) else part
+
+
+def _bounded(item: Requirement, ladder: Ladder, part: AbstractSet) -> tuple[bool, float]:
+    """Whether a requirement surely holds where the ladder has come to, and its margin."""
+    if item.time == 0:
+        compared = item.compared_with(jax.device_put(part))
+        return item.proved(compared), float(compared.margins.min())
+    target, units = target_of(item, ladder, None)
+    start = ladder.horizon.start
+    uppers = [form.ends(start)[1] for form in target.forms]
+    bounds = np.array([upper.min() for upper in uppers])
+    if not _all_right(item, bounds) and len(ladder.horizon.zero):
+        bounds = ladder.climbed(target).bounds
+    return _all_right(item, bounds), float(np.min(-bounds / units))
+
+
+def _all_right(item: Requirement, bounds: Float[np.ndarray, " g"]) -> bool:
+    return bool(np.all(bounds <= 0 if item.inside else bounds < 0))
+
+
+def _axis(ladder: Ladder, item: Requirement) -> int:
+    """The coordinate that moves the inputs of the first step's units most, or what is required."""
+    horizon = ladder.horizon
+    n = len(horizon.start.center)
+    size = np.zeros(n)
+    for layer in horizon.steps[0] if horizon.steps else ():
+        bent = isinstance(layer.unit, SmoothUnit) | (layer.places >= 0)
+        size += abs(layer.inputs.columns[:, :n])[np.broadcast_to(bent, layer.places.shape)].sum(0)
+    if not size.any():
+        C = np.asarray(item.region.facets[0])
+        size = abs(C @ horizon.start.spread).sum(axis=0)
+    return int(size.argmax())

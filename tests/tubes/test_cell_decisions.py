@@ -1,0 +1,146 @@
+"""Decisions by cells: what is proved holds, what is refuted does not, and cells cover the set."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import reachjax as rj
+from tests.networks import he_network
+
+HORIZON = 4
+
+
+def swing(x, u):
+    return jnp.array([x[0] + 0.1 * x[1], x[1] + 0.1 * (5 * jnp.sin(x[0]) + u[0])])
+
+
+@pytest.fixture(scope="module")
+def smooth():
+    law = rj.Network(lambda x: -8 * jnp.tanh(x[:1] + 0.5 * x[1:]), 2, 1)
+    return rj.ClosedLoop(rj.NonlinearPlant(swing, 2, 1), law)
+
+
+@pytest.fixture(scope="module")
+def rectified():
+    plant = rj.AffinePlant([[1.0, 0.2], [0.0, 1.0]], [[0.0], [0.2]])
+    net = rj.MLP.from_layers(he_network((2, 5, 1), 3))
+    return rj.ClosedLoop(plant, net, rj.Box([-1.0], [1.0]))
+
+
+X0 = rj.Box([-1.0, -1.0], [1.0, 1.0])
+
+
+def around(loop, X0, room):
+    """A box that simulations leave by no more than a room, which may be negative."""
+    states = jnp.concatenate([X0.corners(), X0.sample(jax.random.key(0), 4000)])
+    runs = np.asarray(loop.simulate(states, HORIZON)).reshape(-1, 2)
+    return rj.Box(runs.min(axis=0) - room, runs.max(axis=0) + room)
+
+
+def covered(verdict, X):
+    """Whether every point of a set is in a cell."""
+    points = np.asarray(jnp.concatenate([X.corners(), X.sample(jax.random.key(1), 2000)]))
+    lower, upper = (
+        np.stack([getattr(c, end) for c in verdict.cells]) for end in ("lower", "upper")
+    )
+    inside = (lower <= points[:, None] + 1e-12) & (points[:, None] <= upper + 1e-12)
+    return bool(inside.all(axis=2).any(axis=1).all())
+
+
+@pytest.mark.parametrize("name", ["smooth", "rectified"])
+@pytest.mark.parametrize("cells", [(2, 3), 400])
+def test_what_simulations_keep_a_distance_of_is_proved(name, cells, request):
+    loop = request.getfixturevalue(name)
+    verdict = rj.decide(loop, X0, HORIZON, safe=around(loop, X0, 0.02), cells=cells)
+    assert verdict.status is rj.VerdictStatus.PROVED
+    assert all(cell.status is rj.VerdictStatus.PROVED for cell in verdict.cells)
+    assert covered(verdict, X0)
+    assert 0 < np.nanmin(verdict.margins["safe"]) <= np.nanmin(verdict.simulated["safe"]) + 1e-12
+    assert "proved, 0 refuted, 0 undecided" in str(verdict)
+
+
+@pytest.mark.parametrize("name", ["smooth", "rectified"])
+def test_what_is_broken_is_refuted_by_a_trajectory(name, request):
+    loop = request.getfixturevalue(name)
+    region = around(loop, X0, -1e-3)
+    verdict = rj.decide(loop, X0, HORIZON, safe=region, cells=20)
+    assert verdict.status is rj.VerdictStatus.REFUTED
+    states = verdict.counterexample.states
+    np.testing.assert_allclose(loop.simulate(states[0], HORIZON), states, atol=1e-9)
+    assert not region.contains(states[verdict.counterexample.time])
+
+
+def test_a_limit_leaves_cells_undecided_and_margins_that_say_so(smooth):
+    region = around(smooth, X0, 1e-4)
+    for limit in ({"cells": 5}, {"cells": (2, 2), "time_limit": 0.0}):
+        verdict = rj.decide(smooth, X0, HORIZON, safe=region, **limit)
+        assert verdict.status is rj.VerdictStatus.UNKNOWN
+        assert len(verdict.cells) == (5 if limit["cells"] == 5 else 4)
+        assert covered(verdict, X0)
+        assert np.min(verdict.margins["safe"]) < 0
+
+
+def test_an_executor_finds_the_same(smooth):
+    region = around(smooth, X0, 0.05)
+    alone = rj.decide(smooth, X0, HORIZON, safe=region, cells=(2, 2))
+    with ThreadPoolExecutor(2) as executor:
+        shared = rj.decide(smooth, X0, HORIZON, safe=region, cells=(2, 2), executor=executor)
+    assert alone.status is shared.status is rj.VerdictStatus.PROVED
+    np.testing.assert_array_equal(alone.margins["safe"], shared.margins["safe"])
+
+
+def test_cells_of_polytopes_and_avoided_sets(smooth):
+    triangle = rj.Polytope([[-1.0, 0], [0, -1], [1, 1]], [0.2, 0.2, 0.3])
+    reached = around(smooth, triangle, 0.02)
+    beyond = rj.Box(np.asarray(reached.upper), np.asarray(reached.upper) + 1)
+    verdict = rj.decide(smooth, triangle, HORIZON, safe=reached, avoid=[beyond], cells=200)
+    assert verdict.status is rj.VerdictStatus.PROVED
+    assert covered(verdict, triangle)
+
+
+def test_a_bar_sees_every_cell_that_is_bounded(smooth):
+    seen = []
+
+    def bar(items):
+        for item in items:
+            seen.append(item)
+            yield item
+
+    verdict = rj.decide(
+        smooth, X0, HORIZON, safe=around(smooth, X0, 0.05), cells=(2, 2), progress=bar
+    )
+    assert seen[-1] == len(verdict.cells)
+
+
+def test_cells_are_drawn_by_what_is_known_of_them(smooth):
+    verdict = rj.decide(smooth, X0, HORIZON, safe=around(smooth, X0, 1e-4), cells=6)
+    ax = rj.plot_cells(verdict)
+    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert sum(int(label.split(": ")[1]) for label in labels) == len(verdict.cells)
+    assert ax.get_xlabel() == "$x_{1}$"
+    plt.close(ax.figure)
+    with pytest.raises(ValueError, match="verdict has no cells"):
+        rj.plot_cells(rj.decide(smooth, X0, 1, safe=rj.Box([-9, -9], [9, 9])))
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        ({"cells": "many"}, TypeError, r"cells must be a whole number, or one for each"),
+        ({"cells": 0}, ValueError, r"cells must be at least 1"),
+        ({"cells": (2,)}, ValueError, r"cells must be a number for each of 2 coordinates"),
+        (
+            {"cells": 3, "executor": 2},
+            TypeError,
+            r"executor must be an object with a method",
+        ),
+        ({"cells": 3, "progress": 2}, TypeError, r"progress must wrap an iterable"),
+    ],
+)
+def test_what_is_no_number_of_cells_is_named(smooth, given, error, message):
+    with pytest.raises(error, match=message):
+        rj.decide(smooth, X0, 1, safe=X0, **given)

@@ -1,6 +1,6 @@
 """Plants: what follows a state under an input.
 
-The affine one, time-invariant or time-varying, is `x[t+1] = A_t x[t] + B_t u[t] + c_t`.
+The affine one, time-invariant or time-varying, is `x[t+1] = A_t x[t] + B_t u[t] + c_t + E_t w[t]`.
 """
 
 from __future__ import annotations
@@ -33,12 +33,19 @@ class AbstractPlant(Replaceable, abc.ABC):
         """The number `n_u` of inputs."""
 
     @property
+    def disturbances(self) -> int:
+        """The number `n_w` of disturbances that enter it; none here."""
+        return 0
+
+    @property
     @abc.abstractmethod
     def steps(self) -> int | None:
         """The number of times a time-varying plant is given for; `None` when time-invariant."""
 
     @abc.abstractmethod
-    def propagate(self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
+    def propagate(
+        self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
+    ) -> Any:
         """The successor of `x` under input `u`, for any kind of number.
 
         Args:
@@ -46,6 +53,7 @@ class AbstractPlant(Replaceable, abc.ABC):
             u: the input.
             t: the time.
             unit: what is done at each layer of units, of which an affine plant has none.
+            w: the disturbances; None of a plant that has none, or where they are zero.
         """
 
 
@@ -79,12 +87,14 @@ def _depth(value: Any) -> int:
 
 @pytree
 class AffinePlant(AbstractPlant):
-    """The paper's system (LTV). A leading time axis on any of the three makes it time-varying.
+    """The paper's system (LTV), and disturbances. A leading time axis makes it time-varying.
 
     Args:
         A: `(n_x, n_x)` or `(time, n_x, n_x)`.
         B: `(n_x, n_u)` or `(time, n_x, n_u)`.
         c: `(n_x,)` or `(time, n_x)`, in the units of the state; zero when left out.
+        E: `(n_x, n_w)` or `(time, n_x, n_w)`, how disturbances enter, which `ClosedLoop` has a set
+            of; none when left out.
 
     Raises:
         TypeError: a tuple or a list of arrays arrived, of which nobody knows what they are: the
@@ -102,12 +112,16 @@ class AffinePlant(AbstractPlant):
     c: Float[Array, "*time n"] = converted(
         converter=_one_array("(n_x,)", "(time, n_x)"), default=None
     )
+    E: Float[Array, "*time n w"] | None = converted(
+        converter=_one_array("(n_x, n_w)", "(time, n_x, n_w)"), default=None
+    )
 
     def __post_init__(self):
         n = self.A.shape[-1]
         if self.c is None:
             self._set(c=jnp.zeros(n))
-        for name, axis in (("A", -2), ("B", -2), ("c", -1)):
+        rows = {"A": -2, "B": -2, "c": -1} | ({} if self.E is None else {"E": -2})
+        for name, axis in rows.items():
             shape = getattr(self, name).shape
             if shape[axis] != n:
                 raise ValueError(
@@ -121,9 +135,9 @@ class AffinePlant(AbstractPlant):
             )
 
     def _varying(self) -> dict[str, Any]:
-        constant = {"A": 2, "B": 2, "c": 1}
+        constant = {"A": 2, "B": 2, "c": 1, "E": 2}
         arrays = {name: getattr(self, name) for name in constant}
-        return {name: a for name, a in arrays.items() if a.ndim > constant[name]}
+        return {name: a for name, a in arrays.items() if a is not None and a.ndim > constant[name]}
 
     @property
     def states(self) -> int:
@@ -136,6 +150,11 @@ class AffinePlant(AbstractPlant):
         return self.B.shape[-1]
 
     @property
+    def disturbances(self) -> int:
+        """The number `n_w` of disturbances."""
+        return 0 if self.E is None else self.E.shape[-1]
+
+    @property
     def steps(self) -> int | None:
         """The number of times a time-varying plant is given for; `None` when time-invariant."""
         return next((array.shape[0] for array in self._varying().values()), None)
@@ -146,13 +165,18 @@ class AffinePlant(AbstractPlant):
         Raises:
             ValueError: the plant is not given for this time (where the time is a plain number).
         """
-        varying = self._varying()
         if self.steps is not None:
             within_time_axis("AffinePlant", t, self.steps)
-        A, B, c = (varying[k][t] if k in varying else getattr(self, k) for k in ("A", "B", "c"))
-        return A, B, c
+        return self._at("A", t), self._at("B", t), self._at("c", t)
 
-    def propagate(self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
-        """The successor of `x` under input `u`, for any kind of number."""
+    def _at(self, name: str, t: int | jax.Array) -> Array:
+        array = getattr(self, name)
+        return array[t] if name in self._varying() else array
+
+    def propagate(
+        self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
+    ) -> Any:
+        """The successor of `x` under input `u` and disturbances `w`, for any kind of number."""
         A, B, c = self.at(t)
-        return A @ x + B @ u + c
+        following = A @ x + B @ u + c
+        return following if w is None else following + self._at("E", t) @ w

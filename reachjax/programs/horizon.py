@@ -48,6 +48,7 @@ class Horizon:
         state: forms of the state after the steps so far.
         steps: the forms of the units of each step, layer by layer.
         columns: `(p,)`, of the unit of each pair of facts whose product is zero.
+        free: columns of disturbances.
         gaps: `(p,)`, how much of its column a unit's value has.
         origins: `(m, 3)`, of each fact the step, the unit's number among those of a step, and which
             of its facts it is; -1 of the initial set.
@@ -73,6 +74,7 @@ class Horizon:
         self._zero: list[np.ndarray] = [np.zeros((0, 2), dtype=int)]
         self.columns, self.gaps = np.zeros(0, dtype=int), np.zeros(0)
         self.origins = np.zeros((0, 3), dtype=int)
+        self.free = np.zeros(0, dtype=int)
         self._count = self._stated = 0
         if self.start.cut is not None:
             A, b = (np.asarray(part) for part in self.start.cut.facets)
@@ -81,7 +83,8 @@ class Horizon:
     @property
     def facts(self) -> AffineForms:
         """Rows `(m, n)` that are never negative: those of the initial set, then those of units."""
-        width = max(part.columns.shape[1] for part in (self.state, *self._facts))
+        known = 1 + self.free.max(initial=-1)
+        width = max(known, *(part.columns.shape[1] for part in (self.state, *self._facts)))
         if len(self._facts) != 1 or self._facts[0].columns.shape[1] != width:
             none = AffineForms(np.zeros((0, width + 2)), np.zeros((0, 2)))
             self._facts = [joined([none, *(part.widened(width) for part in self._facts)])]
@@ -95,7 +98,8 @@ class Horizon:
     @property
     def varying(self) -> Int[np.ndarray, " v"]:
         """Columns of the initial state and of units, without those of rounding errors."""
-        return np.concatenate([np.arange(self.start.spread.shape[1]), np.unique(self.columns)])
+        of_units = np.union1d(self.columns, self.free)
+        return np.concatenate([np.arange(self.start.spread.shape[1]), of_units])
 
     def advance(self, multipliers: Multipliers | None = None) -> None:
         """One step more.
@@ -109,7 +113,7 @@ class Horizon:
         ) -> Ends:
             self._state_facts(found)
             switching = np.flatnonzero(~unit.lines(*ends).affine)
-            if multipliers is None or not (len(switching) and self._count):
+            if multipliers is None or unit.free or not (len(switching) and self._count):
                 return ends
             lower, upper = (end.copy() for end in ends)
             inputs = y[switching]
@@ -129,18 +133,42 @@ class Horizon:
             self._state_facts(units)
         self.steps.append(units)
 
-    def columns_at(self, state: Float[np.ndarray, " n_x"]) -> Float[np.ndarray, " n"]:
-        """The columns of the trajectory from an initial state."""
+    def columns_at(
+        self,
+        state: Float[np.ndarray, " n_x"],
+        drawn: Sequence[Float[np.ndarray, " m"]] | None = None,
+    ) -> Float[np.ndarray, " n"]:
+        """The columns of the trajectory from an initial state.
+
+        Args:
+            state: the initial state.
+            drawn: the values of the disturbances of each step, in `[-1, 1]`; None for zeros.
+        """
         found = np.zeros(self.facts.columns.shape[1])
         first = self.start.back @ (state - self.start.center)
         found[: len(first)] = first
+        values = iter(()) if drawn is None else itertools.chain(*drawn)
         for layer in itertools.chain(*self.steps):
             here = np.flatnonzero(layer.places >= 0)
             inputs = layer.inputs[here]
             y: Any = inputs.rows[:, 0] + inputs.columns @ found[: inputs.columns.shape[1]]
-            rest = layer.unit(y) - layer.slope[here] * y - layer.offset[here]
+            z = layer.unit(y)
+            if layer.unit.free and drawn is not None:
+                z = z + np.array(list(itertools.islice(values, len(here))))
+            rest = z - layer.slope[here] * y - layer.offset[here]
             found[layer.places[here]] = rest / layer.gap[here]
         return found
+
+    def drawn_at(self, columns: Float[np.ndarray, "c n"]) -> list[Float[np.ndarray, "c m"]]:
+        """The values of the disturbances of each step, in the order in which they are drawn."""
+        none = np.zeros((len(columns), 0))
+        return [
+            np.concatenate(
+                [none, *(columns[:, each.places] * each.gap for each in layers if each.unit.free)],
+                axis=1,
+            )
+            for layers in self.steps
+        ]
 
     def narrow(self, lower: Float[np.ndarray, " n_x"], upper: Float[np.ndarray, " n_x"]) -> None:
         """Meet the state with bounds that surely hold it."""
@@ -158,8 +186,10 @@ class Horizon:
     def _state_facts(self, found: Sequence[UnitForms]) -> None:
         """Add the facts of the layers that are new."""
         for number, layer in enumerate(found[self._stated :], start=self._stated):
-            switching = np.flatnonzero(layer.places >= 0)
-            if len(switching):
+            switching = np.flatnonzero((layer.places >= 0) | layer.unit.stated)
+            if layer.unit.free:  # its column says all that its facts do
+                self.free = np.append(self.free, layer.places)
+            elif len(switching):
                 first = sum(len(before.places) for before in found[:number])
                 self._add_units(layer, switching, first)
         self._stated = len(found)

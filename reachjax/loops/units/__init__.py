@@ -13,6 +13,7 @@ from reachjax.loops.units.base import (
     evaluate,
 )
 from reachjax.loops.units.clip import clipped
+from reachjax.loops.units.disturbance import Constraint, Disturbance
 from reachjax.loops.units.hard_tanh import HardTanh
 from reachjax.loops.units.leaky_relu import LeakyReLU
 from reachjax.loops.units.relu import ReLU
@@ -22,6 +23,8 @@ __all__ = [
     "AbstractUnit",
     "AtUnit",
     "Block",
+    "Constraint",
+    "Disturbance",
     "Facts",
     "HardTanh",
     "LeakyReLU",

@@ -14,7 +14,7 @@ from __future__ import annotations
 import abc
 import enum
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
@@ -119,7 +119,15 @@ class AbstractUnit(AbstractActivation):
     """One relation `z = f(y)`, which adds one column to a basis.
 
     `f` is nonexpansive, `|f(y) - f(y')| <= |y - y'|`; bounds rely on it where inputs are rounded.
+
+    Attributes:
+        free: whether any value between its two lines, which are parallel, is possible, whatever
+            the input is: then all that there is to know of it is that.
+        stated: whether its facts are known of its inputs, so that they count where it is affine.
     """
+
+    free: ClassVar[bool] = False
+    stated: ClassVar[bool] = False
 
     @abc.abstractmethod
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:

@@ -162,7 +162,7 @@ def drawn(W: AbstractSet, x: Any, count: int, t: int | Array, unit: AtUnit) -> A
     s = unit(Disturbance(), zero)
     w = frame.placed(s)
     if len(frame.b):
-        unit(Constraint(), frame.b - frame.A @ w)
+        unit(Constraint(closed=W.parts[1] is None), frame.b - frame.A @ w)
     if len(frame.normals):
         unit(Constraint(), 1 + gamma(8) - frame.normals @ s)
     return w

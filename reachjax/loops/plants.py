@@ -169,6 +169,18 @@ class AffinePlant(AbstractPlant):
             within_time_axis("AffinePlant", t, self.steps)
         return self._at("A", t), self._at("B", t), self._at("c", t)
 
+    def entering(self, t: int | jax.Array) -> Array:
+        """`E_t`.
+
+        Raises:
+            ValueError: there is none, or not for this time (where the time is a plain number).
+        """
+        if self.E is None:
+            raise ValueError("the plant has no disturbances: AffinePlant.E was left out")
+        if self.steps is not None:
+            within_time_axis("AffinePlant", t, self.steps)
+        return self._at("E", t)
+
     def _at(self, name: str, t: int | jax.Array) -> Array:
         array = getattr(self, name)
         return array[t] if name in self._varying() else array
@@ -179,4 +191,4 @@ class AffinePlant(AbstractPlant):
         """The successor of `x` under input `u` and disturbances `w`, for any kind of number."""
         A, B, c = self.at(t)
         following = A @ x + B @ u + c
-        return following if w is None else following + self._at("E", t) @ w
+        return following if w is None else following + self.entering(t) @ w

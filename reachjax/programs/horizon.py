@@ -49,6 +49,7 @@ class Horizon:
         steps: the forms of the units of each step, layer by layer.
         columns: `(p,)`, of the unit of each pair of facts whose product is zero.
         free: columns of disturbances.
+        enclosed: those that facts bound by themselves.
         gaps: `(p,)`, how much of its column a unit's value has.
         origins: `(m, 3)`, of each fact the step, the unit's number among those of a step, and which
             of its facts it is; -1 of the initial set.
@@ -74,7 +75,7 @@ class Horizon:
         self._zero: list[np.ndarray] = [np.zeros((0, 2), dtype=int)]
         self.columns, self.gaps = np.zeros(0, dtype=int), np.zeros(0)
         self.origins = np.zeros((0, 3), dtype=int)
-        self.free = np.zeros(0, dtype=int)
+        self.free = self.enclosed = np.zeros(0, dtype=int)
         self._count = self._stated = 0
         if self.start.cut is not None:
             A, b = (np.asarray(part) for part in self.start.cut.facets)
@@ -187,6 +188,8 @@ class Horizon:
         """Add the facts of the layers that are new."""
         for number, layer in enumerate(found[self._stated :], start=self._stated):
             switching = np.flatnonzero((layer.places >= 0) | layer.unit.stated)
+            if layer.unit.closed:
+                self.enclosed = np.append(self.enclosed, found[number - 1].places)
             if layer.unit.free:  # its column says all that its facts do
                 self.free = np.append(self.free, layer.places)
             elif len(switching):

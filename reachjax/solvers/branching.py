@@ -230,7 +230,7 @@ def settled(
     both, side = vanishing.all(axis=1), vanishing.argmax(axis=1)
     row, constant = np.asarray(form.columns), np.asarray(form.rows[:, 0])
     reach = np.full(facts.columns.shape[1], 2.0)
-    reach[horizon.free] = 1.0  # what bounds a disturbance is no line
+    reach[np.setdiff1d(horizon.free, horizon.enclosed)] = 1.0  # what bounds these are no lines
     attained, near = constant[0] + row[0] @ columns[: row.shape[1]], BENT * abs(row).sum()
     if bound - attained > near:
         return None

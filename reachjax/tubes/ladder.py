@@ -260,12 +260,15 @@ class Ladder:
                 self.spend(tree.nodes - before)
 
     def _scenarios_at(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c s"]:
-        """The scenarios that columns stand for."""
+        """The scenarios that columns stand for.
+
+        What is drawn may be beside an ellipsoid, but where the horizon takes it to be.
+        """
         start = self.horizon.start
         spread = np.asarray(start.spread)
         states = np.asarray(start.center) + columns[:, : spread.shape[1]] @ spread.T
         found = self._scenarios.of_units(states, self.horizon.drawn_at(columns))
-        return self._scenarios.clipped(self._scenarios.completed(found, self._middle))
+        return self._scenarios.completed(found, self._middle)
 
     def _judged(
         self,

@@ -124,10 +124,12 @@ class AbstractUnit(AbstractActivation):
         free: whether any value between its two lines, which are parallel, is possible, whatever
             the input is: then all that there is to know of it is that.
         stated: whether its facts are known of its inputs, so that they count where it is affine.
+        closed: whether these bound the free units before it by themselves.
     """
 
     free: ClassVar[bool] = False
     stated: ClassVar[bool] = False
+    closed: bool = False
 
     @abc.abstractmethod
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:

@@ -60,11 +60,17 @@ class Disturbance(AbstractUnit):
 class Constraint(AbstractUnit):
     """Zero, of an input that is never negative.
 
+    Args:
+        closed: whether such facts alone bound the disturbances that were drawn before, as the
+            facets of a polytope do: then derivatives need not know of the box around it.
+
     Example:
         >>> import jax.numpy as jnp
         >>> Constraint().facts(jnp.array([0.5]), None, None, None)["known"].tolist()
         [0.5]
     """
+
+    closed: bool = False
 
     stated: ClassVar[bool] = True
 

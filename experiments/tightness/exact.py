@@ -187,10 +187,12 @@ def _successor(loop: rj.ClosedLoop, program: Program, state: ndarray, t: int) ->
         above = program.relu(_affine(eye, u, -box.lower))
         below = program.relu(_affine(-eye, above, box.upper - box.lower))
         u = _affine(-eye, below, box.upper)
-    A, B, c = loop.plant.at(t)
+    plant = loop.plant
+    assert isinstance(plant, rj.AffinePlant)
+    A, B, c = plant.at(t)
     following = program.padded(_affine(B, u, c))
     if isinstance(loop.disturbance, rj.Box):
-        entering = np.asarray(loop.plant.entering(t)) @ program.draw(loop.disturbance.at(t))
+        entering = np.asarray(plant.entering(t)) @ program.draw(loop.disturbance.at(t))
         following = program.padded(following) + entering
     return following + _affine(A, program.padded(state), np.zeros(len(state)))
 
@@ -217,12 +219,10 @@ def _simulated(
     if isinstance(X0, rj.Box):
         states = np.clip(states, X0.lower, X0.upper)
     values = np.full(bounds.shape, np.nan)
-    for row, (k, facets) in zip(values, found.items(), strict=True):
-        there = [i for i, each in enumerate(facets) if not np.isnan(each.state).any()]
-        if there:
-            ends = _ends(
-                loop, states[list(found).index(k)][there], [facets[i] for i in there], k, start
-            )
+    for row, begun, (k, facets) in zip(values, states, found.items(), strict=True):
+        there = np.flatnonzero(~np.isnan(begun).any(axis=1))
+        if len(there):
+            ends = _ends(loop, begun[there], [facets[i] for i in there], k, start)
             row[there] = np.sum(rows[there] * ends, axis=1)
     return Maxima(values, states, bounds, spreads)
 

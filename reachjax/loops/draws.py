@@ -83,7 +83,7 @@ def framed(W: AbstractSet, t: int | Array = 0) -> Frame:
     box = W if isinstance(W, Box) else W.bounding_box()
     around = Ball.between(*_ends(box, t))
     A, b = flat.facets if flat.needs_programs else (none, nothing)
-    if ball is not None:
+    if ball is not None and W.dimension > 1:  # else the box is the set
         planes = touching(W.dimension) @ jnp.linalg.inv(jax.lax.stop_gradient(ball.from_ball()))
         A, b = jnp.concatenate([A, planes]), jnp.concatenate([b, ball.support(planes)])
     center, spread, A, b = _settled(W, around.mid, around.rad, A, b)

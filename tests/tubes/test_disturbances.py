@@ -36,24 +36,27 @@ def beyond(tube, states):
     return max(each)
 
 
-@pytest.mark.parametrize("noise", [None, "box", "ellipsoid"])
-@pytest.mark.parametrize(("n", "kind"), product((1, 2, 3), KINDS))
-def test_no_scenario_leaves_a_tube_by_forms_or_branches(n, kind, noise):
-    V = None if noise is None else disturbance_set(noise, n, seed=3)
+@pytest.mark.parametrize(("n", "kind"), list(product((1, 2, 3), KINDS)))
+def test_no_scenario_leaves_a_tube_by_forms_or_branches(n, kind):
+    V = disturbance_set(KINDS[(KINDS.index(kind) + n) % len(KINDS)], n, seed=3)
     loop, X0 = disturbed_loop(n, disturbance_set(kind, n), V, seed=1), initial(n)
     states = attacked(loop, X0, STEPS)
-    for relaxation in (rj.LinearBounds(), rj.BranchAndCut(nodes=0)):
-        tube = rj.reach(loop, X0, STEPS, rj.Template.octagonal(n), relaxation, samples=100)
+    template = rj.Template.octagonal(n)
+    for relaxation in (rj.LinearBounds(), rj.BranchAndCut()):  # a wide gap: no products
+        tube = rj.reach(loop, X0, STEPS, template, relaxation, samples=100, gap=0.5)
         assert beyond(tube, states) < ROUNDING
         for k in range(1, STEPS + 1):
             assert np.all(tube.proof(k).gaps > -ROUNDING)
 
 
 @pytest.mark.parametrize(
-    "relaxation", [rj.LocalBounds(), rj.PaperQC()], ids=lambda r: type(r).__name__
+    ("relaxation", "kind", "template"),
+    [
+        (rj.LocalBounds(), "polytope", rj.Template.box(2)),
+        (rj.PaperQC(), "ellipsoid", rj.Template.box(2)),
+        (rj.PaperQC(), "box", rj.EllipsoidTemplate()),
+    ],
 )
-@pytest.mark.parametrize("kind", ["box", "polytope", "ellipsoid"])
-@pytest.mark.parametrize("template", [rj.Template.box(2), rj.EllipsoidTemplate()], ids=repr)
 def test_no_scenario_leaves_a_tube_by_windows(relaxation, kind, template):
     loop = disturbed_loop(2, disturbance_set(kind, 2), disturbance_set("box", 2, seed=3), seed=1)
     states = attacked(loop, initial(2), 2)
@@ -64,7 +67,7 @@ def test_no_scenario_leaves_a_tube_by_windows(relaxation, kind, template):
 
 def test_no_scenario_leaves_a_tube_by_long_windows_and_cuts():
     loop = disturbed_loop(2, disturbance_set("polytope", 2), disturbance_set("box", 2, 3), seed=1)
-    relaxation = rj.CuttingPlanes(rounds=1)
+    relaxation = rj.CuttingPlanes(rounds=0)
     tube = rj.reach(loop, initial(2), 2, rj.Template.box(2), relaxation, 2, samples=100)
     assert beyond(tube, attacked(loop, initial(2), 2)) < ROUNDING
 
@@ -73,7 +76,7 @@ def test_no_scenario_leaves_a_tube_by_long_windows_and_cuts():
 def test_initial_sets_of_every_kind(kind):
     X0 = initial_set(kind, 2)
     loop = disturbed_loop(2, disturbance_set("box", 2), disturbance_set("ellipsoid", 2, 3), seed=1)
-    tube = rj.reach(loop, X0, 2, rj.Template.box(2), rj.BranchAndCut(nodes=5), samples=100)
+    tube = rj.reach(loop, X0, 2, rj.Template.box(2), samples=100, gap=0.5)
     assert beyond(tube, attacked(loop, X0, 2)) < ROUNDING
 
 
@@ -115,15 +118,13 @@ def test_of_an_affine_loop_what_disturbances_add_is_known():
     plant = rj.AffinePlant(np.eye(2) / 2, np.zeros((2, 1)), E=np.eye(2))
     net = rj.MLP.from_layers([(np.zeros((1, 2)), np.zeros(1))])
     X0 = rj.Box([0.0, 0.0], [0.0, 0.0])
+    template = rj.Template.octagonal(2)
+    diagonal = np.argmax(np.asarray(template.directions) @ np.ones(2))
+    length = np.linalg.norm(template.directions[diagonal])
     for W, size in ((rj.Box([-1, -1], [1, 1]), 1.0), (rj.Ellipsoid([0, 0], np.eye(2)), 1.02)):
-        loop = rj.ClosedLoop(plant, net, disturbance=W)
-        tube = rj.reach(loop, X0, 3, rj.Template.box(2))
-        np.testing.assert_allclose(tube.sets[3].b, 1.75, rtol=1e-9)
-        diagonal = tube.sets[3].replace(A=jnp.ones((1, 2)), b=jnp.ones(1)).A
-        found = rj.reach(loop, X0, 3, rj.Template(jnp.concatenate([diagonal, -diagonal])))
-        exact = 1.75 * (2.0 if isinstance(W, rj.Box) else np.sqrt(2))
-        assert np.all(exact - 1e-9 <= found.sets[3].b)
-        assert np.all(found.sets[3].b <= size * exact + 1e-9)
+        offsets = rj.reach(rj.ClosedLoop(plant, net, disturbance=W), X0, 3, template).sets[3].b
+        exact = 1.75 * length * (np.sqrt(2) if isinstance(W, rj.Box) else 1.0)
+        assert exact - 1e-9 <= offsets[diagonal] <= size * exact + 1e-9
 
 
 def test_noise_alone_and_disturbances_without_width():
@@ -157,8 +158,7 @@ def test_gradients_are_those_of_differences(relaxation, kind):
     rng = np.random.default_rng(1)
     # normals of a polytope have kinks where the box around it touches along an edge
     normals = loop.disturbance.A if kind == "polytope" else None
-    moved = (loop.disturbance, loop.noise, loop.plant.E)
-    for chosen in (moved[:1], moved[1:2], moved[2:], (loop, X0)):
+    for chosen in (loop.disturbance, (loop, X0)):
         ids = {id(leaf) for leaf in jax.tree.leaves(chosen)} - {id(normals)}
         direction = jax.tree.map(
             lambda leaf, ids=ids: (
@@ -178,7 +178,7 @@ def test_a_compiled_gradient_is_the_same():
     loop, X0 = double_integrator()
 
     def value(loop):
-        return rj.volume_penalty(loop, X0, 3, rj.Template.box(2))
+        return rj.volume_penalty(loop, X0, 2, rj.Template.box(2))
 
     plain, compiled = jax.grad(value)(loop), jax.jit(jax.grad(value))(loop)
     for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(compiled), strict=True):

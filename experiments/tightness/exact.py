@@ -3,8 +3,8 @@
 An unrolled loop of ReLUs is a mixed-integer linear program (Tjeng, Xiao, Tedrake, Evaluating
 Robustness of Neural Networks with Mixed Integer Programming, ICLR 2019). Written from the
 definition of the loop, weights, plant and sets, and with nothing of what certifies it, this says
-how tight a certificate is. It takes seconds for some tens of units that switch, and may take
-forever for hundreds.
+how tight a certificate is. Disturbances and noise in boxes are variables too. It takes seconds for
+some tens of units that switch, and may take forever for hundreds.
 """
 
 import contextlib
@@ -123,7 +123,7 @@ def exact_tube(
     `Maxima.require_sharp`.
     """
     rows = _checked(loop, X0, horizon, directions, start)
-    unknown = Largest(np.full(loop.states, np.nan), np.nan, np.nan)
+    unknown = Largest(np.full(loop.states, np.nan), np.nan, np.nan, np.zeros(0))
     found = {k: [unknown] * len(rows) for k in range(1, horizon + 1)}
     with contextlib.suppress(TimeoutError):
         steps = _unrolled(loop, X0, horizon, start, limits or Limits())
@@ -145,6 +145,9 @@ def _checked(
         raise TypeError(
             f"loop.controller must be an MLP, a network of ReLUs, but is {kind} of {activation}"
         )
+    for name, W in (("disturbance", loop.disturbance), ("noise", loop.noise)):
+        if not isinstance(W, rj.Box | None):
+            raise TypeError(f"loop.{name} must be a Box, but {type(W).__name__} arrived")
     loop.check_horizon(horizon, start)
     rows = np.asarray(directions, float)
     if rows.ndim != 2 or not loop.states == X0.dimension == rows.shape[1]:
@@ -172,7 +175,11 @@ def _successor(loop: rj.ClosedLoop, program: Program, state: ndarray, t: int) ->
     assert isinstance(net, rj.MLP)
     assert isinstance(loop.plant, rj.AffinePlant)
     *hidden, (W, b) = net.layers
-    z = state
+    measured = program.padded(state)
+    if isinstance(loop.noise, rj.Box):
+        noise = program.draw(loop.noise.at(t))
+        measured = program.padded(state) + noise
+    z = measured
     for V, a in hidden:
         z = program.relu(_affine(V, z, a))
     u = _affine(W, z, b)
@@ -181,9 +188,14 @@ def _successor(loop: rj.ClosedLoop, program: Program, state: ndarray, t: int) ->
         above = program.relu(_affine(eye, u, -box.lower))
         below = program.relu(_affine(-eye, above, box.upper - box.lower))
         u = _affine(-eye, below, box.upper)
-    A, B, c = loop.plant.at(t)
-    driven = _affine(B, u, c)
-    return driven + _affine(A, program.padded(state), np.zeros(len(state)))
+    plant = loop.plant
+    assert isinstance(plant, rj.AffinePlant)
+    A, B, c = plant.at(t)
+    following = program.padded(_affine(B, u, c))
+    if isinstance(loop.disturbance, rj.Box):
+        entering = np.asarray(plant.entering(t)) @ program.draw(loop.disturbance.at(t))
+        following = program.padded(following) + entering
+    return following + _affine(A, program.padded(state), np.zeros(len(state)))
 
 
 def _affine(W: ArrayLike, rows: Float[ndarray, "n size"], b: ArrayLike) -> Float[ndarray, "k size"]:
@@ -203,14 +215,36 @@ def _simulated(
     """What was found after some numbers of steps, with the values that are attained."""
     states, bounds, spreads = (
         np.array([[getattr(each, name) for each in facets] for facets in found.values()])
-        for name in Largest._fields
+        for name in ("state", "bound", "spread")
     )
     if isinstance(X0, rj.Box):
         states = np.clip(states, X0.lower, X0.upper)
     values = np.full(bounds.shape, np.nan)
-    if len(there := np.argwhere(~np.isnan(states).any(axis=-1))):
-        k, i = there.T
-        ends = loop.simulate(jnp.asarray(states[k, i]), max(found), start)
-        steps = np.array(list(found))[k]
-        values[k, i] = np.sum(rows[i] * np.asarray(ends)[np.arange(len(k)), steps], axis=1)
+    for row, begun, (k, facets) in zip(values, states, found.items(), strict=True):
+        there = np.flatnonzero(~np.isnan(begun).any(axis=1))
+        if len(there):
+            ends = _ends(loop, begun[there], [facets[i] for i in there], k, start)
+            row[there] = np.sum(rows[there] * ends, axis=1)
     return Maxima(values, states, bounds, spreads)
+
+
+def _ends(
+    loop: rj.ClosedLoop, states: Float[ndarray, "c n_x"], found: list[Largest], k: int, start: int
+) -> Float[ndarray, "c n_x"]:
+    """The states after `k` steps, in which what was drawn is brought into its boxes."""
+    given = {}
+    if loop.is_disturbed:
+        drawn = np.array([each.drawn for each in found]).reshape(len(found), k, -1)
+        n_v = 0 if loop.noise is None else loop.states
+        parts = (
+            ("noises", loop.noise, drawn[..., :n_v]),
+            ("disturbances", loop.disturbance, drawn[..., n_v:]),
+        )
+        for name, W, values in parts:
+            if isinstance(W, rj.Box):
+                boxes = [W.at(start + t) for t in range(k)]
+                lower, upper = (
+                    np.array([getattr(box, end) for box in boxes]) for end in ("lower", "upper")
+                )
+                given[name] = np.clip(values, lower, upper)
+    return np.asarray(loop.simulate(jnp.asarray(states), k, start, **given))[:, k]

@@ -63,11 +63,13 @@ class Largest(NamedTuple):
         state: `(n_x,)`, the initial state that attains it; NaN where none was found in time.
         bound: no value is larger, up to HiGHS's tolerances.
         spread: the range that the row is surely within.
+        drawn: `(d,)`, the values of what was drawn before, in that order; NaN as of the state.
     """
 
     state: Float[ndarray, " n_x"]
     bound: float
     spread: float
+    drawn: Float[ndarray, " d"]
 
 
 class Program:
@@ -95,12 +97,26 @@ class Program:
         center, radii = np.asarray(box.center), np.asarray(box.widths) / 2
         self._limits, self._first = limits, np.hstack([center[:, None], np.diag(radii)])
         self._whole, self._lower, self._upper = np.zeros(n, bool), -np.ones(n), np.ones(n)
+        self._drawn: list[tuple[int, float, float]] = []
         within = np.zeros(0, int) if isinstance(X0, rj.Box) else np.arange(len(b))
         self._G, self._h = csc_array((A * radii)[within]), (b - A @ center)[within]
 
     def state(self) -> Float[ndarray, "n_x size"]:
         """Rows of the initial state."""
         return self._first
+
+    def draw(self, box: rj.Box) -> Float[ndarray, "n size"]:
+        """Rows of variables that may be anywhere in a box."""
+        size, n = len(self._whole), box.dimension
+        center, radii = np.asarray(box.center), np.asarray(box.widths) / 2
+        self._drawn += [(size + i, *pair) for i, pair in enumerate(zip(center, radii, strict=True))]
+        self._G.resize((len(self._h), size + n))
+        self._whole = np.append(self._whole, np.zeros(n, bool))
+        self._lower, self._upper = (
+            np.append(self._lower, -np.ones(n)),
+            np.append(self._upper, np.ones(n)),
+        )
+        return np.hstack([center[:, None], np.zeros((n, size)), np.diag(radii)])
 
     def relu(self, inputs: Float[ndarray, "k size"]) -> Float[ndarray, "k grown"]:
         """Rows of the outputs of a layer of units, given those of its inputs."""
@@ -126,13 +142,15 @@ class Program:
         if (proved := found.get("mip_dual_bound", found.fun)) is not None:
             bound = min(most, row[0] - proved / scale)
         if found.x is None:
-            return Largest(np.full(len(self._first), np.nan), bound, spread)
+            unknown = np.full(len(self._first), np.nan), np.full(len(self._drawn), np.nan)
+            return Largest(unknown[0], bound, spread, unknown[1])
         held = np.where(self._whole, np.round(found.x), np.nan)
         with contextlib.suppress(RuntimeError, TimeoutError):  # rounding has left no state, or time
             again = self._solved(-scale * row[1:], np.zeros_like(self._whole), held)
             found = again if again.status == OPTIMAL else found
         center, spans = self._first[:, 0], self._first[:, 1:]
-        return Largest(center + spans @ found.x[: len(center)], bound, spread)
+        drawn = np.array([mid + rad * found.x[column] for column, mid, rad in self._drawn])
+        return Largest(center + spans @ found.x[: len(center)], bound, spread, drawn)
 
     def padded(self, rows: Float[ndarray, "k size"]) -> Float[ndarray, "k grown"]:
         """Rows over all variables that there are by now."""

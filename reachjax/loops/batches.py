@@ -52,13 +52,21 @@ def _evaluated(unit: AbstractUnit, y: Batch) -> Batch:
 
 
 def trajectories(
-    loop: ClosedLoop, states: Float[np.ndarray, "c n_x"], horizon: int, start: int = 0
+    loop: ClosedLoop,
+    states: Float[np.ndarray, "c n_x"],
+    disturbances: Float[np.ndarray, "c h n_w"] | None = None,
+    noises: Float[np.ndarray, "c h n_x"] | None = None,
+    *,
+    horizon: int,
+    start: int = 0,
 ) -> Float[np.ndarray, "c h+1 n_x"]:
     """Trajectories from many initial states, these included.
 
     Args:
         loop: of numpy arrays.
         states: where they begin.
+        disturbances: those of each step, of a loop that has some.
+        noises: the same.
         horizon: the number of steps.
         start: the time of the initial states.
 
@@ -67,12 +75,13 @@ def trajectories(
         >>> from reachjax import MLP, AffinePlant
         >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
         >>> loop = jax.device_get(ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net))
-        >>> trajectories(loop, np.array([[1.0], [-1.0]]), 1)[:, 1].tolist()
+        >>> trajectories(loop, np.array([[1.0], [-1.0]]), horizon=1)[:, 1].tolist()
         [[0.6], [-0.6]]
     """
     found, batch = [states], Batch(states)
     with np.errstate(all="ignore"):  # what overflows is no trajectory
-        for t in range(start, start + horizon):
-            batch = loop.step(batch, t, _evaluated)
+        for k in range(horizon):
+            w, v = (None if part is None else Batch(part[:, k]) for part in (disturbances, noises))
+            batch = loop.step(batch, start + k, _evaluated, w, v)
             found.append(batch.values)
     return np.stack(found, axis=1)

@@ -1,7 +1,9 @@
 """The loop: a plant under a network whose output is projected onto an input box.
 
-The projection is two more layers of units (the paper's equation (proj_NN)), the last ones of a
-step. Which units there are, and in which order, the loop's own forward pass tells.
+The projection is two more layers of units (the paper's equation (proj_NN)). Disturbances of the
+plant and noise of what the network measures are new at each step and known to lie in sets: they are
+units of the step too (`draws`), noise the first ones and disturbances the last ones. Which units
+there are, and in which order, the loop's own forward pass tells.
 """
 
 from __future__ import annotations
@@ -13,12 +15,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from reachjax.loops.draws import drawn
 from reachjax.loops.networks import AbstractNetwork
 from reachjax.loops.plants import AbstractPlant
 from reachjax.loops.units import AbstractUnit, AtUnit, SmoothUnit, clipped, evaluate
-from reachjax.numerics.checks import Numbers, require_kind, same_size, whole_number
+from reachjax.numerics.checks import (
+    Numbers,
+    is_concrete,
+    require_kind,
+    same_size,
+    whole_number,
+)
 from reachjax.numerics.pytrees import Replaceable, pytree
-from reachjax.sets import Box
+from reachjax.sets import AbstractSet, Box
 
 
 class UnitLayer(NamedTuple):
@@ -26,6 +35,20 @@ class UnitLayer(NamedTuple):
 
     unit: AbstractUnit
     size: int
+
+
+class Scenario(NamedTuple):
+    """What a trajectory is a function of.
+
+    Attributes:
+        states: `(*batch, n_x)`, initial states.
+        disturbances: `(*batch, h, n_w)`, those of each step; None of loops without.
+        noises: `(*batch, h, n_x)`; None of loops without.
+    """
+
+    states: Any
+    disturbances: Any
+    noises: Any
 
 
 PLANT = "a plant such as reachjax.AffinePlant"
@@ -38,16 +61,22 @@ NETWORK = (
 
 @pytree
 class ClosedLoop(Replaceable):
-    """`x[t+1] = A_t x[t] + B_t proj(pi(x[t])) + c_t`; sizes are checked here, once.
+    """`x[t+1] = A_t x[t] + B_t proj(pi(x[t] + v[t])) + c_t + E_t w[t]`, for all `w` and `v`.
+
+    Sizes are checked here, once.
 
     Args:
         plant: the plant.
         controller: the network `pi`.
         input_box: what inputs are projected onto, constant or time-varying; `None`: no projection.
+        disturbance: the set of `w[t]`, of a plant that has disturbances: a `Box`, which may vary in
+            time, a `Polytope`, an `Ellipsoid` or an `Intersection`.
+        noise: the set of `v[t]`, of the same kinds; `None`: states are measured exactly.
 
     Raises:
         TypeError: an argument is of another kind.
-        ValueError: numbers of states, inputs or time steps disagree.
+        ValueError: numbers of states, inputs, disturbances or time steps disagree; a plant has
+            disturbances, but there is no set of them; or a set is empty or unbounded.
 
     Example:
         >>> from reachjax import MLP, AffinePlant
@@ -56,11 +85,18 @@ class ClosedLoop(Replaceable):
         >>> loop = ClosedLoop(plant, net, input_box=Box([-1.0], [1.0]))
         >>> loop.simulate(jnp.array([2.5]), 3)[:, 0].tolist()
         [2.5, 1.5, 0.5, -0.5]
+        >>> pushed = ClosedLoop(
+        ...     plant.replace(E=[[1.0]]), net, loop.input_box, disturbance=Box([-0.1], [0.1])
+        ... )
+        >>> pushed.simulate(jnp.array([2.5]), 1, disturbances=[[-0.1]])[:, 0].tolist()
+        [2.5, 1.4]
     """
 
     plant: AbstractPlant
     controller: AbstractNetwork
     input_box: Box | None = None
+    disturbance: AbstractSet | None = None
+    noise: AbstractSet | None = None
 
     def __post_init__(self):
         require_kind("ClosedLoop.plant", self.plant, AbstractPlant, PLANT)
@@ -84,12 +120,56 @@ class ClosedLoop(Replaceable):
                 "the dimension of input_box is",
                 (plant.inputs, self.input_box.dimension),
             )
-            if None not in (plant.steps, self.input_box.steps):
-                same_size(
-                    "the plant's number of time steps is",
-                    "that of input_box is",
-                    (plant.steps, self.input_box.steps),
-                )
+        self._check_draws()
+        times = [(name, part.steps) for name, part in self._parts() if part.steps is not None]
+        for name, steps in times[1:]:
+            same_size(
+                f"{times[0][0]} number of time steps is", f"that of {name} is", (times[0][1], steps)
+            )
+
+    def _parts(self) -> list[tuple[str, Any]]:
+        """What may vary in time, and how errors call it."""
+        given = ("the plant's", self.plant), ("input_box", self.input_box)
+        drawn_from = ("disturbance", self.disturbance), ("noise", self.noise)
+        return [(name, part) for name, part in (*given, *drawn_from) if part is not None]
+
+    def _check_draws(self) -> None:
+        """Raise an error unless disturbances and noise are such as the loop can have."""
+        plant = self.plant
+        for name in ("disturbance", "noise"):
+            W = getattr(self, name)
+            if W is None:
+                continue
+            expected = "a set such as Box(lower, upper), Polytope(A, b) or Ellipsoid(center, shape)"
+            require_kind(f"ClosedLoop.{name}", W, AbstractSet, expected)
+            if is_concrete(W) and W.steps is None:
+                try:
+                    W.bounding_box()
+                except (ValueError, RuntimeError) as error:
+                    raise ValueError(f"ClosedLoop.{name} cannot be used: {error}") from None
+        if self.disturbance is None and plant.disturbances:
+            raise ValueError(
+                f"the plant has {plant.disturbances} disturbances, but ClosedLoop.disturbance is "
+                "None: give the set that they are in"
+            )
+        if self.disturbance is not None and not plant.disturbances:
+            raise ValueError(
+                "ClosedLoop.disturbance is a set of dimension "
+                f"{self.disturbance.dimension}, but the plant has no disturbances: say how they "
+                "enter, by E of an AffinePlant"
+            )
+        if self.disturbance is not None:
+            same_size(
+                "the plant's number of disturbances is",
+                "the dimension of disturbance is",
+                (plant.disturbances, self.disturbance.dimension),
+            )
+        if self.noise is not None:
+            same_size(
+                "the plant's number of states is",
+                "the dimension of noise is",
+                (plant.states, self.noise.dimension),
+            )
 
     @property
     def states(self) -> int:
@@ -104,7 +184,7 @@ class ClosedLoop(Replaceable):
 
     @property
     def controller_layers(self) -> tuple[UnitLayer, ...]:
-        """Those of them that are the controller's, the first ones."""
+        """Those of them that are the controller's, after those of noise."""
         leaves, structure = jax.tree.flatten(self.controller)
         return _recorded(structure, tuple(jnp.shape(leaf) for leaf in leaves))
 
@@ -127,11 +207,27 @@ class ClosedLoop(Replaceable):
     @property
     def steps(self) -> int | None:
         """How many steps a time-varying loop is given for; `None` when it is time-invariant."""
-        return self.plant.steps or (self.input_box.steps if self.input_box else None)
+        return next((part.steps for _, part in self._parts() if part.steps is not None), None)
 
-    def input(self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
-        """The projected input, for any kind of number and with `unit` at each layer of units."""
-        return self.projected(self.controller.propagate(x, unit), t, unit)
+    @property
+    def is_disturbed(self) -> bool:
+        """Whether an initial state leaves open what follows."""
+        return self.disturbance is not None or self.noise is not None
+
+    def measured(
+        self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, v: Any = None
+    ) -> Any:
+        """What the controller sees of a state, for any kind of number.
+
+        Args:
+            x: the state.
+            t: the time.
+            unit: what is done at each layer of units.
+            v: the noise; None for any that there may be, or with plain numbers the middle.
+        """
+        if self.noise is None:
+            return x
+        return x + (drawn(self.noise, x, self.states, t, unit) if v is None else v)
 
     def projected(self, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
         """What the controller gives, projected onto the input box."""
@@ -140,24 +236,109 @@ class ClosedLoop(Replaceable):
         box = self.input_box.at(t)
         return clipped(u, box.lower, box.upper, unit)
 
-    def step(self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
-        """The state at `t + 1`, for any kind of number and with `unit` at each layer of units."""
-        return self.plant.propagate(x, self.input(x, t, unit), t, unit)
+    def input(self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, v: Any = None) -> Any:
+        """The projected input, for any kind of number; arguments are those of `measured`."""
+        u = self.controller.propagate(self.measured(x, t, unit, v), unit)
+        return self.projected(u, t, unit)
+
+    def moved(
+        self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
+    ) -> Any:
+        """What follows a state under a projected input, for any kind of number.
+
+        Args:
+            x: the state.
+            u: the input.
+            t: the time.
+            unit: what is done at each layer of units.
+            w: the disturbances; None for any that there may be, or with plain numbers the middle.
+        """
+        if self.disturbance is None:
+            return self.plant.propagate(x, u, t, unit)
+        if w is None:
+            w = drawn(self.disturbance, x, self.states, t, unit)
+        return self.plant.propagate(x, u, t, unit, w)
+
+    def step(
+        self,
+        x: Any,
+        t: int | jax.Array = 0,
+        unit: AtUnit = evaluate,
+        w: Any = None,
+        v: Any = None,
+    ) -> Any:
+        """The state at `t + 1`, for any kind of number; arguments as of `measured` and `moved`."""
+        return self.moved(x, self.input(x, t, unit, v), t, unit, w)
 
     def simulate(
-        self, x0: Float[ArrayLike, "*batch n"], horizon: int, start: int = 0
+        self,
+        x0: Float[ArrayLike, "*batch n"],
+        horizon: int,
+        start: int = 0,
+        *,
+        disturbances: Float[ArrayLike, "*batch horizon n_w"] | None = None,
+        noises: Float[ArrayLike, "*batch horizon n"] | None = None,
     ) -> Float[Array, "*batch horizon+1 n"]:
         """Trajectories from one initial state `(n,)` or from many `(batch, n)`, `x0` included.
 
+        Args:
+            x0: the initial states.
+            horizon: how many steps are simulated.
+            start: the time of the initial states.
+            disturbances: those of each step, and of each initial state or of all; None for the
+                middle of their set.
+            noises: the same of what is measured.
+
         Raises:
-            ValueError: `x0` has another dimension, or a time-varying loop ends before the horizon.
+            ValueError: `x0` has another dimension, or a time-varying loop ends before the horizon;
+                there are not as many disturbances or noises, or the loop has none.
         """
         x0 = Numbers("(n_x,)", "(batch, n_x)")(x0, "x0")
         same_size(
             "the loop's number of states is", "the dimension of x0 is", (self.states, x0.shape[-1])
         )
         self.check_horizon(horizon, start)
-        return _simulate(self, x0, horizon, start)
+        w = self._given("disturbances", self.disturbance, disturbances, x0, horizon)
+        v = self._given("noises", self.noise, noises, x0, horizon)
+        return _simulate(self, x0, w, v, horizon, start)
+
+    def _given(
+        self, name: str, W: AbstractSet | None, given: Any, x0: Array, horizon: int
+    ) -> Array | None:
+        """What users say is drawn at each step.
+
+        Raises:
+            ValueError: it has another shape, or the loop has nothing that is drawn.
+        """
+        if given is None:
+            return None
+        if W is None:
+            raise ValueError(f"{name} arrived, but the loop has none")
+        given = Numbers("(horizon, n)", "(batch, horizon, n)")(given, name)
+        expected = (horizon, W.dimension)
+        if given.shape not in (expected, (*x0.shape[:-1], *expected)):
+            raise ValueError(
+                f"{name} must have shape {expected}, or that after the batch of x0, "
+                f"{x0.shape[:-1]}, but one of shape {given.shape} arrived"
+            )
+        return given
+
+    def split(self, scenarios: Float[ArrayLike, "*batch s"]) -> Scenario:
+        """The parts of scenarios, such as the `witness_states` of a certificate of this loop.
+
+        Args:
+            scenarios: initial states, behind each the disturbances and the noise of one step after
+                the other, if the loop has any.
+
+        Example:
+            >>> from reachjax import MLP, AffinePlant
+            >>> plant, net = AffinePlant([[0]], [[1]], E=[[1]]), MLP.from_layers([([[0]], [0])])
+            >>> loop = ClosedLoop(plant, net, disturbance=Box([-1.0], [1.0]))
+            >>> loop.split(jnp.array([5.0, 0.1, 0.2])).disturbances.tolist()
+            [[0.1], [0.2]]
+        """
+        sets = self.disturbance, self.noise
+        return split(scenarios, self.states, *(0 if W is None else W.dimension for W in sets))
 
     def check_horizon(self, horizon: int, start: int = 0) -> None:
         """Raise an error unless the loop is given for all of `start .. start + horizon`."""
@@ -168,6 +349,16 @@ class ClosedLoop(Replaceable):
                 f"but start {start} and horizon {horizon} ask for t = {start} .. "
                 f"{start + horizon - 1}"
             )
+
+
+def split(scenarios: Any, n_x: int, n_w: int, n_v: int) -> Scenario:
+    """The parts of scenarios, of these sizes."""
+    states, rest = scenarios[..., :n_x], scenarios[..., n_x:]
+    if n_w + n_v == 0:
+        return Scenario(states, None, None)
+    drawn = rest.reshape(*rest.shape[:-1], -1, n_w + n_v)
+    w, v = drawn[..., :n_w], drawn[..., n_w:]
+    return Scenario(states, w if n_w else None, v if n_v else None)
 
 
 @lru_cache(maxsize=256)
@@ -196,13 +387,19 @@ def _recorded(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Unit
 
 
 @partial(jax.jit, static_argnames="horizon")
-def _simulate(loop: ClosedLoop, x0: Array, horizon: int, start: int) -> Array:
-    def trajectory(x):
-        def advance(x, t):
-            following = loop.step(x, t)
+def _simulate(
+    loop: ClosedLoop, x0: Array, w: Array | None, v: Array | None, horizon: int, start: int
+) -> Array:
+    def trajectory(x, w, v):
+        def advance(x, given):
+            t, w, v = given
+            following = loop.step(x, t, w=w, v=v)
             return following, following
 
-        _, states = jax.lax.scan(advance, x, start + jnp.arange(horizon))
+        _, states = jax.lax.scan(advance, x, (start + jnp.arange(horizon), w, v))
         return jnp.concatenate([x[None], states])
 
-    return trajectory(x0) if x0.ndim == 1 else jax.vmap(trajectory)(x0)
+    if x0.ndim == 1:
+        return trajectory(x0, w, v)
+    of_each = (None if part is None or part.ndim == 2 else 0 for part in (w, v))
+    return jax.vmap(trajectory, in_axes=(0, *of_each))(x0, w, v)

@@ -1,6 +1,6 @@
 """Plants: what follows a state under an input.
 
-The affine one, time-invariant or time-varying, is `x[t+1] = A_t x[t] + B_t u[t] + c_t`.
+The affine one, time-invariant or time-varying, is `x[t+1] = A_t x[t] + B_t u[t] + c_t + E_t w[t]`.
 """
 
 from __future__ import annotations
@@ -34,12 +34,19 @@ class AbstractPlant(Replaceable, abc.ABC):
         """The number `n_u` of inputs."""
 
     @property
+    def disturbances(self) -> int:
+        """The number `n_w` of disturbances that enter it; none here."""
+        return 0
+
+    @property
     @abc.abstractmethod
     def steps(self) -> int | None:
         """The number of times a time-varying plant is given for; `None` when time-invariant."""
 
     @abc.abstractmethod
-    def propagate(self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
+    def propagate(
+        self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
+    ) -> Any:
         """The successor of `x` under input `u`, for any kind of number.
 
         Args:
@@ -47,6 +54,7 @@ class AbstractPlant(Replaceable, abc.ABC):
             u: the input.
             t: the time.
             unit: what is done at each layer of units, of which an affine plant has none.
+            w: the disturbances; None of a plant that has none, or where they are zero.
         """
 
 
@@ -80,12 +88,14 @@ def _depth(value: Any) -> int:
 
 @pytree
 class AffinePlant(AbstractPlant):
-    """The paper's system (LTV). A leading time axis on any of the three makes it time-varying.
+    """The paper's system (LTV), and disturbances. A leading time axis makes it time-varying.
 
     Args:
         A: `(n_x, n_x)` or `(time, n_x, n_x)`.
         B: `(n_x, n_u)` or `(time, n_x, n_u)`.
         c: `(n_x,)` or `(time, n_x)`, in the units of the state; zero when left out.
+        E: `(n_x, n_w)` or `(time, n_x, n_w)`, how disturbances enter, which `ClosedLoop` has a set
+            of; none when left out.
 
     Raises:
         TypeError: a tuple or a list of arrays arrived, of which nobody knows what they are: the
@@ -103,12 +113,16 @@ class AffinePlant(AbstractPlant):
     c: Float[Array, "*time n"] = converted(
         converter=_one_array("(n_x,)", "(time, n_x)"), default=None
     )
+    E: Float[Array, "*time n w"] | None = converted(
+        converter=_one_array("(n_x, n_w)", "(time, n_x, n_w)"), default=None
+    )
 
     def __post_init__(self):
         n = self.A.shape[-1]
         if self.c is None:
             self._set(c=jnp.zeros(n))
-        for name, axis in (("A", -2), ("B", -2), ("c", -1)):
+        rows = {"A": -2, "B": -2, "c": -1} | ({} if self.E is None else {"E": -2})
+        for name, axis in rows.items():
             shape = getattr(self, name).shape
             if shape[axis] != n:
                 raise ValueError(
@@ -122,9 +136,9 @@ class AffinePlant(AbstractPlant):
             )
 
     def _varying(self) -> dict[str, Any]:
-        constant = {"A": 2, "B": 2, "c": 1}
+        constant = {"A": 2, "B": 2, "c": 1, "E": 2}
         arrays = {name: getattr(self, name) for name in constant}
-        return {name: a for name, a in arrays.items() if a.ndim > constant[name]}
+        return {name: a for name, a in arrays.items() if a is not None and a.ndim > constant[name]}
 
     @property
     def states(self) -> int:
@@ -137,6 +151,11 @@ class AffinePlant(AbstractPlant):
         return self.B.shape[-1]
 
     @property
+    def disturbances(self) -> int:
+        """The number `n_w` of disturbances."""
+        return 0 if self.E is None else self.E.shape[-1]
+
+    @property
     def steps(self) -> int | None:
         """The number of times a time-varying plant is given for; `None` when time-invariant."""
         return next((array.shape[0] for array in self._varying().values()), None)
@@ -147,26 +166,46 @@ class AffinePlant(AbstractPlant):
         Raises:
             ValueError: the plant is not given for this time (where the time is a plain number).
         """
-        varying = self._varying()
         if self.steps is not None:
             within_time_axis("AffinePlant", t, self.steps)
-        A, B, c = (varying[k][t] if k in varying else getattr(self, k) for k in ("A", "B", "c"))
-        return A, B, c
+        return self._at("A", t), self._at("B", t), self._at("c", t)
 
-    def propagate(self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
-        """The successor of `x` under input `u`, for any kind of number."""
+    def entering(self, t: int | jax.Array) -> Array:
+        """`E_t`.
+
+        Raises:
+            ValueError: there is none, or not for this time (where the time is a plain number).
+        """
+        if self.E is None:
+            raise ValueError("the plant has no disturbances: AffinePlant.E was left out")
+        if self.steps is not None:
+            within_time_axis("AffinePlant", t, self.steps)
+        return self._at("E", t)
+
+    def _at(self, name: str, t: int | jax.Array) -> Array:
+        array = getattr(self, name)
+        return array[t] if name in self._varying() else array
+
+    def propagate(
+        self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
+    ) -> Any:
+        """The successor of `x` under input `u` and disturbances `w`, for any kind of number."""
         A, B, c = self.at(t)
-        return A @ x + B @ u + c
+        following = A @ x + B @ u + c
+        return following if w is None else following + self.entering(t) @ w
 
 
 @pytree
 class NonlinearPlant(AbstractPlant):
-    """Any JAX function as a plant, `x[t+1] = f(x[t], u[t])`, traced as a `Network` is.
+    """Any JAX function as a plant, `x[t+1] = f(x[t], u[t], w[t])`, traced as a `Network` is.
 
     Args:
-        f: of a state `(states,)` and an input `(inputs,)`, with the successor for a result.
+        f: of a state `(states,)`, an input `(inputs,)` and, if there are any, disturbances
+            `(disturbances,)`, with the successor for a result.
         states: how many there are.
         inputs: how many there are.
+        disturbances: how many there are; of none `f` takes two arguments. What they may be the
+            `disturbance` of a `ClosedLoop` says.
 
     Raises:
         TypeError: `f` is no function, or contains a primitive that has no bounds, whose line the
@@ -183,18 +222,20 @@ class NonlinearPlant(AbstractPlant):
 
     f: Function
 
-    def __init__(self, f: Any, states: int | None = None, inputs: int | None = None):
+    def __init__(
+        self, f: Any, states: int | None = None, inputs: int | None = None, disturbances: int = 0
+    ):
         if not isinstance(f, Function):
             name = "NonlinearPlant"
-            n, m = (
-                whole_number(f"{name}.states", states, 1),
-                whole_number(f"{name}.inputs", inputs, 1),
-            )
-            f = Function.of(f, (n, m), n, f"{name}.f")
+            n = whole_number(f"{name}.states", states, 1)
+            m = whole_number(f"{name}.inputs", inputs, 1)
+            d = whole_number(f"{name}.disturbances", disturbances, 0)
+            f = Function.of(f, (n, m, d) if d else (n, m), n, f"{name}.f")
         self._set(f=f)
 
     def __repr__(self) -> str:
-        return f"NonlinearPlant(states={self.states}, inputs={self.inputs})"
+        more = f", disturbances={self.disturbances}" if self.disturbances else ""
+        return f"NonlinearPlant(states={self.states}, inputs={self.inputs}{more})"
 
     @property
     def states(self) -> int:
@@ -207,10 +248,21 @@ class NonlinearPlant(AbstractPlant):
         return self.f.structure.inputs[1]
 
     @property
+    def disturbances(self) -> int:
+        """The number `n_w` of disturbances."""
+        return sum(self.f.structure.inputs[2:])
+
+    @property
     def steps(self) -> int | None:
         """None: the function does not know the time."""
         return None
 
-    def propagate(self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
-        """The successor of `x` under input `u`, for any kind of number."""
-        return self.f.propagate((x, u), unit)
+    def propagate(
+        self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
+    ) -> Any:
+        """The successor of `x` under input `u` and disturbances `w`, for any kind of number."""
+        if not self.disturbances:
+            return self.f.propagate((x, u), unit)
+        if w is None:
+            w = np.zeros((self.disturbances, self.states)) @ x
+        return self.f.propagate((x, u, w), unit)

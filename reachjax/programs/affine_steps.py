@@ -63,11 +63,13 @@ class Merged(NamedTuple):
         outputs: forms of the outputs.
         gap: `(n_u,)`, how much each has of its column.
         places: `(n_u,)`, the columns; -1 where none is needed.
+        layers: those of the step that it sums up.
     """
 
     outputs: AffineForms
     gap: Float[Array | np.ndarray, " n_u"]
     places: Int[Array | np.ndarray, " n_u"]
+    layers: range
 
 
 class StepForms(NamedTuple):
@@ -122,8 +124,7 @@ def step_forms(
         scratch: where the columns begin that a step needs in between, if there is a place.
     """
     found: list[UnitForms] = []
-    done, width, merging = 0, state.columns.shape[1], loop.smooth_controller
-    free = scratch if merging and place is not None else place
+    done, width, free = 0, state.columns.shape[1], place
 
     def apply(unit: AbstractUnit, y: AffineForms) -> AffineForms:
         nonlocal done, width, free
@@ -146,12 +147,18 @@ def step_forms(
         found.append(forms)
         return z
 
-    u, merged = loop.controller.propagate(state, apply), None
-    if merging:
-        u, merged = _merged(u, state.columns.shape[1], place, scratch)
+    measured, merged = loop.measured(state, t, apply), None
+    if loop.smooth_controller:
+        first, kept, before = len(found), free, width
+        free = None if place is None else scratch
+        u = loop.controller.propagate(measured, apply)
+        u, (gap, places) = _merged(u, before, kept, scratch)
+        merged = Merged(u, gap, places, range(first, len(found)))
         width = u.columns.shape[1]
-        free = None if place is None else place + len(u.rows)
-    successor = loop.plant.propagate(state, loop.projected(u, t, apply), t, apply)
+        free = None if kept is None else kept + len(u.rows)
+    else:
+        u = loop.controller.propagate(measured, apply)
+    successor = loop.moved(state, loop.projected(u, t, apply), t, apply)
     if place is None:
         successor = successor.widened(width)
     successor = _spilled(successor, free)
@@ -175,7 +182,7 @@ def _require_bounds(forms: UnitForms, t: int) -> None:
 
 def _merged(
     forms: AffineForms, width: int, place: Place, scratch: int
-) -> tuple[AffineForms, Merged]:
+) -> tuple[AffineForms, tuple[Any, Any]]:
     """The same with all columns from some on as one for each number."""
     xp, first = namespace(forms.rows), 2 + (width if place is None else scratch)
     last = forms.rows[:, first:]
@@ -185,7 +192,7 @@ def _merged(
     else:
         rows = xp.concatenate([forms.rows[:, :first], xp.zeros_like(last)], axis=1)
     forms, places = AffineForms(rows, forms.radii).with_own(gap, place)
-    return forms, Merged(forms, gap, places)
+    return forms, (gap, places)
 
 
 def _smooth(

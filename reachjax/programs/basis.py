@@ -163,6 +163,7 @@ def change_of_basis(loop: ClosedLoop, t: int = 0) -> ChangeOfBasis:
 
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
+        TypeError: the loop has disturbances or noise, which the paper's basis has no place for.
         ValueError: a time-varying loop ends before `t`.
 
     Source: propositions 3, 4 and 5 of Hu, Fazlyab, Morari, Pappas (CDC 2020).
@@ -175,6 +176,11 @@ def change_of_basis(loop: ClosedLoop, t: int = 0) -> ChangeOfBasis:
         [[1.0, 0.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]
     """
     require_double_precision(loop=loop)
+    if loop.is_disturbed:
+        raise TypeError(
+            "change_of_basis is of loops without disturbances and noise, but loop has some: "
+            "the paper's basis has no place for them"
+        )
     loop.check_horizon(1, t)
     return _change_of_basis(loop, t)
 

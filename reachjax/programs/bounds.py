@@ -47,7 +47,12 @@ class LoopBounds:
 
 
 def loop_bounds(
-    loop: ClosedLoop, box: Box, t: int | jax.Array, known: Ball | None = None
+    loop: ClosedLoop,
+    box: Box,
+    t: int | jax.Array,
+    known: Ball | None = None,
+    w: Array | None = None,
+    v: Array | None = None,
 ) -> LoopBounds:
     """Propagate a box of states through one step by interval arithmetic.
 
@@ -56,7 +61,10 @@ def loop_bounds(
         box: of states.
         t: the time.
         known: `(k,)`, other bounds of the units' inputs, if there are any.
+        w: `(n_w,)`, the disturbances, where they are known.
+        v: `(n_x,)`, the noise, where it is known.
     """
+    drawn = (None if part is None else Ball.exact(part) for part in (w, v))
     units: list[tuple[Ball, Ball, Lines, Array, Array]] = []
 
     def unit(unit: AbstractUnit, y: Ball) -> Ball:
@@ -78,7 +86,7 @@ def loop_bounds(
         return z
 
     state = Ball.between(box.lower, box.upper)
-    successor = loop.step(state, t, unit)
+    successor = loop.step(state, t, unit, *drawn)
     empty = jnp.zeros(0)
     none, line = Ball.exact(empty), Line(empty, empty)
     units.insert(0, (none, none, Lines(line, line), empty > 0, empty))
@@ -113,9 +121,19 @@ def _chosen(mask: Array, one: Line, other: Line) -> Line:
 
 
 @jax.jit
-def successor_box(loop: ClosedLoop, box: Box, t: int) -> Box:
-    """A box that surely holds the successors of a box of states, rounding included."""
-    successor = loop_bounds(loop, box, t).successor
+def successor_box(
+    loop: ClosedLoop, box: Box, t: int, w: Array | None = None, v: Array | None = None
+) -> Box:
+    """A box that surely holds the successors of a box of states, rounding included.
+
+    Args:
+        loop: the closed loop.
+        box: of states.
+        t: the time.
+        w: the disturbances, where they are known.
+        v: the noise, where it is known.
+    """
+    successor = loop_bounds(loop, box, t, None, w, v).successor
     return Box(successor.lower, successor.upper)
 
 

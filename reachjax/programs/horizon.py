@@ -15,7 +15,8 @@ Everything here is numpy on the host.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,8 @@ class Horizon:
         state: forms of the state after the steps so far.
         steps: the forms of the units of each step, layer by layer.
         columns: `(p,)`, of the unit of each pair of facts whose product is zero.
+        free: columns of disturbances.
+        enclosed: those that facts bound by themselves.
         gaps: `(p,)`, how much of its column a unit's value has.
         origins: `(m, 3)`, of each fact the step, the unit's number among those of a step, and which
             of its facts it is; -1 of the initial set, -2 of products of its columns.
@@ -71,13 +74,13 @@ class Horizon:
         self.state = AffineForms.beginning(self.start)
         self.steps: list[tuple[UnitForms, ...]] = []
         self.merged: list[Merged | None] = []
-        self._controllers = len(loop.controller_layers)
         self._varying = np.zeros(0, dtype=int)
         self._width = self.start.count
         self._facts: list[AffineForms] = []
         self._zero: list[np.ndarray] = [np.zeros((0, 2), dtype=int)]
         self.columns, self.gaps = np.zeros(0, dtype=int), np.zeros(0)
         self.origins = np.zeros((0, 3), dtype=int)
+        self.free = self.enclosed = np.zeros(0, dtype=int)
         self._count = self._stated = 0
         if self.start.cut is not None:
             A, b = (np.asarray(part) for part in self.start.cut.facets)
@@ -125,7 +128,7 @@ class Horizon:
             if isinstance(unit, SmoothUnit):  # its range is that of its form, but for little
                 return ends
             switching = np.flatnonzero(~unit.lines(*ends).affine)
-            if multipliers is None or not (len(switching) and self._count):
+            if multipliers is None or unit.free or not (len(switching) and self._count):
                 return ends
             lower, upper = (end.copy() for end in ends)
             inputs = y[switching]
@@ -148,13 +151,23 @@ class Horizon:
         self.steps.append(units)
         self.merged.append(merged)
         # those of units of a smooth controller are summed up in the merged ones
-        own = units if merged is None else units[self._controllers :]
+        summed = range(0) if merged is None else merged.layers
+        own = (layer for number, layer in enumerate(units) if number not in summed)
         for each in (*own, *([merged] if merged else [])):
-            if _left_out(each):
+            if _has_a_range(each):
                 self._varying = np.append(self._varying, each.places[each.places >= 0])
 
-    def columns_at(self, state: Float[np.ndarray, " n_x"]) -> Float[np.ndarray, " n"]:
-        """The columns of the trajectory from an initial state."""
+    def columns_at(
+        self,
+        state: Float[np.ndarray, " n_x"],
+        drawn: Sequence[Float[np.ndarray, " m"]] | None = None,
+    ) -> Float[np.ndarray, " n"]:
+        """The columns of the trajectory from an initial state.
+
+        Args:
+            state: the initial state.
+            drawn: the values of the disturbances of each step, in `[-1, 1]`; None for zeros.
+        """
         found = np.zeros(self.width)
         first = self.start.back @ (state - self.start.center)
         found[: len(first)] = first
@@ -163,27 +176,46 @@ class Horizon:
             i == j, 2 * first[i] * first[j] - 1, first[i] * first[j]
         )
         x: Any = state
-        for k, (layers, merged) in enumerate(zip(self.steps, self.merged, strict=True)):
-            following, own = iter(layers), 0 if merged is None else self._controllers
-
-            def apply(
-                unit: AbstractUnit, y: Any, following: Any = following, own: int = own
-            ) -> Any:
-                nonlocal seen
-                z: Any = unit(y)
-                layer, seen = next(following), seen + 1
-                if seen > own:  # else its columns were merged
-                    _fill(found, layer.outputs, layer.gap, layer.places, z)
-                return z
-
-            seen = 0
-
-            u = self._loop.controller.propagate(x, apply)
-            if merged is not None:
-                _fill(found, *merged[:2], merged.places, u)
-            t = self._t + k
-            x = self._loop.plant.propagate(x, self._loop.projected(u, t, apply), t, apply)
+        for k in range(len(self.steps)):
+            x = self._followed(x, k, found, () if drawn is None else drawn[k])
         return found
+
+    def _followed(
+        self,
+        x: Float[np.ndarray, " n_x"],
+        k: int,
+        found: Float[np.ndarray, " n"],
+        drawn: Iterable[float],
+    ) -> Float[np.ndarray, " n_x"]:
+        """The state after one step more of a trajectory, whose columns are set."""
+        (layers, merged), loop, t = (self.steps[k], self.merged[k]), self._loop, self._t + k
+        summed = range(0) if merged is None else merged.layers
+        numbers, values = itertools.count(), iter(drawn)
+
+        def apply(unit: AbstractUnit, y: Any) -> Any:
+            number, z = next(numbers), unit(y)
+            if unit.free:
+                z = z + np.array([next(values, 0.0) for _ in range(len(y))])
+            if number not in summed:
+                layer = layers[number]
+                _fill(found, layer.outputs, layer.gap, layer.places, z)
+            return z
+
+        u = loop.controller.propagate(loop.measured(x, t, apply), apply)
+        if merged is not None:
+            _fill(found, merged.outputs, merged.gap, merged.places, u)
+        return loop.moved(x, loop.projected(u, t, apply), t, apply)
+
+    def drawn_at(self, columns: Float[np.ndarray, "c n"]) -> list[Float[np.ndarray, "c m"]]:
+        """The values of the disturbances of each step, in the order in which they are drawn."""
+        none = np.zeros((len(columns), 0))
+        return [
+            np.concatenate(
+                [none, *(columns[:, each.places] * each.gap for each in layers if each.unit.free)],
+                axis=1,
+            )
+            for layers in self.steps
+        ]
 
     def weights(self, multipliers: Float[np.ndarray, "f m"], steps: int) -> FactWeights:
         """Multipliers of the facts so far by what they are of, for so many steps."""
@@ -216,8 +248,12 @@ class Horizon:
     def _state_facts(self, found: Sequence[UnitForms]) -> None:
         """Add the facts of the layers that are new."""
         for number, layer in enumerate(found[self._stated :], start=self._stated):
-            switching = np.flatnonzero(layer.places >= 0)
-            if len(switching):
+            switching = np.flatnonzero((layer.places >= 0) | layer.unit.stated)
+            if layer.unit.closed:
+                self.enclosed = np.append(self.enclosed, found[number - 1].places)
+            if layer.unit.free:  # its column says all that its facts do
+                self.free = np.append(self.free, layer.places)
+            elif len(switching):
                 first = sum(len(before.places) for before in found[:number])
                 self._add_units(layer, switching, first)
         self._stated = len(found)
@@ -247,9 +283,9 @@ class Horizon:
         self._count += len(rows.rows)
 
 
-def _left_out(each: UnitForms | Merged) -> bool:
-    """Whether columns are of what smooth units leave out."""
-    return isinstance(each, Merged) or isinstance(each.unit, SmoothUnit)
+def _has_a_range(each: UnitForms | Merged) -> bool:
+    """Whether columns may be anything in their range: disturbances, and what smooth units leave."""
+    return isinstance(each, Merged) or each.unit.free or isinstance(each.unit, SmoothUnit)
 
 
 def _fill(

@@ -130,8 +130,14 @@ def _upper(rows: Rows, X: AbstractSet, bounds: LoopBounds) -> Float[Array, " k"]
 
 @jax.jit
 def first_rows(loop: ClosedLoop) -> Rows | None:
-    """Rows over `[x, 1]` of the inputs of the controller's first layer; None if it has no units."""
+    """Rows over `[x, 1]` of the inputs of the controller's first layer.
+
+    None if it has no units, or if it measures the state with noise: what it is given is no function
+    of the state then, nor are its units the first ones of a step.
+    """
     n, found = loop.states, []
+    if loop.noise is not None:
+        return None
 
     def stop(_: AbstractUnit, y: Rows) -> Rows:
         found.append(y)

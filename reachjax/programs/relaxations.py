@@ -117,6 +117,7 @@ class PaperQC(AbstractRelaxation):
         within = (itertools.combinations(facets, 2) for facets in facts.set_facets)
         signed = [[pair] for pair in itertools.chain(*within)]
         signed += [[(0, i)] for i in facts.marked(Mark.SECTOR)]
+        signed += [[pair] for pair in facts.products(Mark.SECTOR)]
         if self.repeated:
             signed += _crossed(facts)
         return free + signed, len(free)

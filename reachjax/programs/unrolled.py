@@ -48,11 +48,14 @@ class ByForms(NamedTuple):
         slopes: `(units,)`, of the lines that stand for the units of the step before.
         corners: `(m, n_x)`, initial states at which the forms are largest, but for their columns of
             units and what cuts the initial set.
+        drawn: for each step so far the values `(m, d)` of disturbances there; nothing of compiled
+            code.
     """
 
     offsets: Float[Array | np.ndarray, "*N m"]
     slopes: Float[Array | np.ndarray, "*N units"]
     corners: Float[Array | np.ndarray, "*N m n_x"]
+    drawn: tuple[Float[np.ndarray, "m d"], ...] = ()
 
 
 def unrolled(
@@ -86,13 +89,17 @@ def unrolled(
     with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
         start = InitialColumns.of(X0, box, loop.curved)
         state = AffineForms.beginning(start)
+    free: list[np.ndarray] = []
     for k, rows in enumerate(np.asarray(directions)):
         with np.errstate(all="ignore"):
             given = None if slopes is None else np.asarray(slopes[k])
             held = None if known is None else known[k]
             state, units, _ = step_forms(loop, state, t + k, start, slopes=given, known=held)
-            found = _bounds(rows @ state, units, start)
-        yield found
+            forms = rows @ state
+            found = _bounds(forms, units, start)
+        here = [layer.places for layer in units if layer.unit.free]
+        free.append(np.concatenate([np.zeros(0, int), *here]))
+        yield found._replace(drawn=tuple(np.sign(forms.columns[:, each]) for each in free))
 
 
 @partial(jax.jit, static_argnames="t")

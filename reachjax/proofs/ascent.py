@@ -1,4 +1,4 @@
-"""Projected gradient ascent: initial states whose trajectories go far.
+"""Projected gradient ascent: scenarios whose trajectories go far.
 
 The loop is piecewise affine, so an ascent ends at a corner of a piece or on the edge of the set. A
 solver's proposal is often the best state already, up to its tolerance, and a few steps remove that.
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.scenarios import Scenarios
 from reachjax.sets import AbstractSet
 
 ASCENT_STEPS = 80
@@ -25,58 +26,58 @@ LONGEST = 4.0
 @partial(jax.jit, static_argnames=("horizon", "start"))
 def ascended(
     loop: ClosedLoop,
-    X0: AbstractSet,
+    scenarios: Scenarios,
     scale: Float[Array, "n_x n_x"],
-    middle: Float[Array, " n_x"],
-    states: Float[Array, "m n_x"],
+    middle: Float[Array, " s"],
+    begin: Float[Array, "m s"],
     region: AbstractSet,
     which: Int[Array, " m"],
     k: int,
     horizon: int,
     start: int,
-) -> Float[Array, "m n_x"]:
-    """Initial states of larger values after `k` steps, in the set of initial states.
+) -> Float[Array, "m s"]:
+    """Scenarios of larger values after `k` steps: initial states in their set, and what is drawn.
 
-    Steps and projections are measured in the box around that set, or where an ellipsoid is a ball;
+    Steps and projections are measured in the box around a set, or where an ellipsoid is a ball;
     where the loop is affine, an ascent ends at the largest value, but for polytopes with corners so
     sharp that projections onto them do not converge. Steps double where they gain, and are halved
     where they do not.
 
     Args:
         loop: the closed loop.
-        X0: the set of initial states.
-        scale: in which steps and projections are measured.
-        middle: a point in its interior, if it has any.
-        states: where to begin.
+        scenarios: all of them.
+        scale: in which steps and projections of initial states are measured.
+        middle: a scenario in their interior, if they have any.
+        begin: where to begin.
         region: a set whose bounded values are sought.
-        which: of these values, one for each state.
+        which: of these values, one for each scenario.
         k: after how many steps.
         horizon: how many steps are simulated.
         start: the time of the initial set.
     """
 
-    def climb(state: Float[Array, " n_x"], number: Int[Array, ""]) -> Float[Array, " n_x"]:
-        def value(state):
-            after = loop.simulate(state, horizon, start)[k]
+    def climb(begin: Float[Array, " s"], number: Int[Array, ""]) -> Float[Array, " s"]:
+        def value(scenario):
+            states, disturbances, noises = scenarios.split(scenario)
+            drawn = {"disturbances": disturbances, "noises": noises}
+            after = loop.simulate(states, horizon, start, **drawn)[k]
             return region.bounded_values(after)[number]
 
         def improve(carry, _):
-            best, slope, state, length = carry
-            uphill = scale.T @ slope
-            size = jnp.linalg.norm(uphill)
-            unit = uphill / jnp.where(size > 0, size, 1.0)
-            moved = X0.brought_inside(state + length * scale @ unit, middle, scale)
+            best, slope, scenario, length = carry
+            ahead = scenario + length * scenarios.uphill(slope, scale)
+            moved = scenarios.brought_inside(ahead, middle, scale)
             reached, other = jax.value_and_grad(value)(moved)
             better = reached > best
             following = reached, other, moved, jnp.minimum(2 * length, LONGEST)
             return jax.tree.map(
                 lambda new, old: jnp.where(better, new, old),
                 following,
-                (best, slope, state, length / 2),
+                (best, slope, scenario, length / 2),
             ), None
 
-        first = X0.brought_inside(state, middle, scale)
+        first = scenarios.brought_inside(begin, middle, scale)
         begun = (*jax.value_and_grad(value)(first), first, jnp.array(0.5))
         return jax.lax.scan(improve, begun, length=ASCENT_STEPS)[0][2]
 
-    return jax.vmap(climb)(states, which)
+    return jax.vmap(climb)(begin, which)

@@ -27,7 +27,8 @@ class AbstractProof(Replaceable, abc.ABC):
         codes: `(f,)`, how what found it ended, as values of `SolverStatus`.
         bounds: `(f,)`, what was proved.
         witnesses: `(f,)`, the largest simulated values of what is bounded.
-        witness_states: `(f, n_x)`, the initial states that attain them.
+        witness_states: `(f, n_x)`, the initial states that attain them. Of a loop with disturbances
+            or noise `(f, s)`, with what is drawn at each step behind them: see `ClosedLoop.split`.
         seconds: `(f,)`, the time that it took to find.
     """
 

@@ -2,7 +2,8 @@
 
 A witness is an initial state whose trajectory attains a value of a direction: no sound offset can
 be smaller. Candidates are the corners of the initial set, points drawn from it, and what gradient
-ascent finds from these and from the states that the dual of a semidefinite program proposes.
+ascent finds from these and from the states that the dual of a semidefinite program proposes. Of a
+loop with disturbances or noise it is a whole scenario (`loops.scenarios`).
 """
 
 from __future__ import annotations
@@ -15,15 +16,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.batches import trajectories
+from reachjax.loops.scenarios import PULL, Runs, Scenarios
 from reachjax.proofs.ascent import ascended
 from reachjax.sets import AbstractSet
 
 BLOCK = 1024
 """Trajectories are evaluated in multiples of so many, for which code is compiled once."""
-
-PULL = 1 - 1e-12
-"""How far a rounded point is brought towards the middle of the set."""
 
 PULLS = PULL, 1 - 1e-9, 1 - 1e-6
 """The same of points that solvers of cones found, by turns until one is inside."""
@@ -44,7 +42,7 @@ def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, 
     return states[inside] if inside.any() else states  # a flat set contains none exactly
 
 
-def _padded(points: Float[np.ndarray, "c n_x"]) -> Float[np.ndarray, "b n_x"]:
+def _padded(points: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "b n"]:
     """The same points and some of them again, so that there are few numbers of them."""
     return np.resize(points, (-(-len(points) // BLOCK) * BLOCK, points.shape[1]))
 
@@ -68,18 +66,18 @@ class Simulated(NamedTuple):
     Attributes:
         least: `(f,)`, infinite where nothing is simulated.
         most: `(f,)`, the same.
-        states: `(f, n_x)`, initial states that attain the largest.
+        scenarios: `(f, s)`, those that attain the largest.
     """
 
     least: Float[np.ndarray, " f"]
     most: Float[np.ndarray, " f"]
-    states: Float[np.ndarray, "f n_x"]
+    scenarios: Float[np.ndarray, "f s"]
 
     @classmethod
-    def nothing(cls, state: Float[np.ndarray, " n_x"], facets: int) -> Simulated:
-        """Of so many directions, with some initial state."""
+    def nothing(cls, scenario: Float[np.ndarray, " s"], facets: int) -> Simulated:
+        """Of so many directions, with some scenario."""
         none = np.full(facets, np.inf)
-        return cls(none, -none, np.tile(state, (facets, 1)))
+        return cls(none, -none, np.tile(scenario, (facets, 1)))
 
 
 class Simulations:
@@ -99,23 +97,23 @@ class Simulations:
     def __init__(
         self, loop: ClosedLoop, X0: AbstractSet, horizon: int, start: int, samples: int, seed: int
     ):
-        self._loop, self._X0, self._start, self._horizon = loop, X0, start, horizon
+        self._loop, self._start, self._horizon = loop, start, horizon
         self._on_host = jax.device_get(loop)
         self._scale = X0.scale()
+        self._all = Scenarios.of(loop, X0, horizon, start)
         states = initial_states(X0, samples, seed)
-        self._states, self._middle = states, states.mean(axis=0)
-        self._trajectories = self.simulated(states, horizon)
+        self._middle = self._all.middle(states.mean(axis=0))
+        self._scenarios = self._all.drawn(states, seed)
+        self._trajectories = self.simulated(self._scenarios)
 
     @property
-    def trajectories(self) -> Float[np.ndarray, "c h+1 n_x"]:
+    def runs(self) -> Runs:
         """All of them."""
-        return self._trajectories
+        return Runs(self._scenarios, self._trajectories)
 
-    def simulated(
-        self, states: Float[np.ndarray, "c n_x"], steps: int
-    ) -> Float[np.ndarray, "c steps+1 n_x"]:
-        """Trajectories from these states."""
-        return trajectories(self._on_host, states, steps, self._start)
+    def simulated(self, scenarios: Float[np.ndarray, "c s"]) -> Float[np.ndarray, "c h+1 n_x"]:
+        """The trajectories of these scenarios."""
+        return self._all.runs(self._on_host, scenarios, self._horizon, self._start)
 
     def values(self, k: int, directions: Float[np.ndarray, "f n_x"]) -> Simulated:
         """What is known of directions after `k` steps."""
@@ -124,14 +122,14 @@ class Simulations:
     def known(self, values: Float[np.ndarray, "c f"]) -> Simulated:
         """What is known of numbers that these are the values of, trajectory by trajectory."""
         worst = values.argmax(axis=0)
-        return Simulated(values.min(axis=0), values.max(axis=0), self._states[worst])
+        return Simulated(values.min(axis=0), values.max(axis=0), self._scenarios[worst])
 
     def climb(
         self,
         k: int,
         region: AbstractSet,
         which: Int[np.ndarray, " m"],
-        states: Float[np.ndarray, "m n_x"],
+        begin: Float[np.ndarray, "m p"],
     ) -> None:
         """Seek larger values after `k` steps by gradient ascent.
 
@@ -139,31 +137,43 @@ class Simulations:
             k: the number of steps.
             region: a set that bounds `m` values.
             which: of these values each ascent seeks.
-            states: where it begins; those that are no numbers begin at the middle of the samples.
+            begin: scenarios where it begins, or initial states alone, with what is drawn in the
+                best scenario so far; those that are no numbers begin at the middle of the samples.
         """
-        known = np.isfinite(states).all(axis=1, keepdims=True)
-        begin = np.where(known, states, self._middle)
-        fixed = self._loop, self._X0, self._scale, self._middle
+        if begin.shape[1] < len(self._middle):
+            best = self._values(k, region).argmax(axis=0)
+            begin = self._all.completed(begin, self._scenarios[best[which]])
+        known = np.isfinite(begin).all(axis=1, keepdims=True)
+        begin = np.where(known, begin, self._middle)
+        fixed = self._loop, self._all, self._scale, self._middle
         found = ascended(*fixed, begin, region, which, k, self._horizon, self._start)
         self.include(np.asarray(found))
 
-    def include(self, states: Float[np.ndarray, "m n_x"]) -> Float[np.ndarray, "k h+1 n_x"]:
-        """Simulate these initial states too, those that are in the set or just outside."""
-        if not len(states):
-            return self._trajectories[:0]
-        states = np.unique(states, axis=0)  # facets of many steps are often worst at one state
-        for pull in PULLS:
-            inside = self._inside(states)[:, None]
-            states = np.where(inside, states, self._middle + pull * (states - self._middle))
-        found = self.simulated(states, self._horizon)
-        kept = self._inside(states) & np.isfinite(found).all(axis=(1, 2))
-        self._states = np.concatenate([self._states, states[kept]])
-        self._trajectories = np.concatenate([self._trajectories, found[kept]])
-        return found[kept]
+    def include(self, *given: Float[np.ndarray, "m p"]) -> Runs:
+        """Simulate these scenarios too, those that are in their sets or just outside.
 
-    def _inside(self, states: Float[np.ndarray, "m n_x"]) -> Bool[np.ndarray, " m"]:
-        """Which states are in the initial set."""
-        return np.asarray(self._X0.contains(_padded(states)))[: len(states)]
+        They may end early, or be initial states alone: then everything else that is drawn is in the
+        middle of its set.
+        """
+        if not any(map(len, given)):
+            return self.runs.some(slice(0))
+        scenarios = np.concatenate([self._all.completed(part, self._middle) for part in given])
+        scenarios = np.unique(scenarios, axis=0)  # facets of many steps are often worst at one
+        scenarios = self._all.clipped(scenarios)
+        for pull in PULLS:
+            inside = self._inside(scenarios)[:, None]
+            pulled = self._middle + pull * (scenarios - self._middle)
+            scenarios = np.where(inside, scenarios, self._all.clipped(pulled))
+        found = self.simulated(scenarios)
+        kept = self._inside(scenarios) & np.isfinite(found).all(axis=(1, 2))
+        added = Runs(scenarios[kept], found[kept])
+        self._scenarios = np.concatenate([self._scenarios, added.scenarios])
+        self._trajectories = np.concatenate([self._trajectories, added.states])
+        return added
+
+    def _inside(self, scenarios: Float[np.ndarray, "m s"]) -> Bool[np.ndarray, " m"]:
+        """Which scenarios have every part in its set."""
+        return np.asarray(self._all.contains(_padded(scenarios)))[: len(scenarios)]
 
     def _values(self, k: int, region: AbstractSet) -> Float[np.ndarray, "c m"]:
         """What a set bounds, at each trajectory after `k` steps: facets in numpy."""
@@ -176,14 +186,14 @@ class Simulations:
 
     def attained(
         self, k: int, region: AbstractSet
-    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n_x"]]:
-        """The largest values `(m,)` of what a set bounds, after `k` steps, and initial states."""
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m s"]]:
+        """The largest values `(m,)` of what a set bounds, after `k` steps, and their scenarios."""
         values = self._values(k, region)
-        return values.max(axis=0), self._states[values.argmax(axis=0)]
+        return values.max(axis=0), self._scenarios[values.argmax(axis=0)]
 
     def best(
         self, k: int, region: AbstractSet, which: int, count: int
-    ) -> Float[np.ndarray, "count n_x"]:
-        """The initial states of the largest values of one of the things that a set bounds."""
+    ) -> Float[np.ndarray, "count s"]:
+        """The scenarios of the largest values of one of the things that a set bounds."""
         order = np.argsort(-self._values(k, region)[:, which], stable=True)
-        return self._states[np.resize(order[:count], count)]
+        return self._scenarios[np.resize(order[:count], count)]

@@ -229,6 +229,8 @@ def settled(
     vanishing = values <= BENT
     both, side = vanishing.all(axis=1), vanishing.argmax(axis=1)
     row, constant = np.asarray(form.columns), np.asarray(form.rows[:, 0])
+    reach = np.full(facts.columns.shape[1], 2.0)
+    reach[np.setdiff1d(horizon.free, horizon.enclosed)] = 1.0  # what bounds these are no lines
     attained, near = constant[0] + row[0] @ columns[: row.shape[1]], BENT * abs(row).sum()
     if bound - attained > near:
         return None
@@ -237,7 +239,7 @@ def settled(
             continue
         there = np.where(both, phases, side)
         held = (zero[i, there[i]] for i in np.flatnonzero(there >= 0))
-        vertex = programs.largest(row, constant, held, reach=2.0)
+        vertex = programs.largest(row, constant, held, reach=reach)
         if vertex is not None and abs(vertex.value - attained) <= near:
             return vertex.multipliers
     return None

@@ -52,7 +52,7 @@ class ConicPrograms(AbstractPrograms):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
-        reach: float = 1.0,
+        reach: float | Float[np.ndarray, " n"] = 1.0,
         basis: Any = None,
     ) -> Vertex | None:
         """The largest value of a row, or of the least of several; None where there is no answer."""
@@ -69,13 +69,14 @@ class ConicPrograms(AbstractPrograms):
         compared = np.c_[rows / size, -np.ones(len(rows))]
         units = np.eye(n, n + 1)[self._states :]
         ball = np.vstack([np.zeros(n + 1), np.eye(self._states, n + 1)])
+        ends_of_units = np.broadcast_to(reach, self._width)[self._columns[self._states :]]
         parts = fixed, compared, signed, units, -units, ball
         ends = (
             self._constants[held],
             constants / size,
             self._constants[others],
-            np.full(len(units), reach),
-            np.full(len(units), reach),
+            ends_of_units,
+            ends_of_units,
             np.eye(1, self._states + 1)[0],
         )
         if not all(np.isfinite(part).all() for part in (*parts, *ends)):

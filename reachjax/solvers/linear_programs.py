@@ -67,7 +67,7 @@ class AbstractPrograms(abc.ABC):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
-        reach: float = 1.0,
+        reach: float | Float[np.ndarray, " n"] = 1.0,
         basis: Any = None,
     ) -> Vertex | None:
         """The largest value of a row, or of the least of several; None where there is no answer.
@@ -76,7 +76,7 @@ class AbstractPrograms(abc.ABC):
             rows: over the columns.
             constants: of the rows.
             zero: facts that are held at zero.
-            reach: what bounds the columns of units.
+            reach: what bounds the columns of units, of all or of each column.
             basis: where the search begins; None where the last one ended.
         """
 
@@ -135,7 +135,7 @@ class LinearPrograms(AbstractPrograms):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
-        reach: float = 1.0,
+        reach: float | Float[np.ndarray, " n"] = 1.0,
         basis: Any = None,
     ) -> Vertex | None:
         """The largest value of a row, or of the least of several; None where there is no answer."""
@@ -157,12 +157,12 @@ class LinearPrograms(AbstractPrograms):
             for row, constant in zip(rows / size, constants / size, strict=True):
                 self._add_row(-constant, highspy.kHighsInf, np.concatenate([[-1.0], row]))
         self._model.changeColsCost(width, np.arange(width, dtype=np.int32), objective)
-        if reach != 1.0:
+        if np.any(reach != 1.0):
             self._bound_units(reach)
         if basis is not None:
             self._model.setBasis(basis)
         found = self._solved(rows, constants, size, extra)
-        if reach != 1.0:
+        if np.any(reach != 1.0):
             self._bound_units(1.0)
         if extra:
             last = np.arange(self._count - extra, self._count, dtype=np.int32)
@@ -225,9 +225,10 @@ class LinearPrograms(AbstractPrograms):
     def _bound(self, fact: int, upper: float) -> None:
         self._model.changeRowBounds(int(self._rows[fact]), -self._constant[fact], upper)
 
-    def _bound_units(self, reach: float) -> None:
-        for column in range(1 + self._states, 1 + len(self._columns)):
-            self._model.changeColBounds(column, -reach, reach)
+    def _bound_units(self, reach: float | Float[np.ndarray, " n"]) -> None:
+        ends = np.broadcast_to(reach, self._width)[self._columns]
+        for column in range(self._states, len(self._columns)):
+            self._model.changeColBounds(1 + column, -ends[column], ends[column])
 
     def _add_columns(self, count: int, bound: float) -> None:
         if count > 0:

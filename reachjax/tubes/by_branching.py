@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.programs.unrolled import weighed_at_once
 from reachjax.proofs.branches import BranchCertificate, Rung
@@ -69,9 +70,9 @@ def sets_by_branching(
         gap = min(gap, EXACT)
     timed = np.isfinite(setting.deadline)  # then that is the budget
     of_programs, work = (np.inf, np.inf) if timed else (WORK, PRODUCTS)
-    ladder = Ladder(
-        loop, begun, around, setting.start, nodes, setting.deadline, of_programs, setting.note
-    )
+    scenarios = Scenarios.of(loop, begun, horizon, setting.start)
+    limits = nodes, setting.deadline, of_programs
+    ladder = Ladder(loop, begun, around, scenarios, setting.start, *limits, setting.note)
     X, steps = X0, []
     for k, (region, proof, *_) in enumerate(known, start=1):
         steps.append(Step(setting, X, k - 1, tuple(steps)))
@@ -91,7 +92,7 @@ def sets_by_branching(
         rows = np.asarray(jax.lax.stop_gradient(directions))
         end = ladder.until(1 / (horizon - k + 1))
         ladder.advance(until=end)
-        simulated = Simulated.nothing(around.center, len(rows))
+        simulated = Simulated.nothing(scenarios.middle(around.center), len(rows))
         if setting.simulations is not None:
             simulated = setting.simulations.values(k, rows)
         target, ranges = ladder.facets(rows, simulated, gap)
@@ -124,7 +125,7 @@ def sets_by_branching(
         X = Polytope(directions, offsets)
         seconds = time.perf_counter() - began
         proof = _certificate(climbed, offsets, products, opened, seconds)
-        yield Reached(X, proof, climbed.states, climb=False)
+        yield Reached(X, proof, climbed.ended, climb=False)
         ladder.horizon.narrow(*_ends(*_fixed(X)))
 
 

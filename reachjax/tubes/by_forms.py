@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
 from reachjax.proofs.linear import LinearCertificate
@@ -40,7 +41,9 @@ def sets_by_forms(
             "give a Template, or for ellipsoids another relaxation, such as CuttingPlanes() or "
             "LocalBounds()"
         )
-    directions = template.directions
+    directions, scenarios = template.directions, None
+    if loop.is_disturbed and is_concrete(loop, X0):
+        scenarios = Scenarios.of(loop, X0, horizon, start)
     if template.steps is None:
         directions = jnp.broadcast_to(directions, (horizon, *directions.shape))
     if is_concrete(loop, X0, box, directions):
@@ -65,6 +68,8 @@ def sets_by_forms(
         )
         region = shaped.polytope(owned(step.offsets))
         states = np.asarray(step.corners) if is_concrete(step.corners) else np.zeros((0, 0))
+        if scenarios is not None:
+            states = scenarios.of_units(states, step.drawn)
         yield Reached(region, proof, states, climb=False)
 
 

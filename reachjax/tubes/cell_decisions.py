@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.batches import trajectories
+from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.loops.units import SmoothUnit
 from reachjax.numerics.checks import described, whole_number, wrapped
 from reachjax.proofs.witnesses import Simulations
@@ -123,7 +123,7 @@ def decided_by_cells(
     """
     run = _Run(task, X0, most, deadline)
     if simulations is not None:
-        run.seen(simulations.trajectories)
+        run.seen(simulations.runs)
     if run.example is None:
         for _ in wrapped(progress, run.results(begun, executor)):
             if run.example is not None:
@@ -141,6 +141,7 @@ class _Run:
     def __init__(self, task: CellTask, X0: AbstractSet, most: int | None, deadline: float):
         self._task, self._X0, self._most, self._deadline = task, X0, most, deadline
         self._loop = jax.device_put(task.loop)
+        self._scenarios = Scenarios.of(self._loop, X0, task.horizon, task.start)
         self._done: list[DecidedCell] = []
         self._count = 0
         blank = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
@@ -207,14 +208,16 @@ class _Run:
         states = np.clip(lower + ends * (upper - lower), lower, upper)
         states = states[np.asarray(self._X0.contains(states))]
         if len(states):
-            self.seen(trajectories(self._task.loop, states, self._task.horizon, self._task.start))
+            task, scenarios = self._task, self._scenarios.drawn(states, len(self._done))
+            after = self._scenarios.runs(task.loop, scenarios, task.horizon, task.start)
+            self.seen(Runs(scenarios, after))
 
-    def seen(self, runs: np.ndarray) -> None:
+    def seen(self, runs: Runs) -> None:
         """What trajectories show, a counterexample perhaps."""
-        runs = runs[np.isfinite(runs).all(axis=(1, 2))]
+        runs = runs.some(np.isfinite(runs.states).all(axis=(1, 2)))
         found: list[Suspect] = []
-        for item in self._task.required if len(runs) else ():
-            rooms = item.simulated(runs)
+        for item in self._task.required if len(runs.states) else ():
+            rooms = item.simulated(runs.states)
             row = self._simulated[item.name]
             row[item.time] = np.fmin(row[item.time], rooms.min())
             found += suspects(item, rooms, runs)
@@ -256,14 +259,16 @@ def outcome_of(task: CellTask, part: AbstractSet, deadline: float) -> Outcome:
         begun = _open_box(part, box)
         around = jax.device_get(box)
         margins = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
-        nodes = min(FEW, task.nodes)
-        ladder = Ladder(task.loop, begun, around, task.start, nodes, deadline, WORK)
+        scenarios = Scenarios.of(task.loop, begun, task.horizon, task.start)
+        limits = min(FEW, task.nodes), deadline, WORK
+        ladder = Ladder(task.loop, begun, around, scenarios, task.start, *limits)
         for k in range(task.horizon + 1):
             if k:
                 ladder.advance(tighten=False)
             for item in task.required:
                 if item.time == k:
-                    proved, margin = _bounded(item, ladder, part)
+                    middle = scenarios.middle(np.asarray(around.center))
+                    proved, margin = _bounded(item, ladder, part, middle)
                     margins[item.name][k] = margin
                     if not proved:
                         return Outcome(False, margins, _axis(ladder, item))
@@ -275,12 +280,14 @@ def _open_box(part: AbstractSet, box: Box) -> AbstractSet:
     return jax.device_get(box) if isinstance(part, Box) else part
 
 
-def _bounded(item: Requirement, ladder: Ladder, part: AbstractSet) -> tuple[bool, float]:
+def _bounded(
+    item: Requirement, ladder: Ladder, part: AbstractSet, middle: Float[np.ndarray, " s"]
+) -> tuple[bool, float]:
     """Whether a requirement surely holds where the ladder has come to, and its margin."""
     if item.time == 0:
         compared = item.compared_with(jax.device_put(part))
         return item.proved(compared), float(compared.margins.min())
-    target, units = target_of(item, ladder, None)
+    target, units = target_of(item, ladder, None, middle)
     start = ladder.horizon.start
     uppers = [form.ends(start)[1] for form in target.forms]
     bounds = np.array([upper.min() for upper in uppers])

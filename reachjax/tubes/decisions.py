@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.batches import trajectories
+from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.checks import (
     is_concrete,
     owned,
@@ -144,7 +144,8 @@ def decide(
     for nodes in dict.fromkeys((min(FEW, relaxation.nodes), relaxation.nodes)):
         if not decision.ended:
             work = WORK if time_limit is None else np.inf
-            ladder = Ladder(on_host, begun, around, start, nodes, deadline, work)
+            scenarios = Scenarios.of(on_host, begun, horizon, start)
+            ladder = Ladder(on_host, begun, around, scenarios, start, nodes, deadline, work)
             decision.climb(ladder, tighten=nodes > FEW)
     return decision.verdict()
 
@@ -172,7 +173,8 @@ class _Decision:
     ):
         self._loop, self._X0, self._start = loop, X0, start
         self._horizon, self._on_host = horizon, jax.device_get(loop)
-        self._middle = np.asarray(boxed(X0, "X0").center)
+        self._scenarios = Scenarios.of(loop, X0, horizon, start)
+        self._middle = self._scenarios.middle(np.asarray(boxed(X0, "X0").center))
         self._open = {(item.name, item.time): item for item in required}
         self._margins = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
@@ -180,7 +182,7 @@ class _Decision:
         self._example: Counterexample | None = None
         self._simulations = simulations
         if simulations is not None:
-            self._seen(required, simulations.trajectories)
+            self._seen(required, simulations.runs)
 
     @property
     def ended(self) -> bool:
@@ -223,7 +225,7 @@ class _Decision:
 
     def _decided(self, key: tuple[str, int], item: Requirement, ladder: Ladder) -> None:
         """Bound one requirement at the time that the ladder has come to."""
-        target, units = target_of(item, ladder, self._simulations)
+        target, units = target_of(item, ladder, self._simulations, self._middle)
         left = sum(other.time >= item.time for other in self._open.values())
         climbed = ladder.climbed(target, (left - 1) * len(target.forms), ladder.until(1 / left))
         right = climbed.bounds <= 0 if item.inside else climbed.bounds < 0
@@ -234,7 +236,8 @@ class _Decision:
             self._certificates[key] = _certificate(climbed, target.simulated, not item.inside)
         if not np.all(right):
             worst, middle = climbed.worst[climbed.attained > 0], self._middle
-            self._tried(item, np.concatenate([middle + p * (worst - middle) for p in PULLS]))
+            pulled = np.concatenate([middle + p * (worst - middle) for p in PULLS])
+            self._tried(item, self._scenarios.clipped(pulled))
 
     def _note(self, key: tuple[str, int], holds: bool, margin: float) -> None:
         name, k = key
@@ -242,21 +245,22 @@ class _Decision:
         if holds:
             del self._open[key]
 
-    def _tried(self, item: Requirement, states: np.ndarray) -> None:
-        """Simulate initial states that may break a requirement."""
+    def _tried(self, item: Requirement, scenarios: np.ndarray) -> None:
+        """Simulate scenarios that may break a requirement."""
         if self._simulations is not None:
-            self._seen([item], self._simulations.include(states))
+            self._seen([item], self._simulations.include(scenarios))
         else:
-            runs = trajectories(self._on_host, states, self._horizon, self._start)
-            self._seen([item], runs[np.isfinite(runs).all(axis=(1, 2))])
+            given = self._on_host, scenarios, self._horizon, self._start
+            runs = Runs(scenarios, self._scenarios.runs(*given))
+            self._seen([item], runs.some(np.isfinite(runs.states).all(axis=(1, 2))))
 
-    def _seen(self, items: list[Requirement], runs: np.ndarray) -> None:
+    def _seen(self, items: list[Requirement], runs: Runs) -> None:
         """What trajectories show, a counterexample perhaps."""
-        if not len(runs):
+        if not len(runs.states):
             return
         found: list[Suspect] = []
         for item in items:
-            rooms = item.simulated(runs)
+            rooms = item.simulated(runs.states)
             row = self._simulated[item.name]
             row[item.time] = np.fmin(row[item.time], rooms.min())
             found += suspects(item, rooms, runs)
@@ -270,7 +274,7 @@ def _certificate(climbed: Climbed, known: Simulated, least: bool) -> BranchCerti
         codes=np.full(count, int(SolverStatus.SOLVED)),
         bounds=climbed.bounds,
         witnesses=known.most,
-        witness_states=known.states,
+        witness_states=known.scenarios,
         seconds=np.full(count, np.nan),
         about=climbed.about,
         branches=climbed.branches,

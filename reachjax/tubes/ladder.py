@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.batches import trajectories
+from reachjax.loops.scenarios import Scenarios
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, joined
 from reachjax.proofs.branches import Branches, HorizonFacts, Rung, bounds_of, leaf_bounds
@@ -62,24 +62,24 @@ class Climbed(NamedTuple):
         branches: the leaves.
         bounds: `(g,)`, what they prove.
         attained: `(g,)`, the largest values that are known to be attained.
-        worst: `(g, n_x)`, the initial states of these.
+        worst: `(g, s)`, the scenarios of these.
         columns: `(g, n)`, where the leaf that decides attains its bound.
         multipliers: `(g, m)`, of that leaf.
         rungs: `(g,)`, values of `Rung`.
         nodes: `(g,)`, how many linear programs were solved.
-        states: `(c, n_x)`, initial states at which they ended.
+        ended: `(c, s)`, scenarios at which they ended.
     """
 
     about: HorizonFacts
     branches: Branches
     bounds: Float[np.ndarray, " g"]
     attained: Float[np.ndarray, " g"]
-    worst: Float[np.ndarray, "g n_x"]
+    worst: Float[np.ndarray, "g s"]
     columns: Float[np.ndarray, "g n"]
     multipliers: Float[np.ndarray, "g m"]
     rungs: Int[np.ndarray, " g"]
     nodes: Int[np.ndarray, " g"]
-    states: Float[np.ndarray, "c n_x"]
+    ended: Float[np.ndarray, "c s"]
 
 
 class Ladder:
@@ -89,6 +89,7 @@ class Ladder:
         loop: of numpy arrays.
         X0: the initial set, of numpy arrays.
         box: around it.
+        scenarios: all of them, over as many steps as will be climbed, from this set.
         t: the time of the initial set.
         nodes: how many linear programs a bound may take.
         deadline: after which nothing is solved, as `time.monotonic` says it.
@@ -104,13 +105,15 @@ class Ladder:
         loop: ClosedLoop,
         X0: AbstractSet,
         box: Box,
+        scenarios: Scenarios,
         t: int,
         nodes: int,
         deadline: float,
         work: float = WORK,
         note: Callable[[str], None] = lambda note: None,
     ):
-        self._note = note
+        self._note, self._scenarios = note, scenarios
+        self._middle = scenarios.middle(np.asarray(box.center))
         self._loop, self._t, self._nodes, self._deadline = loop, t, nodes, deadline
         self._work = work
         self.horizon = Horizon(loop, X0, box, t)
@@ -208,15 +211,16 @@ class Ladder:
         """
         horizon = self.horizon
         self._programs.grow(horizon.facts, horizon.varying)
-        best, worst = target.simulated.most.copy(), target.simulated.states.copy()
-        states: list[np.ndarray] = []
+        best, worst = target.simulated.most.copy(), target.simulated.scenarios.copy()
+        ended: list[np.ndarray] = []
         trees: dict[int, Tree] = {}
         for number, forms in enumerate(target.forms):
 
             def attained(columns: list[np.ndarray], number: int = number) -> float:
-                begun = self._initial(np.array(columns))
-                states.extend(begun)
-                after = trajectories(self._loop, begun, len(horizon.steps), self._t)[:, -1]
+                begun = self._scenarios_at(np.array(columns))
+                ended.extend(begun)
+                steps = len(horizon.steps)
+                after = self._scenarios.runs(self._loop, begun, steps, self._t)[:, -1]
                 values = np.nan_to_num(target.values(after)[:, number], nan=-np.inf)
                 if values.max() > best[number]:
                     best[number], worst[number] = values.max(), begun[values.argmax()]
@@ -236,7 +240,7 @@ class Ladder:
             (number in trees and trees[number].found()) or affine_leaf(forms, horizon)
             for number, forms in enumerate(target.forms)
         ]
-        return self._judged(target, best, worst, found, states)
+        return self._judged(target, best, worst, found, ended)
 
     def _grow(self, trees: list[Tree], share: float) -> None:
         """Grow trees by turns, until all are closed or this share of the work is done."""
@@ -255,10 +259,16 @@ class Ladder:
                 pool -= tree.nodes - before
                 self.spend(tree.nodes - before)
 
-    def _initial(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n_x"]:
+    def _scenarios_at(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c s"]:
+        """The scenarios that columns stand for.
+
+        What is drawn may be beside an ellipsoid, but where the horizon takes it to be.
+        """
         start = self.horizon.start
         spread = np.asarray(start.spread)
-        return np.asarray(start.center) + columns[:, : spread.shape[1]] @ spread.T
+        states = np.asarray(start.center) + columns[:, : spread.shape[1]] @ spread.T
+        found = self._scenarios.of_units(states, self.horizon.drawn_at(columns))
+        return self._scenarios.completed(found, self._middle)
 
     def _judged(
         self,
@@ -266,7 +276,7 @@ class Ladder:
         best: np.ndarray,
         worst: np.ndarray,
         found: list[Found],
-        states: list[np.ndarray],
+        ended: list[np.ndarray],
     ) -> Climbed:
         """What the leaves prove."""
         horizon, count = self.horizon, len(found)
@@ -297,7 +307,7 @@ class Ladder:
             multipliers=multipliers[deciding],
             rungs=np.where(bounds < uppers, rungs, Rung.AFFINE_FORM),
             nodes=np.array([leaf.nodes for leaf in found]),
-            states=np.array(states).reshape(-1, len(horizon.start.center)),
+            ended=np.array(ended).reshape(-1, len(self._middle)),
         )
 
     def settled(
@@ -311,7 +321,8 @@ class Ladder:
             if self.late:
                 break
             form = climbed.about.rows[facet : facet + 1]
-            at = self.horizon.columns_at(climbed.worst[facet])
+            worst, n = climbed.worst[facet], len(self.horizon.start.center)
+            at = self.horizon.columns_at(worst[:n], self._scenarios.units_at(worst))
             leaves, bound = phases[owner == facet], climbed.bounds[facet]
             given = settled(self.horizon, self._programs, form, at, leaves, bound)
             if given is not None:

@@ -266,7 +266,7 @@ def _guided(run: _Run, X0: AbstractSet, count: int, gap: float) -> list[ReachTub
 def _attained(X0: AbstractSet, tube: ReachTube, t: int) -> Float[np.ndarray, " m"]:
     """What a cell's witnesses attain; those beside the initial set do not count."""
     proof = tube.proof(t)
-    inside = np.asarray(X0.contains(proof.witness_states, BESIDE))
+    inside = np.asarray(X0.contains(proof.witness_states[:, : X0.dimension], BESIDE))
     return np.where(inside, proof.witnesses, -np.inf)
 
 

@@ -223,7 +223,7 @@ def _with_witnesses(steps: list[Reached], simulations: Simulations) -> list[Abst
     """Simulate what the certificates bound, from the initial set."""
     simulated = [step.states for step in steps if not step.climb and len(step.states)]
     if simulated:
-        simulations.include(np.concatenate(simulated))
+        simulations.include(*simulated)
     for k, step in enumerate(steps, start=1):
         if step.climb and len(step.states):
             simulations.climb(k, step.region, np.arange(len(step.states)), step.states)

@@ -12,6 +12,7 @@ from typing import Any
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.checks import floats_of, owned, require_double_precision, whole_number
 from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
@@ -103,9 +104,15 @@ class ReachTube(Replaceable):
         return certificate
 
     def simulate(self, samples: int = SAMPLES, seed: int = 0) -> Float[Array, "c h+1 n_x"]:
-        """Trajectories from corners of the initial set and `samples` points drawn from it."""
+        """Trajectories from corners of the initial set and `samples` points drawn from it.
+
+        Disturbances and noise are drawn as well: extreme ones, and any.
+        """
         states = initial_states(self.sets[0], samples, seed)
-        return self.loop.simulate(states, self.horizon, self.start)
+        scenarios = Scenarios.of(self.loop, self.sets[0], self.horizon, self.start)
+        states, disturbances, noises = self.loop.split(scenarios.drawn(states, seed))
+        drawn = {"disturbances": disturbances, "noises": noises}
+        return self.loop.simulate(states, self.horizon, self.start, **drawn)
 
     def extended(self, steps: int, **options: Any) -> ReachTube:
         """The same tube and some steps more.

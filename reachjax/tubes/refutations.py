@@ -9,6 +9,8 @@ import jax
 import numpy as np
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.closed_loop import Scenario
+from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
 from reachjax.sets import AbstractSet, Box
@@ -26,37 +28,52 @@ class Suspect(NamedTuple):
     Attributes:
         room: how far it is on the right side: not at all.
         item: the requirement.
+        scenario: `(s,)`, what it is a function of.
         states: `(h + 1, n_x)`.
     """
 
     room: float
     item: Requirement
+    scenario: np.ndarray
     states: np.ndarray
 
 
-def suspects(item: Requirement, rooms: np.ndarray, trajectories: np.ndarray) -> list[Suspect]:
-    """The worst of trajectories `(c, h + 1, n_x)`, of which these are the rooms `(c,)`."""
+def suspects(item: Requirement, rooms: np.ndarray, runs: Runs) -> list[Suspect]:
+    """The worst of some runs, of which these are the rooms `(c,)`."""
     worst = np.argsort(rooms)[:SUSPECTS]
-    return [Suspect(float(rooms[k]), item, trajectories[k]) for k in worst if rooms[k] <= 0]
+    return [Suspect(float(rooms[k]), item, *runs.some(k)) for k in worst if rooms[k] <= 0]
 
 
 def counterexample(
     loop: ClosedLoop, X0: AbstractSet, found: Iterable[Suspect], start: int
 ) -> Counterexample | None:
-    """The worst suspect that surely begins in the set and breaks its requirement; None if none."""
-    for room, item, states in sorted(found, key=lambda suspect: suspect.room):
-        if X0.surely_contains(states[0]) and surely_broken(loop, item, states[0], start):
+    """The worst suspect whose scenario surely is one and breaks its requirement; None if none."""
+    ordered = sorted(found, key=lambda suspect: suspect.room)
+    if not ordered:
+        return None
+    scenarios = Scenarios.of(loop, X0, len(ordered[0].states) - 1, start)
+    for room, item, scenario, states in ordered:
+        drawn = loop.split(scenario)
+        if scenarios.surely_contains(scenario) and surely_broken(loop, item, drawn, start):
             on_host = jax.device_get(loop)
-            inputs = [on_host.input(x, start + t) for t, x in enumerate(states[:-1])]
-            return Counterexample(item.name, item.time, -room, states, np.stack(inputs))
+            _, w, v = drawn
+            noises = [None] * (len(states) - 1) if v is None else v
+            inputs = [
+                on_host.input(x, start + t, v=noise)
+                for t, (x, noise) in enumerate(zip(states[:-1], noises, strict=True))
+            ]
+            parts = item.name, item.time, -room, states, np.stack(inputs)
+            return Counterexample(*parts, disturbances=w, noises=v)
     return None
 
 
-def surely_broken(loop: ClosedLoop, item: Requirement, x0: np.ndarray, start: int) -> bool:
-    """Whether the exact trajectory from `x0` breaks a requirement, rounding accounted for."""
+def surely_broken(loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int) -> bool:
+    """Whether the exact trajectory of a scenario breaks a requirement, rounding accounted for."""
+    x0, w, v = scenario
     reached = Box(x0, x0)
     for t in range(item.time):
-        reached = successor_box(loop, reached, start + t)
+        drawn = (None if part is None else part[t] for part in (w, v))
+        reached = successor_box(loop, reached, start + t, *drawn)
     lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
     C, d = balanced(*(np.asarray(part) for part in item.region.facets), inner=not item.inside)
     ends = np.where(C > 0, lower, upper), np.where(C > 0, upper, lower)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import contextlib
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
+from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.checks import is_concrete, whole_number
 from reachjax.numerics.rounding import TINY
 from reachjax.proofs.proposal import SolverStatus
+from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet, PolyhedralSet
 from reachjax.tubes.partitions import BESIDE, PartitionedTube
 from reachjax.tubes.reach import ReachTube
@@ -82,22 +82,22 @@ def _decided(
         )
     proofs = [tube.proof(t) for t in range(1, tube.horizon + 1)]
     unsolved = sum(s is not SolverStatus.SOLVED for proof in proofs for s in proof.statuses)
-    trajectories = _trajectories(tube, samples, seed)
+    runs = _runs(tube, samples, seed)
     if X0 is not tube.sets[0]:  # a cell may hold points beside the initial set
-        trajectories = trajectories[np.asarray(X0.contains(trajectories[:, 0], BESIDE))]
+        runs = runs.some(np.asarray(X0.contains(runs.states[:, 0], BESIDE)))
     margins: dict[str, np.ndarray] = {}
     simulated: dict[str, np.ndarray] = {}
     proved, found = True, []
     for item in required:
         blank = np.full(tube.horizon + 1, np.nan)
-        compared, rooms = item.compared(tube), item.simulated(trajectories)
+        compared, rooms = item.compared(tube), item.simulated(runs.states)
         holds, margin = item.proved(compared), float(compared.margins.min())
         if not holds:  # what underflows or is no number proves nothing
             margin = min(margin, -TINY) if np.isfinite(margin) else -np.inf
         margins.setdefault(item.name, blank.copy())[item.time] = margin
         simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min(initial=np.inf)
         proved = proved and holds
-        found += suspects(item, rooms, trajectories)
+        found += suspects(item, rooms, runs)
     example = counterexample(tube.loop, X0, found, tube.start)
     if example is not None:
         if proved:
@@ -107,13 +107,19 @@ def _decided(
     return Verdict(status, margins, simulated, None, unsolved)
 
 
-def _trajectories(tube: ReachTube, samples: int, seed: int) -> Float[np.ndarray, "c h+1 n_x"]:
+def _runs(tube: ReachTube, samples: int, seed: int) -> Runs:
     """Trajectories from witnesses, corners and samples, as far as there are any."""
-    found = [np.zeros((0, tube.horizon + 1, tube.loop.states))]
-    states = jnp.concatenate([tube.proof(t).witness_states for t in range(1, tube.horizon + 1)])
-    if states.shape[1] == tube.loop.states:  # a tube from a thin set, or of jax.jit, has none
-        found.append(np.asarray(tube.loop.simulate(states, tube.horizon, tube.start)))
+    scenarios = Scenarios.of(tube.loop, tube.sets[0], tube.horizon, tube.start)
+    given = [np.zeros((0, len(scenarios.middle(np.zeros(tube.loop.states)))))]
+    found = [np.asarray(tube.proof(t).witness_states) for t in range(1, tube.horizon + 1)]
+    if found[0].shape[1]:  # a tube from a thin set, or of jax.jit, has none
+        given += found
     with contextlib.suppress(RuntimeError):  # a set that is too thin to be sampled
-        found.append(np.asarray(tube.simulate(samples, seed)))
-    trajectories = np.concatenate(found)
-    return trajectories[np.isfinite(trajectories).all(axis=(1, 2))]
+        given.append(scenarios.drawn(initial_states(tube.sets[0], samples, seed), seed))
+    every = np.concatenate(given)
+    if not len(every):
+        return Runs(every, np.zeros((0, tube.horizon + 1, tube.loop.states)))
+    states, disturbances, noises = tube.loop.split(every)
+    drawn = {"disturbances": disturbances, "noises": noises}
+    runs = Runs(every, np.asarray(tube.loop.simulate(states, tube.horizon, tube.start, **drawn)))
+    return runs.some(np.isfinite(runs.states).all(axis=(1, 2)))

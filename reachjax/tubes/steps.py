@@ -44,7 +44,8 @@ class Reached(NamedTuple):
     Attributes:
         region: it surely holds the states.
         proof: of that.
-        states: `(c, n_x)`, initial states that the proof thinks of as the worst; there may be none.
+        states: `(c, p)`, initial states that the proof thinks of as the worst, or scenarios, which
+            may end early; there may be none.
         climb: whether ascents begin at them, one for each value that the set bounds.
     """
 
@@ -192,6 +193,6 @@ class Step:
         region = jax.lax.stop_gradient(Polytope(directions, jnp.zeros(facets)))
         starts = simulations.best(k, region, facet, facets)
         if len(self.window) == k:
-            starts[-1] = column[:n]
+            starts[-1, :n] = column[:n]
         simulations.climb(k, region, np.full(facets, facet), starts)
         return float(simulations.attained(k, region)[0][facet])

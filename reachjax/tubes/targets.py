@@ -13,7 +13,7 @@ BELOW = 1e-9
 
 
 def target_of(
-    item: Requirement, ladder: Ladder, simulations: Simulations | None
+    item: Requirement, ladder: Ladder, simulations: Simulations | None, middle: np.ndarray
 ) -> tuple[Target, np.ndarray]:
     """What must be below zero: the excess over each facet, or the depth in the set.
 
@@ -21,6 +21,7 @@ def target_of(
         item: the requirement, at the time that the ladder has come to.
         ladder: over whose forms it is stated.
         simulations: trajectories whose values are known; None if there are none.
+        middle: `(s,)`, some scenario.
 
     Returns:
         The target, and what a distance of 1 in the units of the state changes its values by.
@@ -44,7 +45,7 @@ def target_of(
         return bound <= -BELOW * sizes[number] or attained > 0
 
     if simulations is None:
-        known = Simulated.nothing(np.asarray(start.center), len(forms))
+        known = Simulated.nothing(middle, len(forms))
     else:
-        known = simulations.known(values(simulations.trajectories[:, len(ladder.horizon.steps)]))
+        known = simulations.known(values(simulations.runs.states[:, len(ladder.horizon.steps)]))
     return Target(forms, values, enough, known), norms if item.inside else np.ones(1)

@@ -37,6 +37,8 @@ class Counterexample:
         violation: by how much, in the units of the state.
         states: `(horizon + 1, n_x)`, the whole trajectory.
         inputs: `(horizon, n_u)`.
+        disturbances: `(horizon, n_w)`; None of a loop without.
+        noises: `(horizon, n_x)`; None of a loop without.
     """
 
     requirement: str
@@ -44,6 +46,8 @@ class Counterexample:
     violation: float
     states: Float[np.ndarray, "h+1 n_x"]
     inputs: Float[np.ndarray, "h n_u"]
+    disturbances: Float[np.ndarray, "h n_w"] | None = None
+    noises: Float[np.ndarray, "h n_x"] | None = None
 
 
 class DecidedCell(NamedTuple):
@@ -106,7 +110,7 @@ class Verdict:
             e = self.counterexample
             lines.append(
                 f"  counterexample: from {np.round(e.states[0], 4).tolist()} it breaks "
-                f"{e.requirement} at t = {e.time} by {e.violation:.4g}"
+                f"{e.requirement} at t = {e.time} by {e.violation:.4g}{_drawn(e)}"
             )
         if self.cells:
             counts = [sum(each.status is status for each in self.cells) for status in VerdictStatus]
@@ -120,6 +124,17 @@ class Verdict:
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def _drawn(example: Counterexample) -> str:
+    """What a trajectory rests on besides its initial state."""
+    parts = {"disturbances": example.disturbances, "noises": example.noises}
+    named = [
+        f", with {name} {np.round(rows[: example.time], 4).tolist()}"
+        for name, rows in parts.items()
+        if rows is not None and example.time
+    ]
+    return "".join(named)
 
 
 def of_cells(verdicts: list[Verdict]) -> Verdict:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.loops.scenarios import Scenarios
 from reachjax.proofs.ascent import ascended
 from reachjax.proofs.witnesses import Simulations
 from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
@@ -28,7 +29,8 @@ def climbed(loop, X, k=HORIZON, starts=None, horizon=HORIZON, start=0):
     begin = states if starts is None else starts
     region = rj.Template.box(n_x).polytope(jnp.zeros(2 * n_x))
     which = np.arange(len(begin)) % (2 * n_x)
-    end = ascended(loop, X, X.scale(), states.mean(axis=0), begin, region, which, k, horizon, start)
+    scenarios, middle = Scenarios.of(loop, X, horizon, start), states.mean(axis=0)
+    end = ascended(loop, scenarios, X.scale(), middle, begin, region, which, k, horizon, start)
 
     def values(points):
         after = loop.simulate(jnp.asarray(points), horizon, start)[:, k]

@@ -13,6 +13,7 @@ from reachjax.loops.units.base import (
     evaluate,
 )
 from reachjax.loops.units.clip import clipped
+from reachjax.loops.units.disturbance import Constraint, Disturbance
 from reachjax.loops.units.exponential import Exp, Log
 from reachjax.loops.units.hard_tanh import HardTanh
 from reachjax.loops.units.hyperbolic import Sigmoid, Tanh
@@ -28,7 +29,9 @@ __all__ = [
     "AtUnit",
     "Atan",
     "Block",
+    "Constraint",
     "Cos",
+    "Disturbance",
     "Exp",
     "Facts",
     "HardTanh",

@@ -121,9 +121,16 @@ class AbstractUnit(AbstractActivation):
     Attributes:
         nonexpansive: whether `|f(y) - f(y')| <= |y - y'|`. `loop_bounds` relies on it where inputs
             are rounded, and holds for such units only.
+        free: whether any value between its two lines, which are parallel, is possible, whatever
+            the input is: then all that there is to know of it is that.
+        stated: whether its facts are known of its inputs, so that they count where it is affine.
+        closed: whether these bound the free units before it by themselves.
     """
 
     nonexpansive: ClassVar[bool] = True
+    free: ClassVar[bool] = False
+    stated: ClassVar[bool] = False
+    closed: bool = False
 
     @abc.abstractmethod
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:

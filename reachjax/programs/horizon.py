@@ -154,7 +154,7 @@ class Horizon:
         summed = range(0) if merged is None else merged.layers
         own = (layer for number, layer in enumerate(units) if number not in summed)
         for each in (*own, *([merged] if merged else [])):
-            if _has_a_range(each):
+            if _left_out(each):
                 self._varying = np.append(self._varying, each.places[each.places >= 0])
 
     def columns_at(
@@ -253,6 +253,7 @@ class Horizon:
                 self.enclosed = np.append(self.enclosed, found[number - 1].places)
             if layer.unit.free:  # its column says all that its facts do
                 self.free = np.append(self.free, layer.places)
+                self._varying = np.append(self._varying, layer.places)
             elif len(switching):
                 first = sum(len(before.places) for before in found[:number])
                 self._add_units(layer, switching, first)
@@ -283,9 +284,9 @@ class Horizon:
         self._count += len(rows.rows)
 
 
-def _has_a_range(each: UnitForms | Merged) -> bool:
-    """Whether columns may be anything in their range: disturbances, and what smooth units leave."""
-    return isinstance(each, Merged) or each.unit.free or isinstance(each.unit, SmoothUnit)
+def _left_out(each: UnitForms | Merged) -> bool:
+    """Whether columns are of what smooth units leave out."""
+    return isinstance(each, Merged) or isinstance(each.unit, SmoothUnit)
 
 
 def _fill(

@@ -120,7 +120,8 @@ def smallest_ellipsoid(facts, signs, E_out, successors, options=None):
     best = EllipsoidStep(np.full(n_x, np.nan), np.full((n_x, n_x), np.nan), "solver_error", 0.0)
     for unit in UNITS:
         root, offset, status = _smallest(facts, signs, E_out, middle, unit * spread, options)
-        if status != best.status:
+        solved = status in cp.settings.SOLUTION_PRESENT
+        if status == cp.OPTIMAL or (solved and best.status not in cp.settings.SOLUTION_PRESENT):
             best = EllipsoidStep(
                 middle - np.asarray(root) @ np.asarray(offset), root @ root.T, status, 0.0
             )

@@ -106,7 +106,9 @@ BAD_TYPES = {
     r"MLP\.layers must be pairs .*ArrayImpl": lambda: rj.MLP.from_layers(jnp.ones((2, 2))),
     r"MLP\.activation must .*class.*ReLU'": lambda: NET.replace(activation=rj.ReLU),
     r"MLP\.activation must be an activation obj": lambda: NET.replace(activation=jax.nn.relu),
-    r"ClosedLoop\.plant must be a plant such as reachjax\.AffinePlant, but an MLP": lambda: rj.ClosedLoop(NET, PLANT),
+    r"ClosedLoop\.plant must be a plant such as reachjax\.AffinePlant, but an MLP": lambda: (
+        rj.ClosedLoop(NET, PLANT)
+    ),
     r"ClosedLoop\.input_box must .* a tuple": lambda: rj.ClosedLoop(PLANT, NET, (-1, 1)),
     r"X0 must be .*\[\[0, 0\], \[1, 1\]\]": lambda: reach(X0=[[0, 0], [1, 1]]),
     "loop must be a ClosedLoop": lambda: reach(loop=NET),

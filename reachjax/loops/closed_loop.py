@@ -1,7 +1,8 @@
 """The loop: a plant under a network whose output is projected onto an input box.
 
 The projection is two more layers of units (the paper's equation (proj_NN)), the last ones of a
-step. Which units there are, and in which order, the loop's own forward pass tells.
+step; onto a polytope it is one layer. Which units there are, and in which order, the loop's own
+forward pass tells.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from reachjax.loops.input_polytope import InputPolytope, input_set
 from reachjax.loops.networks import AbstractNetwork
 from reachjax.loops.plants import AbstractPlant
-from reachjax.loops.units import AbstractUnit, AtUnit, clipped, evaluate
+from reachjax.loops.units import AbstractUnit, AtUnit, clipped, evaluate, projected
 from reachjax.numerics.checks import Numbers, require_kind, same_size, whole_number
-from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.numerics.pytrees import Replaceable, converted, pytree
 from reachjax.sets import Box
 
 
@@ -44,10 +46,12 @@ class ClosedLoop(Replaceable):
         plant: the plant.
         controller: the network `pi`.
         input_box: what inputs are projected onto, constant or time-varying; `None`: no projection.
+            A `Polytope` of numbers is kept as an `InputPolytope`, and takes one layer of units.
 
     Raises:
-        TypeError: an argument is of another kind.
-        ValueError: numbers of states, inputs or time steps disagree.
+        TypeError: an argument is of another kind, or normals of a polytope are traced.
+        ValueError: numbers of states, inputs or time steps disagree; or a polytope is empty, or has
+            too many facets.
 
     Example:
         >>> from reachjax import MLP, AffinePlant
@@ -60,13 +64,11 @@ class ClosedLoop(Replaceable):
 
     plant: AbstractPlant
     controller: AbstractNetwork
-    input_box: Box | None = None
+    input_box: Box | InputPolytope | None = converted(converter=input_set, default=None)
 
     def __post_init__(self):
         require_kind("ClosedLoop.plant", self.plant, AbstractPlant, PLANT)
         require_kind("ClosedLoop.controller", self.controller, AbstractNetwork, NETWORK)
-        if self.input_box is not None:
-            require_kind("ClosedLoop.input_box", self.input_box, Box, "of type Box")
         plant, net = self.plant, self.controller
         same_size(
             "the plant's number of states is",
@@ -117,10 +119,13 @@ class ClosedLoop(Replaceable):
         return self.projected(self.controller.propagate(x, unit), t, unit)
 
     def projected(self, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
-        """What the controller gives, projected onto the input box."""
-        if self.input_box is None:
+        """What the controller gives, projected onto the input box or polytope."""
+        box = self.input_box
+        if box is None:
             return u
-        box = self.input_box.at(t)
+        if isinstance(box, InputPolytope):
+            return projected(u, box.normals, box.offsets, unit)
+        box = box.at(t)
         return clipped(u, box.lower, box.upper, unit)
 
     def step(self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
@@ -164,7 +169,7 @@ def _recorded(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Unit
     layers = []
 
     def record(unit: AbstractUnit, y: Array) -> Array:
-        layers.append(UnitLayer(unit, len(y)))
+        layers.append(UnitLayer(unit.kind, len(y)))
         return unit(y)
 
     leaves = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]

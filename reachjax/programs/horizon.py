@@ -136,10 +136,10 @@ class Horizon:
         found[: len(first)] = first
         for layer in itertools.chain(*self.steps):
             here = np.flatnonzero(layer.places >= 0)
-            inputs = layer.inputs[here]
+            inputs = layer.inputs
             y: Any = inputs.rows[:, 0] + inputs.columns @ found[: inputs.columns.shape[1]]
-            rest = layer.unit(y) - layer.slope[here] * y - layer.offset[here]
-            found[layer.places[here]] = rest / layer.gap[here]
+            rest = layer.unit(y) - layer.slope * y - layer.offset
+            found[layer.places[here]] = rest[here] / layer.gap[here]
         return found
 
     def narrow(self, lower: Float[np.ndarray, " n_x"], upper: Float[np.ndarray, " n_x"]) -> None:
@@ -166,9 +166,12 @@ class Horizon:
 
     def _add_units(self, layer: UnitForms, switching: np.ndarray, before: int) -> None:
         width = layer.outputs.columns.shape[1]
-        y, z = layer.inputs[switching].widened(width), layer.outputs[switching]
-        ends: Any = layer.lower[switching], layer.upper[switching]
-        facts = layer.unit.facts(y, z, *ends)
+        # a layer that is not separable states its facts as a whole
+        stated = switching if layer.unit.separable else np.arange(len(layer.places))
+        y, z = layer.inputs[stated].widened(width), layer.outputs[stated]
+        ends: Any = layer.lower[stated], layer.upper[stated]
+        kept = np.searchsorted(stated, switching)
+        facts = layer.unit.facts(y, z, *ends).map(lambda block: block.rows[kept])
         first = {}
         sectors = (block for block in facts.blocks if block.mark is Mark.SECTOR)
         for which, block in enumerate(sectors):

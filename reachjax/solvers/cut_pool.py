@@ -99,7 +99,9 @@ def _first(program: Program, layout: FactLayout) -> Bool[np.ndarray, " m"]:
     first = np.zeros(len(there), dtype=bool)
     first[[0, *layout.set_facets[0], *layout.cone_rows]] = True
     for units in layout.units:
-        switching = there[np.array(units.marked(Mark.SECTOR))].all(axis=0)
+        names = dict.fromkeys(itertools.chain(*units.kind.zero))
+        rows = np.array([units.rows[name] for name in names], dtype=int)
+        switching = there[rows.reshape(-1, units.kind.size)].all(axis=0)
         first[np.array(list(units.rows.values()))[:, switching]] = True
     return first
 

@@ -15,6 +15,7 @@ from reachjax.loops.units.base import (
 from reachjax.loops.units.clip import clipped
 from reachjax.loops.units.hard_tanh import HardTanh
 from reachjax.loops.units.leaky_relu import LeakyReLU
+from reachjax.loops.units.projection import ProjectionSlack, projected
 from reachjax.loops.units.relu import ReLU
 
 __all__ = [
@@ -29,7 +30,9 @@ __all__ = [
     "Lines",
     "Mark",
     "Product",
+    "ProjectionSlack",
     "ReLU",
     "clipped",
     "evaluate",
+    "projected",
 ]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import abc
 import enum
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
@@ -119,7 +119,17 @@ class AbstractUnit(AbstractActivation):
     """One relation `z = f(y)`, which adds one column to a basis.
 
     `f` is nonexpansive, `|f(y) - f(y')| <= |y - y'|`; bounds rely on it where inputs are rounded.
+
+    A layer whose values depend on all of its inputs is no row of such relations: it is not
+    `separable`, is given whole, and sees to rounded ends of its inputs by itself.
     """
+
+    separable: ClassVar[bool] = True
+
+    @property
+    def kind(self) -> AbstractUnit:
+        """The unit without what it may know of numbers."""
+        return self
 
     @abc.abstractmethod
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops.units import ProjectionSlack
-from reachjax.loops.units.active_sets import Normals, active_sets
+from reachjax.loops.units.active_sets import Normals, active_sets, has_points
 from reachjax.numerics.checks import is_concrete, require_kind
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.sets import Box, Polytope
@@ -47,7 +47,8 @@ class InputPolytope(Replaceable):
             raise TypeError(
                 "ClosedLoop.input_box must have normals Polytope.A that are numbers, but traced "
                 "ones arrived: which facets can be active together depends on them. Its offsets "
-                "Polytope.b may be traced"
+                "may be traced: inside jax.jit, take a loop that was built outside and replace "
+                "loop.input_box.offsets, or give normals as an array of JAX's"
             )
         with jax.ensure_compile_time_eval():
             C = np.asarray(polytope.A)
@@ -81,10 +82,12 @@ class InputPolytope(Replaceable):
         known = is_concrete(self.offsets)
         offsets = np.asarray(self.offsets) if known else np.zeros(len(self.normals))
         scaled = ProjectionSlack.scaled(self.normals, offsets)
-        if not active_sets(scaled.normals).faces(scaled.offsets).any() and known:
+        nearly = active_sets(scaled.normals).faces(scaled.offsets).any()
+        if known and not has_points(scaled.normals, scaled.offsets):
+            by = ", if only by rounding: enlarge its offsets b" if nearly else ""
             raise ValueError(
                 "ClosedLoop.input_box must hold an input, but the polytope A u <= b that arrived "
-                "is empty"
+                f"is empty{by}"
             )
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable
 from fractions import Fraction
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -30,7 +31,9 @@ Normals = tuple[tuple[float, ...], ...]
 
 
 class ActiveSets(NamedTuple):
-    """All sets of linearly independent facets, the smallest first; `N` of `r` facets.
+    """All sets of linearly independent facets; `N` of `r` facets.
+
+    The smallest come first, and of one size those of moderate matrices.
 
     Attributes:
         members: `(N, r)`.
@@ -83,8 +86,7 @@ def active_sets(normals: Normals) -> ActiveSets:
             f"input_box has {r} facets for {n} inputs, which are {count} sets of facets that may "
             f"be active together: the projection onto it looks at {MOST_SETS} at most"
         )
-    C = [[Fraction(entry) for entry in row] for row in normals]
-    G = [[sum(map(Fraction.__mul__, one, other), Fraction(0)) for other in C] for one in C]
+    G = _gram(normals)
     subsets = itertools.chain(*(itertools.combinations(range(r), k) for k in range(min(r, n) + 1)))
     found = [(S, inverse) for S in subsets if (inverse := _inverse(G, S)) is not None]
     members = np.zeros((len(found), r), bool)
@@ -96,13 +98,46 @@ def active_sets(normals: Normals) -> ActiveSets:
         for j, column in enumerate(zip(*inverse, strict=True)):
             multipliers[number, here, S[j]] = [float(entry) for entry in column]
             for k in set(range(r)) - set(S):
-                weights = (G[k][i] * entry for i, entry in zip(S, column, strict=True))
-                slacks[number, k, S[j]] = float(sum(weights, Fraction(0)))
+                slacks[number, k, S[j]] = float(_dot([G[k][i] for i in S], column))
+    order = np.lexsort((abs(multipliers).max(axis=(1, 2)).round(9), members.sum(axis=1)))
+    members, multipliers, slacks = members[order], multipliers[order], slacks[order]
     sizes = members.sum(axis=1)
     largest = np.flatnonzero(sizes == sizes.max())
     within = ~np.any(members[:, None] & ~members[largest], axis=2)
     gram = np.array([[float(entry) for entry in row] for row in G])
     return ActiveSets(members, multipliers, slacks, gram, largest, within)
+
+
+def has_points(normals: Normals, offsets: Float[np.ndarray, " r"]) -> bool:
+    """Whether `C u <= d` has any, in exact arithmetic: facets that can be active together do meet.
+
+    Example:
+        >>> has_points(((1.0,), (-1.0,)), np.array([0.5, -0.5]))
+        True
+        >>> has_points(((1.0,), (-1.0,)), np.array([0.5, -0.6]))
+        False
+    """
+    sets, G, d = active_sets(normals), _gram(normals), [Fraction(entry) for entry in offsets]
+    for number in sets.largest[sets.faces(offsets)[sets.largest]]:
+        S = tuple(np.flatnonzero(sets.members[number]).tolist())
+        inverse = _inverse(G, S)
+        assert inverse is not None  # as it is a set of active ones
+        weights = [_dot(row, [d[i] for i in S]) for row in inverse]
+        if all(
+            _dot([row[i] for i in S], weights) <= limit for row, limit in zip(G, d, strict=True)
+        ):
+            return True
+    return False
+
+
+def _dot(one: Iterable[Fraction], other: Iterable[Fraction]) -> Fraction:
+    return sum(map(Fraction.__mul__, one, other), Fraction(0))
+
+
+def _gram(normals: Normals) -> list[list[Fraction]]:
+    """`C C'`."""
+    C = [[Fraction(entry) for entry in row] for row in normals]
+    return [[_dot(one, other) for other in C] for one in C]
 
 
 def _inverse(G: list[list[Fraction]], S: tuple[int, ...]) -> list[list[Fraction]] | None:

@@ -22,6 +22,9 @@ from reachjax.loops.units.cases import Cases
 from reachjax.loops.units.relu import PRODUCTS, ZERO
 from reachjax.numerics.rounding import namespace, smaller
 
+ROUNDED = 1e-14
+"""Multipliers and slacks that are no more negative than this, in parts of excesses, are not."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ProjectionSlack(AbstractUnit):
@@ -64,7 +67,7 @@ class ProjectionSlack(AbstractUnit):
         return active_sets(self.normals)
 
     def __call__(self, y: Float[Array, "*c r"]) -> Float[Array, "*c r"]:
-        """Multipliers of the active set whose multipliers and slacks are least negative, if any."""
+        """Those of the first active set whose multipliers and slacks are not negative."""
         xp, sets, (N, r) = namespace(y), self._sets, self._sets.members.shape
         faces = sets.faces(self.offsets)
         m, s = (
@@ -72,7 +75,11 @@ class ProjectionSlack(AbstractUnit):
             for matrices in (sets.multipliers, sets.slacks)
         )
         least = xp.where(sets.members, m, s).min(axis=-1)
-        chosen = xp.where(faces, smaller(least, 0.0), -np.inf).argmax(axis=-1)
+        size = abs(y).max(axis=-1, keepdims=True)
+        if self.offsets is not None:
+            size = size + abs(self.offsets).max()
+        least = xp.where(least >= -ROUNDED * size, 0.0, least)
+        chosen = xp.where(faces, least, -np.inf).argmax(axis=-1)
         values = (xp.asarray(sets.multipliers)[chosen] @ y[..., None])[..., 0]
         return xp.where(faces.any(), values, np.nan)
 

@@ -173,8 +173,8 @@ def test_facts_hold_of_exact_multipliers_and_one_of_each_pair_is_zero(inputs):
                 assert np.all(block.rows >= -size), block.name
             for left, right in facts.zero:
                 assert np.all(abs(facts[left] * facts[right]) <= size * (1 + abs(m.astype(float))))
-    sectors = [block.name for block in facts.blocks if block.mark is Mark.SECTOR]
-    assert {name for pair in facts.zero for name in pair} <= set(sectors)
+            sectors = {block.name for block in facts.blocks if block.mark is Mark.SECTOR}
+            assert {name for pair in facts.zero for name in pair} <= sectors
 
 
 def test_what_is_no_number_is_no_bound():

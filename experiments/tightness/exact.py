@@ -18,6 +18,7 @@ from numpy import ndarray
 
 import reachjax as rj
 from experiments.tightness.program import SPARE, Largest, Limits, Program
+from reachjax.loops.input_polytope import InputPolytope
 
 SHARP = 1e-5
 """How far apart the value and HiGHS's bound of it may be, as a part of the direction's range.
@@ -183,7 +184,11 @@ def _successor(loop: rj.ClosedLoop, program: Program, state: ndarray, t: int) ->
     for V, a in hidden:
         z = program.relu(_affine(V, z, a))
     u = _affine(W, z, b)
-    if loop.input_box is not None:
+    if isinstance(loop.input_box, InputPolytope):
+        C = np.array(loop.input_box.normals)
+        m = program.multipliers(C, _affine(C, u, -np.asarray(loop.input_box.offsets)))
+        u = program.padded(u) - C.T @ m
+    elif loop.input_box is not None:
         box, eye = loop.input_box.at(t), np.eye(len(u))
         above = program.relu(_affine(eye, u, -box.lower))
         below = program.relu(_affine(-eye, above, box.upper - box.lower))

@@ -7,9 +7,14 @@ A unit `z = max(y, 0)` whose input can have either sign is
 and the others are affine: `y` and every state are rows over the initial state and the `z` and `d`
 of earlier units. Tolerances of HiGHS are absolute, so variables, constraints and objectives are
 scaled to ranges of order one.
+
+Multipliers of the projection onto a polytope `C u <= d` are more of these, given excesses `y`:
+
+    0 <= m <= M d,   0 <= s <= S (1 - d),   s = C C' m - y,   d in {0, 1}.
 """
 
 import contextlib
+import itertools
 import time
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -127,6 +132,41 @@ class Program:
         z = self.padded(np.where(on[:, None], y, 0.0))
         z[switching] = outputs
         return z
+
+    def multipliers(
+        self, C: Float[ndarray, "r n"], excesses: Float[ndarray, "r size"]
+    ) -> Float[ndarray, "r grown"]:
+        """Rows of the multipliers of the facets of a polytope, given those of its excesses.
+
+        Those of linearly independent facets, which are at most `|(C_S C_S')^-1| |y_S|` in size.
+        """
+        y, r = self.padded(excesses), len(C)
+        ends = np.array([self._range(row) for row in y])
+        size = abs(ends).max(axis=1)
+        G, most = C @ C.T, np.zeros(r)
+        for count in range(1, C.shape[1] + 1):
+            for S in map(list, itertools.combinations(range(r), count)):
+                if np.linalg.matrix_rank(C[S]) == count:
+                    bound = abs(np.linalg.inv(G[np.ix_(S, S)])) @ size[S]
+                    most[S] = np.maximum(most[S], bound)
+        most *= 1 + SPARE
+        slack = abs(G) @ most + size
+        none = np.zeros((r, r))
+        y = np.hstack([y, none, none])
+        m, d = (np.eye(r, y.shape[1], k=y.shape[1] - (2 - i) * r) for i in range(2))
+        m *= most[:, None]
+        one = np.eye(1, y.shape[1])
+        s = G @ m - y
+        facts = [(m - most[:, None] * d) / most[:, None], -s / slack[:, None]]
+        facts.append(s / slack[:, None] - (one - d))
+        new = np.vstack(facts)
+        self._G.resize((len(self._h), len(self._whole) + 2 * r))
+        self._G = vstack([self._G, csc_array(new[:, 1:])], format="csc")
+        self._h = np.append(self._h, -new[:, 0])
+        self._lower = np.append(self._lower, np.zeros(2 * r))
+        self._upper = np.append(self._upper, np.ones(2 * r))
+        self._whole = np.append(self._whole, np.repeat([False, True], r))
+        return m
 
     def largest(self, row: Float[ndarray, " size"]) -> Largest:
         """The largest value of a row, as far as that is found in time.

@@ -1,9 +1,10 @@
 """The loop: a plant under a network whose output is projected onto an input box.
 
-The projection is two more layers of units (the paper's equation (proj_NN)). Disturbances of the
-plant and noise of what the network measures are new at each step and known to lie in sets: they are
-units of the step too (`draws`), noise the first ones and disturbances the last ones. Which units
-there are, and in which order, the loop's own forward pass tells.
+The projection is two more layers of units (the paper's equation (proj_NN)); onto a polytope it is
+one layer. Disturbances of the plant and noise of what the network measures are new at each step and
+known to lie in sets: they are units of the step too (`draws`), noise the first ones and
+disturbances the last ones. Which units there are, and in which order, the loop's own forward pass
+tells.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.loops.draws import drawn
+from reachjax.loops.input_polytope import InputPolytope, input_set
 from reachjax.loops.networks import AbstractNetwork
 from reachjax.loops.plants import AbstractPlant
-from reachjax.loops.units import AbstractUnit, AtUnit, SmoothUnit, clipped, evaluate
+from reachjax.loops.units import AbstractUnit, AtUnit, SmoothUnit, clipped, evaluate, projected
 from reachjax.numerics.checks import (
     Numbers,
     is_concrete,
@@ -26,7 +28,7 @@ from reachjax.numerics.checks import (
     same_size,
     whole_number,
 )
-from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.numerics.pytrees import Replaceable, converted, pytree
 from reachjax.sets import AbstractSet, Box
 
 
@@ -69,14 +71,16 @@ class ClosedLoop(Replaceable):
         plant: the plant.
         controller: the network `pi`.
         input_box: what inputs are projected onto, constant or time-varying; `None`: no projection.
+            A `Polytope` of numbers is kept as an `InputPolytope`, and takes one layer of units.
         disturbance: the set of `w[t]`, of a plant that has disturbances: a `Box`, which may vary in
             time, a `Polytope`, an `Ellipsoid` or an `Intersection`.
         noise: the set of `v[t]`, of the same kinds; `None`: states are measured exactly.
 
     Raises:
-        TypeError: an argument is of another kind.
+        TypeError: an argument is of another kind, or normals of an input polytope are traced.
         ValueError: numbers of states, inputs, disturbances or time steps disagree; a plant has
-            disturbances, but there is no set of them; or a set is empty or unbounded.
+            disturbances, but there is no set of them; a set is empty or unbounded; or an input
+            polytope has too many facets.
 
     Example:
         >>> from reachjax import MLP, AffinePlant
@@ -94,15 +98,13 @@ class ClosedLoop(Replaceable):
 
     plant: AbstractPlant
     controller: AbstractNetwork
-    input_box: Box | None = None
+    input_box: Box | InputPolytope | None = converted(converter=input_set, default=None)
     disturbance: AbstractSet | None = None
     noise: AbstractSet | None = None
 
     def __post_init__(self):
         require_kind("ClosedLoop.plant", self.plant, AbstractPlant, PLANT)
         require_kind("ClosedLoop.controller", self.controller, AbstractNetwork, NETWORK)
-        if self.input_box is not None:
-            require_kind("ClosedLoop.input_box", self.input_box, Box, "of type Box")
         plant, net = self.plant, self.controller
         same_size(
             "the plant's number of states is",
@@ -230,10 +232,13 @@ class ClosedLoop(Replaceable):
         return x + (drawn(self.noise, x, self.states, t, unit) if v is None else v)
 
     def projected(self, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate) -> Any:
-        """What the controller gives, projected onto the input box."""
-        if self.input_box is None:
+        """What the controller gives, projected onto the input box or polytope."""
+        box = self.input_box
+        if box is None:
             return u
-        box = self.input_box.at(t)
+        if isinstance(box, InputPolytope):
+            return projected(u, box.normals, box.offsets, unit)
+        box = box.at(t)
         return clipped(u, box.lower, box.upper, unit)
 
     def input(self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, v: Any = None) -> Any:
@@ -372,7 +377,7 @@ def _recorded(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Unit
     layers = []
 
     def record(unit: AbstractUnit, y: Array) -> Array:
-        layers.append(UnitLayer(unit, len(y)))
+        layers.append(UnitLayer(unit.kind, len(y)))
         return unit(y)
 
     def passed(tree: Any, x: Array) -> Array:

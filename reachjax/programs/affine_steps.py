@@ -237,13 +237,17 @@ def _unit(
         for ends in (unit.remainder(slope, lower, upper), unit.interval(lower, upper))
     )
     slope, offset, gap = settled((slope, rest.mid, rest.rad))
+    left = xp.zeros_like(gap)
     rows = slope[:, None] * y.rows
     constants = xp.stack([rows[:, 0] + offset, values.mid], axis=1)
+    if not unit.separable:  # what rounding alone leaves of a value needs no column
+        small = gap <= SPILL * abs(y.columns).max(axis=1, initial=0.0)
+        left, gap = xp.where(small, gap, 0.0), xp.where(small, 0.0, gap)
     # products with 0 and 1 are exact
     size = abs(constant(rows)).sum(axis=1) + abs(constant(offset))
     rounded = (slope != 0) & (abs(slope) != 1) | (offset != 0)
     radius = abs(slope) * y.radii[:, 0] + xp.where(rounded, gamma(4) * size, 0.0)
-    radius = constant(radius) * (1 + gamma(rows.shape[1]))
+    radius = constant(radius + left) * (1 + gamma(rows.shape[1]))
     z = AffineForms(
         xp.concatenate([constants, rows[:, 2:]], axis=1), xp.stack([radius, values.rad], axis=1)
     )

@@ -20,10 +20,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit, Block, Facts, Line, Lines, Mark
-from reachjax.numerics.checks import require_double_precision
+from reachjax.numerics.checks import require_double_precision, require_kind
 from reachjax.numerics.pytrees import pytree
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.bounds import LoopBounds
+from reachjax.sets import Box
 
 STEADY = 1e-6
 """An input that varies by no more than this part of itself has no caps among its facts: they would
@@ -163,7 +164,8 @@ def change_of_basis(loop: ClosedLoop, t: int = 0) -> ChangeOfBasis:
 
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
-        TypeError: the loop has disturbances or noise, which the paper's basis has no place for.
+        TypeError: the loop has disturbances or noise, or its inputs are projected onto a polytope:
+            the paper's basis has no place for these.
         ValueError: a time-varying loop ends before `t`.
 
     Source: propositions 3, 4 and 5 of Hu, Fazlyab, Morari, Pappas (CDC 2020).
@@ -181,6 +183,8 @@ def change_of_basis(loop: ClosedLoop, t: int = 0) -> ChangeOfBasis:
             "change_of_basis is of loops without disturbances and noise, but loop has some: "
             "the paper's basis has no place for them"
         )
+    if loop.input_box is not None:
+        require_kind("loop.input_box", loop.input_box, Box, "a Box, as the paper has it")
     loop.check_horizon(1, t)
     return _change_of_basis(loop, t)
 
@@ -196,7 +200,7 @@ def _change_of_basis(loop: ClosedLoop, t: int) -> ChangeOfBasis:
     one = columns(size - 1, 1, size).mid
     # the paper keeps x^{l+1} = z + u_low and x^{l+2} = u_high - z in place of the last outputs
     S = jnp.eye(size)
-    if loop.input_box is not None:
+    if isinstance(loop.input_box, Box):
         box, m = loop.input_box.at(t), loop.plant.inputs
         lower, upper = slice(size - 1 - 2 * m, size - 1 - m), slice(size - 1 - m, size - 1)
         S = S.at[lower, -1].set(-box.lower)

@@ -261,9 +261,12 @@ class Horizon:
 
     def _add_units(self, layer: UnitForms, switching: np.ndarray, before: int) -> None:
         width = layer.outputs.columns.shape[1]
-        y, z = layer.inputs[switching].widened(width), layer.outputs[switching]
-        ends: Any = layer.lower[switching], layer.upper[switching]
-        facts = layer.unit.facts(y, z, *ends)
+        # a layer that is not separable states its facts as a whole
+        stated = switching if layer.unit.separable else np.arange(len(layer.places))
+        y, z = layer.inputs[stated].widened(width), layer.outputs[stated]
+        ends: Any = layer.lower[stated], layer.upper[stated]
+        kept = np.searchsorted(stated, switching)
+        facts = layer.unit.facts(y, z, *ends).map(lambda block: block.rows[kept])
         first = {}
         sectors = (block for block in facts.blocks if block.mark is Mark.SECTOR)
         for which, block in enumerate(sectors):

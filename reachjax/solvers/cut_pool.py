@@ -99,9 +99,10 @@ def _first(program: Program, layout: FactLayout) -> Bool[np.ndarray, " m"]:
     first = np.zeros(len(there), dtype=bool)
     first[[0, *layout.set_facets[0], *layout.cone_rows]] = True
     for units in layout.units:
+        paired = [units.rows[name] for name in dict.fromkeys(itertools.chain(*units.kind.zero))]
         # a smooth unit has no facts but those of its bounds
-        blocks = units.marked(Mark.SECTOR) or units.marked(Mark.BOUND)
-        switching = there[np.array(blocks)].all(axis=0)
+        blocks = paired or units.marked(Mark.SECTOR) or units.marked(Mark.BOUND)
+        switching = there[np.array(blocks, dtype=int)].all(axis=0)
         first[np.array(list(units.rows.values()))[:, switching]] = True
     return first
 

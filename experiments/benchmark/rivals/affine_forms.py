@@ -34,6 +34,7 @@ def affine_bounds(
         A, B, c = map(np.asarray, loop.plant.at(t))
         u = _controlled(layers, x)
         if loop.input_box is not None:
+            assert isinstance(loop.input_box, rj.Box)
             box = loop.input_box.at(t)
             u = _clipped(u, np.asarray(box.lower), np.asarray(box.upper))
         x = _affine(A, _padded(x, u), c) + B @ u

@@ -111,6 +111,7 @@ def _paper_data(task: Task, X: rj.PolyhedralSet, t: int) -> dict:
     set_A, set_b = map(np.asarray, X.facets)
     lower = upper = None
     if task.loop.input_box is not None:
+        assert isinstance(task.loop.input_box, rj.Box)
         box = task.loop.input_box.at(t)
         lower, upper = np.asarray(box.lower), np.asarray(box.upper)
     names = ("layers", "A", "B", "c", "u_lower", "u_upper", "set_A", "set_b", "repeated")

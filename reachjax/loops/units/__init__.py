@@ -19,6 +19,7 @@ from reachjax.loops.units.hard_tanh import HardTanh
 from reachjax.loops.units.hyperbolic import Sigmoid, Tanh
 from reachjax.loops.units.leaky_relu import LeakyReLU
 from reachjax.loops.units.powers import Reciprocal, Sqrt, Square
+from reachjax.loops.units.projection import ProjectionSlack, projected
 from reachjax.loops.units.relu import ReLU
 from reachjax.loops.units.smooth import Quadratic, SmoothUnit, UnboundedError
 from reachjax.loops.units.trigonometric import Atan, Cos, Sin
@@ -41,6 +42,7 @@ __all__ = [
     "Log",
     "Mark",
     "Product",
+    "ProjectionSlack",
     "Quadratic",
     "ReLU",
     "Reciprocal",
@@ -53,4 +55,5 @@ __all__ = [
     "UnboundedError",
     "clipped",
     "evaluate",
+    "projected",
 ]

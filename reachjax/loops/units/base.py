@@ -118,7 +118,11 @@ class AbstractActivation(abc.ABC):
 class AbstractUnit(AbstractActivation):
     """One relation `z = f(y)`, which adds one column to a basis.
 
+    A layer whose values depend on all of its inputs is no row of such relations: it is not
+    `separable`, is given whole, and sees to rounded ends of its inputs by itself.
+
     Attributes:
+        separable: whether each value is of its own input alone.
         nonexpansive: whether `|f(y) - f(y')| <= |y - y'|`. `loop_bounds` relies on it where inputs
             are rounded, and holds for such units only.
         free: whether any value between its two lines, which are parallel, is possible, whatever
@@ -127,10 +131,16 @@ class AbstractUnit(AbstractActivation):
         closed: whether these bound the free units before it by themselves.
     """
 
+    separable: ClassVar[bool] = True
     nonexpansive: ClassVar[bool] = True
     free: ClassVar[bool] = False
     stated: ClassVar[bool] = False
     closed: bool = False
+
+    @property
+    def kind(self) -> AbstractUnit:
+        """The unit without what it may know of numbers."""
+        return self
 
     @abc.abstractmethod
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:

@@ -16,7 +16,7 @@ Everything here is numpy on the host.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -175,9 +175,9 @@ class Horizon:
         found[len(first) : self.start.count] = np.where(
             i == j, 2 * first[i] * first[j] - 1, first[i] * first[j]
         )
-        x: Any = state
+        x, values = state, itertools.chain(*(drawn or ()))
         for k in range(len(self.steps)):
-            x = self._followed(x, k, found, () if drawn is None else drawn[k])
+            x = self._followed(x, k, found, values)
         return found
 
     def _followed(
@@ -185,12 +185,12 @@ class Horizon:
         x: Float[np.ndarray, " n_x"],
         k: int,
         found: Float[np.ndarray, " n"],
-        drawn: Iterable[float],
+        values: Iterator[float],
     ) -> Float[np.ndarray, " n_x"]:
         """The state after one step more of a trajectory, whose columns are set."""
         (layers, merged), loop, t = (self.steps[k], self.merged[k]), self._loop, self._t + k
         summed = range(0) if merged is None else merged.layers
-        numbers, values = itertools.count(), iter(drawn)
+        numbers = itertools.count()
 
         def apply(unit: AbstractUnit, y: Any) -> Any:
             number, z = next(numbers), unit(y)

@@ -18,7 +18,9 @@ from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet, PolyhedralSet
 from reachjax.tubes.partitions import BESIDE, PartitionedTube
+from reachjax.tubes.propagation import deadline_of
 from reachjax.tubes.reach import ReachTube
+from reachjax.tubes.recurrence import for_ever
 from reachjax.tubes.refutations import counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Requirement, of_tube
 from reachjax.tubes.verdicts import Verdict, VerdictStatus, of_cells
@@ -32,6 +34,8 @@ def verify(
     *,
     samples: int = 10_000,
     seed: int = 0,
+    forever: bool = False,
+    time_limit: float | None = None,
 ) -> Verdict:
     """Decide a reach-avoid specification from a tube.
 
@@ -44,11 +48,15 @@ def verify(
         samples: how many trajectories are simulated in search of a counterexample, besides those
             from corners and witnesses; so many from each cell.
         seed: of the samples.
+        forever: whether `safe` and `avoid` must hold beyond the horizon, at all times: proved if
+            the sets return into the initial set, or into another one that does (`Recurrence`).
+        time_limit: seconds to look for such a set; None: until a few are tried.
 
     Raises:
         TypeError: a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, a part
-            of the tube was exchanged for another one, or the tube is traced inside `jax.jit`.
+            of the tube was exchanged for another one, or the tube is traced inside `jax.jit`; or
+            something is required for ever of a loop that varies in time, or at given times only.
 
     Source: equations (reach_avoid) and (reach_avoid_approx) of the paper.
 
@@ -61,14 +69,23 @@ def verify(
         'PROVED'
         >>> verify(tube, goal=Box([0.0], [0.4])).counterexample.states.ravel().round(3).tolist()
         [2.0, 1.2, 0.72, 0.432]
+        >>> verify(tube, safe=Box([-1.0], [2.0]), forever=True).status.name
+        'PROVED'
     """
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     if isinstance(tube, PartitionedTube):
         tube.require_sealed()
-        cells = [(each, of_tube(each, goal, avoid, safe)) for each in tube.tubes]
-        return of_cells([_decided(*cell, samples, seed, tube.X0) for cell in cells])
-    return _decided(tube, of_tube(tube, goal, avoid, safe), samples, seed, tube.sets[0])
+        tubes, X0 = tube.tubes, tube.X0
+        cells = [(each, of_tube(each, goal, avoid, safe)) for each in tubes]
+        verdict = of_cells([_decided(*cell, samples, seed, X0) for cell in cells])
+    else:
+        required = of_tube(tube, goal, avoid, safe)
+        tubes, X0 = (tube,), tube.sets[0]
+        verdict = _decided(tube, required, samples, seed, X0)
+    if not forever:
+        return verdict
+    return for_ever(verdict, tubes, X0, safe, avoid, seed, deadline_of(time_limit))
 
 
 def _decided(

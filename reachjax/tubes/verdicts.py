@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.proofs.certificates import AbstractProof
+from reachjax.sets import PolyhedralSet
 
 
 class VerdictStatus(enum.Enum):
@@ -67,6 +68,25 @@ class DecidedCell(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
+class Recurrence:
+    """A set that states come into, and come back to: what holds until then holds for ever.
+
+    Attributes:
+        step: when every state is in the set.
+        period: after how many steps every state of the set is in it again.
+        region: the set.
+        margin: by how much they are inside; negative, by how much that fails to be proved.
+        proved: whether that is proved, and what is required in between.
+    """
+
+    step: int
+    period: int
+    region: PolyhedralSet
+    margin: float
+    proved: bool
+
+
+@dataclasses.dataclass(frozen=True)
 class Verdict:
     """What is known of a specification, part by part.
 
@@ -81,6 +101,7 @@ class Verdict:
         certificates: of a verdict without a tube, what each requirement that is proved rests on,
             by its name and its time.
         cells: of a decision by cells, what is known of each, see `plot_cells`.
+        recurrence: of a statement for all time, what it rests on, or what came nearest to that.
     """
 
     status: VerdictStatus
@@ -90,6 +111,7 @@ class Verdict:
     unsolved: int = 0
     certificates: Mapping[tuple[str, int], AbstractProof] = dataclasses.field(default_factory=dict)
     cells: tuple[DecidedCell, ...] = ()
+    recurrence: Recurrence | None = None
 
     def __bool__(self) -> bool:
         raise TypeError("a verdict has three values: compare verdict.status with VerdictStatus")
@@ -116,6 +138,8 @@ class Verdict:
             counts = [sum(each.status is status for each in self.cells) for status in VerdictStatus]
             proved, refuted, unknown = counts
             lines.append(f"  cells: {proved} proved, {refuted} refuted, {unknown} undecided")
+        if self.recurrence is not None:
+            lines.append(_described(self.recurrence))
         if self.unsolved:
             lines.append(
                 f"  {self.unsolved} programs were not solved to tolerance: their bounds hold, but "
@@ -124,6 +148,14 @@ class Verdict:
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def _described(found: Recurrence) -> str:
+    """At which step states come into a set that they come back to."""
+    times = f"at t = {found.step}, and again after {found.period} more steps"
+    if found.proved:
+        return f"  for ever: in a set {times}, margin {found.margin:+.4g}"
+    return f"  not for ever: nearest is a set {times}, certified margin {found.margin:+.4g}"
 
 
 def _drawn(example: Counterexample) -> str:

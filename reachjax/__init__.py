@@ -88,7 +88,15 @@ from reachjax.tubes.reach import Interrupted, ReachTube, reach, reach_step
 from reachjax.tubes.requirements import shortfall
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.tubes.specs import verify
-from reachjax.tubes.verdicts import Counterexample, DecidedCell, Verdict, VerdictStatus
+from reachjax.tubes.verdicts import (
+    Counterexample,
+    DecidedCell,
+    Recurrence,
+    Verdict,
+    VerdictStatus,
+)
+from reachjax.tubes.winning import winning_set
+from reachjax.tubes.winning_sets import WinningSet
 
 __version__ = "0.1.0"
 
@@ -146,6 +154,7 @@ __all__ = [
     "ReLU",
     "ReachTube",
     "Reciprocal",
+    "Recurrence",
     "Residual",
     "Rung",
     "Sigmoid",
@@ -157,6 +166,7 @@ __all__ = [
     "Template",
     "Verdict",
     "VerdictStatus",
+    "WinningSet",
     "change_of_basis",
     "decide",
     "failures",
@@ -177,5 +187,6 @@ __all__ = [
     "verify",
     "volume",
     "volume_penalty",
+    "winning_set",
     "zero_order_hold",
 ]

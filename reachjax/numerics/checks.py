@@ -233,7 +233,7 @@ def real_number(name: str, value: Any, least: float) -> float:
     return float(array)
 
 
-def require_kind(name: str, value: Any, kind: type, expected: str) -> None:
+def require_kind(name: str, value: Any, kind: type | tuple[type, ...], expected: str) -> None:
     """Raise a `TypeError` that says what was expected if `value` is of another kind."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be {expected}, but {described(value)} arrived")

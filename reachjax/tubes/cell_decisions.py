@@ -23,6 +23,7 @@ from reachjax.loops.units import SmoothUnit
 from reachjax.numerics.checks import described, whole_number, wrapped
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, Box
+from reachjax.sets.balance import balanced
 from reachjax.tubes.cells import Cell, grid, halves_along
 from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
@@ -268,7 +269,7 @@ def outcome_of(task: CellTask, part: AbstractSet, deadline: float) -> Outcome:
             for item in task.required:
                 if item.time == k:
                     middle = scenarios.middle(np.asarray(around.center))
-                    proved, margin = _bounded(item, ladder, part, middle)
+                    proved, margin = bounded(item, ladder, part, middle)
                     margins[item.name][k] = margin
                     if not proved:
                         return Outcome(False, margins, _axis(ladder, item))
@@ -280,7 +281,7 @@ def _open_box(part: AbstractSet, box: Box) -> AbstractSet:
     return jax.device_get(box) if isinstance(part, Box) else part
 
 
-def _bounded(
+def bounded(
     item: Requirement, ladder: Ladder, part: AbstractSet, middle: Float[np.ndarray, " s"]
 ) -> tuple[bool, float]:
     """Whether a requirement surely holds where the ladder has come to, and its margin."""
@@ -294,6 +295,14 @@ def _bounded(
     if not _all_right(item, bounds) and len(ladder.horizon.zero):
         bounds = ladder.climbed(target).bounds
     return _all_right(item, bounds), float(np.min(-bounds / units))
+
+
+def fails_everywhere(item: Requirement, ladder: Ladder) -> bool:
+    """Whether every state surely breaks a requirement at the time that the ladder has come to."""
+    facets = (np.asarray(part) for part in item.region.facets)
+    C, d = balanced(*facets, inner=not item.inside)
+    lower, upper = (C @ ladder.horizon.state + (-d)).ends(ladder.horizon.start)
+    return bool((lower > 0).any() if item.inside else (upper <= 0).all())
 
 
 def _all_right(item: Requirement, bounds: Float[np.ndarray, " g"]) -> bool:

@@ -12,6 +12,7 @@ from reachjax.sets import AbstractSet
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.verdicts import Verdict, VerdictStatus
+from reachjax.tubes.winning_sets import WinningSet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -116,15 +117,15 @@ def plot_tube(
 
 
 def plot_cells(
-    verdict: Verdict, ax: Axes | None = None, coordinates: tuple[int, int] = (0, 1)
+    verdict: Verdict | WinningSet, ax: Axes | None = None, coordinates: tuple[int, int] = (0, 1)
 ) -> Axes:
-    """Draw which cells of an initial set are proved, refuted and undecided.
+    """Draw which cells of an initial set or a domain are proved, refuted and undecided.
 
     Of sets of more than two dimensions it draws the cells' shadows, the undecided ones above the
     proved ones, and the refuted ones above all.
 
     Args:
-        verdict: of `decide(..., cells=...)`.
+        verdict: of `decide(..., cells=...)` or `winning_set`.
         ax: where to draw; a new figure by default.
         coordinates: the two states to draw, counted from 0: the horizontal axis, then the vertical
             one.
@@ -133,7 +134,8 @@ def plot_cells(
         TypeError: it is no verdict.
         ValueError: it has no cells, or the coordinates are not two of its states.
     """
-    require_kind("verdict", verdict, Verdict, "a Verdict, as decide(...) returns it")
+    expected = "a Verdict, as decide(...) returns it, or a WinningSet"
+    require_kind("verdict", verdict, (Verdict, WinningSet), expected)
     if not verdict.cells:
         raise ValueError("verdict has no cells: give decide(..., cells=...) a number of them")
     i, j = _two_of(len(verdict.cells[0].lower), coordinates)

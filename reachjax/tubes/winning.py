@@ -1,0 +1,314 @@
+"""Winning sets: from which initial states a specification surely holds, and from which it fails.
+
+Cells of a domain are proved, or refuted, if it fails from every state of them, or halved. A few
+trajectories say which of these to try, so that nothing is bounded where the boundary runs through.
+Proved cells are an inner estimate of the winning set; all that are not refuted, an outer one.
+"""
+
+from __future__ import annotations
+
+import heapq
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.loops.scenarios import Scenarios
+from reachjax.numerics.checks import (
+    owned,
+    require_bar,
+    require_double_precision,
+    require_executor,
+    require_kind,
+    same_size,
+    whole_number,
+    wrapped,
+)
+from reachjax.programs.relaxations import BranchAndCut
+from reachjax.sets import Box, PolyhedralSet
+from reachjax.tubes.cell_decisions import CellTask, bounded, fails_everywhere
+from reachjax.tubes.ladder import WORK, Ladder
+from reachjax.tubes.propagation import deadline_of
+from reachjax.tubes.requirements import AvoidSets, Requirement, requirements
+from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
+from reachjax.tubes.winning_sets import WinningSet
+
+FEW = 10
+"""Linear programs that a bound may take in a cell: halving it is the other way."""
+
+INNER = 8
+"""How many points of a cell are simulated, besides the middles of its sides."""
+
+BATCH = 8
+"""How many cells are sorted at a time: their trajectories are simulated together."""
+
+
+class Sorted(NamedTuple):
+    """What is found of a cell.
+
+    Attributes:
+        status: proved; refuted, from every state; or neither.
+        margin: the smallest certified one; NaN where nothing was bounded.
+        axis: along which it should be halved.
+    """
+
+    status: VerdictStatus
+    margin: float
+    axis: int
+
+
+def winning_set(
+    loop: ClosedLoop,
+    domain: Box,
+    horizon: int,
+    goal: PolyhedralSet | None = None,
+    safe: PolyhedralSet | None = None,
+    avoid: AvoidSets | None = None,
+    *,
+    cells: int = 10_000,
+    relaxation: BranchAndCut = BranchAndCut(nodes=FEW),  # noqa: B008  (immutable)
+    start: int = 0,
+    time_limit: float | None = None,
+    known: WinningSet | None = None,
+    executor: Executor | None = None,
+    progress: Callable[[Iterable[Any]], Iterable[Any]] | None = None,
+) -> WinningSet:
+    """From which initial states of a box a specification holds: cells, refined at the boundary.
+
+    Args:
+        loop: the closed loop.
+        domain: the initial states that are asked about.
+        horizon: the number of steps.
+        goal: where every state must be at the horizon.
+        safe: where every state must be at all times.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
+            time to a sequence.
+        cells: how many there may be. The largest that are undecided are halved.
+        relaxation: how many linear programs a bound may take.
+        start: the time of the initial states.
+        time_limit: seconds, after which cells stay as they are.
+        known: what an earlier call found of the same question, whose undecided cells are gone on
+            with; None: to begin with the whole domain.
+        executor: runs the cells: any with the interface of `concurrent.futures`, such as a
+            `ProcessPoolExecutor`. None: one after the other, here.
+        progress: wraps the iteration over cells to show a progress bar, such as `tqdm.tqdm`.
+
+    Returns:
+        All cells; of a loop with disturbances, proved for all of them, and refuted for all.
+
+    Raises:
+        RuntimeError: JAX's 64-bit floats are off.
+        TypeError: an argument is of another kind, or a set is of a kind without facets.
+        ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or what
+            is known is of another domain.
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net, Box([-1.0], [1.0]))
+        >>> found = winning_set(loop, Box([-8.0], [8.0]), 2, safe=Box([-4.0], [4.0]), cells=64)
+        >>> found.contains([[0.0], [3.5], [5.0]]).tolist()
+        [True, True, False]
+        >>> 7.0 < found.volume(VerdictStatus.PROVED) <= 8.0
+        True
+    """
+    require_kind("loop", loop, ClosedLoop, "a ClosedLoop")
+    require_kind("domain", domain, Box, "a Box, around the initial states that are asked about")
+    require_kind("relaxation", relaxation, BranchAndCut, "a BranchAndCut")
+    require_double_precision(loop=loop, domain=domain)
+    same_size(
+        "the loop's number of states is",
+        "the dimension of domain is",
+        (loop.states, domain.dimension),
+    )
+    loop.check_horizon(horizon, start)
+    most = whole_number("cells", cells, 1)
+    require_executor(executor)
+    require_bar(progress)
+    required = requirements(loop.states, horizon, goal, avoid, safe)
+    loop, domain = jax.device_get(owned((loop, domain)))
+    task = CellTask(loop, horizon, start, tuple(required), relaxation.nodes)
+    cells_so_far = [_whole(domain)]
+    if known is not None:
+        require_kind("known", known, WinningSet, "a WinningSet, as winning_set(...) returns it")
+        known.require_domain(domain)
+        cells_so_far = list(known.cells)
+    run = _Run(task, domain, cells_so_far, most, deadline_of(time_limit))
+    for _ in wrapped(progress, run.results(executor)):
+        pass
+    return WinningSet(domain, tuple(run.done))
+
+
+def _whole(domain: Box) -> DecidedCell:
+    lower, upper = np.asarray(domain.lower), np.asarray(domain.upper)
+    return DecidedCell(lower, upper, VerdictStatus.UNKNOWN, np.nan)
+
+
+class _Run:
+    """The cells that are decided so far, and those that are open, the largest first."""
+
+    def __init__(
+        self,
+        task: CellTask,
+        domain: Box,
+        cells: Sequence[DecidedCell],
+        most: int,
+        deadline: float,
+    ):
+        self._task, self._most, self._deadline = task, most, deadline
+        self._scale = np.asarray(domain.upper) - np.asarray(domain.lower)
+        self._scale = np.where(self._scale > 0, self._scale, 1.0)
+        self.done = [cell for cell in cells if cell.status is not VerdictStatus.UNKNOWN]
+        self._open: list[tuple[float, int, DecidedCell]] = []
+        self._count, self._number = len(cells), 0
+        for cell in cells:
+            if cell.status is VerdictStatus.UNKNOWN:
+                self._push(cell)
+
+    def _push(self, cell: DecidedCell) -> None:
+        self._number += 1
+        volume = float(np.prod((cell.upper - cell.lower) / self._scale))
+        heapq.heappush(self._open, (-volume, self._number, cell))
+
+    def results(self, executor: Executor | None) -> Iterator[int]:
+        """How many cells are decided, after each batch."""
+        running: dict[Future, list[DecidedCell]] = {}
+        workers = 1 if executor is None else 2 * getattr(executor, "_max_workers", 2)
+        try:
+            while (self._open and not self._late) or running:
+                while self._open and len(running) < workers and not self._late:
+                    batch = [
+                        heapq.heappop(self._open)[2] for _ in range(min(BATCH, len(self._open)))
+                    ]
+                    running[_submitted(executor, self._task, batch)] = batch
+                finished, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    for cell, found in zip(running.pop(future), future.result(), strict=True):
+                        self._judged(cell, found)
+                    yield len(self.done)
+        finally:
+            for future, batch in running.items():
+                future.cancel()
+                self.done += batch
+            self.done += [cell for _, _, cell in self._open]
+            self._open = []
+
+    @property
+    def _late(self) -> bool:
+        return time.monotonic() >= self._deadline
+
+    def _judged(self, cell: DecidedCell, found: Sorted) -> None:
+        """Keep a cell, or halve it as long as there may be more."""
+        middle = cell.lower + (cell.upper - cell.lower) / 2
+        at, low, high = middle[found.axis], cell.lower[found.axis], cell.upper[found.axis]
+        if found.status is VerdictStatus.UNKNOWN and self._count < self._most and low < at < high:
+            self._count += 1
+            for end in ("lower", "upper"):
+                part = {end: np.where(np.arange(len(middle)) == found.axis, at, getattr(cell, end))}
+                self._push(cell._replace(margin=found.margin, **part))
+        else:
+            self.done.append(cell._replace(status=found.status, margin=found.margin))
+
+
+def _submitted(executor: Executor | None, task: CellTask, batch: list[DecidedCell]) -> Future:
+    boxes = [(cell.lower, cell.upper) for cell in batch]
+    if executor is not None:
+        return executor.submit(sorted_cells, task, boxes)
+    future: Future = Future()
+    future.set_result(sorted_cells(task, boxes))
+    return future
+
+
+def sorted_cells(
+    task: CellTask, boxes: Sequence[tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]]
+) -> list[Sorted]:
+    """What is found of each of some boxes, wherever it runs."""
+    with jax.enable_x64(True):
+        points = [_points(*box) for box in boxes]
+        rooms = _rooms(task, np.concatenate(points), boxes)
+        each = np.split(rooms, np.cumsum([len(part) for part in points])[:-1], axis=1)
+        return [_sorted(task, *box, part) for box, part in zip(boxes, each, strict=True)]
+
+
+def _points(
+    lower: Float[np.ndarray, " n"], upper: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "c n"]:
+    """The middles of a box's sides, axis by axis, and some of its points."""
+    n, center = len(lower), lower + (upper - lower) / 2
+    stars = np.repeat(center[None], 2 * n, axis=0)
+    stars[np.arange(0, 2 * n, 2), np.arange(n)] = lower
+    stars[np.arange(1, 2 * n, 2), np.arange(n)] = upper
+    shares = np.random.default_rng(0).uniform(size=(INNER, n))
+    shares[: INNER // 2] = shares[: INNER // 2] > 0.5
+    return np.concatenate([stars, np.clip(lower + shares * (upper - lower), lower, upper)])
+
+
+def _rooms(
+    task: CellTask, states: Float[np.ndarray, "c n"], boxes: Sequence[Any]
+) -> Float[np.ndarray, "r c"]:
+    """How far trajectories are on the right side of each requirement; what overflows is not."""
+    scenarios = Scenarios.of(task.loop, Box(*boxes[0]), task.horizon, task.start)
+    drawn = scenarios.drawn(states, 0)
+    runs = scenarios.runs(task.loop, drawn, task.horizon, task.start)
+    rooms = np.stack([item.simulated(runs) for item in task.required])
+    return np.where(np.isfinite(rooms), rooms, -np.inf)
+
+
+def _sorted(
+    task: CellTask,
+    lower: Float[np.ndarray, " n"],
+    upper: Float[np.ndarray, " n"],
+    rooms: Float[np.ndarray, "r c"],
+) -> Sorted:
+    """What is found of one box, given what trajectories from it do."""
+    least, n = rooms.min(axis=0), len(lower)
+    with np.errstate(invalid="ignore"):
+        moved = np.nan_to_num(abs(np.diff(rooms[:, : 2 * n].reshape(len(rooms), n, 2))[..., 0]))
+    near = np.clip(abs(rooms).min(axis=1), 1e-12, 1e300)  # the closer to the boundary, the more
+    axis = int((moved / near[:, None]).max(axis=0).argmax())
+    if (upper - lower)[axis] <= 0:
+        axis = int((upper - lower).argmax())
+    if (least < 0).any() and (least >= 0).any():
+        return Sorted(VerdictStatus.UNKNOWN, np.nan, axis)
+    box = jax.device_get(Box(lower, upper))
+    scenarios = Scenarios.of(task.loop, box, task.horizon, task.start)
+    ladder = Ladder(task.loop, box, box, scenarios, task.start, task.nodes, np.inf, WORK)
+    if (least < 0).all():
+        broken = [item for item, row in zip(task.required, rooms, strict=True) if (row < 0).all()]
+        status = VerdictStatus.REFUTED if _fails(broken, ladder) else VerdictStatus.UNKNOWN
+        return Sorted(status, np.nan, axis)
+    holds, margin = _holds(task, ladder, box, scenarios.middle(np.asarray(box.center)))
+    return Sorted(VerdictStatus.PROVED if holds else VerdictStatus.UNKNOWN, margin, axis)
+
+
+def _fails(broken: Sequence[Requirement], ladder: Ladder) -> bool:
+    """Whether every state surely breaks one of some requirements."""
+    ordered = sorted(broken, key=lambda item: item.time)
+    for item in ordered:
+        while len(ladder.horizon.steps) < item.time:
+            ladder.advance(tighten=False)
+        if fails_everywhere(item, ladder):
+            return True
+    return False
+
+
+def _holds(
+    task: CellTask, ladder: Ladder, box: Box, middle: Float[np.ndarray, " s"]
+) -> tuple[bool, float]:
+    """Whether all requirements surely hold, and the smallest margin of those that were bounded."""
+    margin = np.inf
+    for k in range(task.horizon + 1):
+        if k:
+            ladder.advance(tighten=False)
+        for item in task.required:
+            if item.time == k:
+                proved, found = bounded(item, ladder, box, middle)
+                margin = min(margin, found)
+                if not proved:
+                    return False, margin
+    return True, margin

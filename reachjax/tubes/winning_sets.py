@@ -1,0 +1,92 @@
+"""What is known of the initial states of a box: which win, which lose, and which are undecided."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import ArrayLike, Bool, Float
+
+from reachjax.numerics.checks import Numbers, require_kind, same_size
+from reachjax.sets import Box
+from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
+
+AT_ONCE = 1000
+"""So many points are looked up at a time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WinningSet:
+    """Cells that cover a domain, each of which is proved, refuted or undecided.
+
+    Proved is a cell if the specification surely holds from every state of it, refuted if it surely
+    holds from none. Proved cells are an inner estimate of the winning set; all but the refuted ones
+    are an outer one. `plot_cells` draws them.
+
+    Attributes:
+        domain: the initial states that were asked about.
+        cells: they cover it.
+    """
+
+    domain: Box
+    cells: tuple[DecidedCell, ...]
+
+    def __repr__(self) -> str:
+        return f"WinningSet(cells={len(self.cells)}, states={self.domain.dimension})"
+
+    def __str__(self) -> str:
+        total = sum(map(self.volume, VerdictStatus))
+        lines = [f"{'':10} {'cells':>7} {'volume':>10} {'part':>7}"]
+        for status in VerdictStatus:
+            size, count = self.volume(status), len(self.of(status))
+            part = size / total if total > 0 else np.nan
+            lines.append(f"{status.value:10} {count:7d} {size:10.4g} {part:7.2%}")
+        return "\n".join(lines)
+
+    def of(self, status: VerdictStatus) -> tuple[DecidedCell, ...]:
+        """The cells of which this is known."""
+        return tuple(cell for cell in self.cells if cell.status is status)
+
+    def volume(self, status: VerdictStatus) -> float:
+        """That of these cells together, in the units of the states."""
+        return float(sum(np.prod(cell.upper - cell.lower) for cell in self.of(status)))
+
+    def contains(self, states: Float[ArrayLike, "*batch n"]) -> Bool[np.ndarray, "*batch"]:
+        """Which states are in the inner estimate: the specification surely holds from them."""
+        return self._in(states, VerdictStatus.PROVED)
+
+    def excludes(self, states: Float[ArrayLike, "*batch n"]) -> Bool[np.ndarray, "*batch"]:
+        """Which states are outside of the outer estimate: the specification fails from them."""
+        return self._in(states, VerdictStatus.REFUTED)
+
+    def _in(self, states: Float[ArrayLike, "*batch n"], status: VerdictStatus) -> np.ndarray:
+        points = np.asarray(Numbers("(n,)", "(batch, n)")(states, "states"))
+        same_size(
+            "the domain's dimension is",
+            "the dimension of states is",
+            (self.domain.dimension, points.shape[-1]),
+        )
+        flat, cells = points.reshape(-1, points.shape[-1]), self.of(status)
+        found = np.zeros(len(flat), dtype=bool)
+        if cells:
+            lower, upper = (
+                np.stack([getattr(c, end) for c in cells]) for end in ("lower", "upper")
+            )
+            for first in range(0, len(flat), AT_ONCE):
+                some = flat[first : first + AT_ONCE, None]
+                inside = np.all((lower <= some) & (some <= upper), axis=2)
+                found[first : first + AT_ONCE] = np.any(inside, axis=1)
+        return found.reshape(points.shape[:-1])
+
+    def require_domain(self, domain: Box) -> None:
+        """Raise an error unless the cells are of this domain.
+
+        Raises:
+            ValueError: they are of another one.
+        """
+        require_kind("domain", domain, Box, "a Box")
+        ends = [(np.asarray(each.lower), np.asarray(each.upper)) for each in (self.domain, domain)]
+        if not all(np.array_equal(one, other) for one, other in zip(*ends, strict=True)):
+            raise ValueError(
+                f"known must be of the domain {domain}, but one of {self.domain} arrived"
+            )

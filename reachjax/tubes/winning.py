@@ -44,6 +44,9 @@ FEW = 10
 INNER = 8
 """How many points of a cell are simulated, besides the middles of its sides."""
 
+NEARLY = 0.1
+"""Coordinates whose influence differs by no more than this part are cut by turns."""
+
 BATCH = 8
 """How many cells are sorted at a time: their trajectories are simulated together."""
 
@@ -235,17 +238,29 @@ def sorted_cells(
         return [_sorted(task, *box, part) for box, part in zip(boxes, each, strict=True)]
 
 
+def _axis(least: Float[np.ndarray, " c"], widths: Float[np.ndarray, " n"]) -> int:
+    """The coordinate along which the smallest room differs most from that in the middle."""
+    n = len(widths)
+    with np.errstate(invalid="ignore"):
+        moved = np.nan_to_num(abs(least[: 2 * n] - least[2 * n]), posinf=1.0)
+    moved = moved.reshape(n, 2).max(axis=1)
+    alike = moved >= (1 - NEARLY) * moved.max()
+    return int(np.where(alike & (widths > 0), widths, -1.0).argmax())
+
+
 def _points(
     lower: Float[np.ndarray, " n"], upper: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "c n"]:
-    """The middles of a box's sides, axis by axis, and some of its points."""
+    """The middles of a box's sides, axis by axis, its own, and some of its points."""
     n, center = len(lower), lower + (upper - lower) / 2
     stars = np.repeat(center[None], 2 * n, axis=0)
     stars[np.arange(0, 2 * n, 2), np.arange(n)] = lower
     stars[np.arange(1, 2 * n, 2), np.arange(n)] = upper
     shares = np.random.default_rng(0).uniform(size=(INNER, n))
     shares[: INNER // 2] = shares[: INNER // 2] > 0.5
-    return np.concatenate([stars, np.clip(lower + shares * (upper - lower), lower, upper)])
+    return np.concatenate(
+        [stars, center[None], np.clip(lower + shares * (upper - lower), lower, upper)]
+    )
 
 
 def _rooms(
@@ -266,13 +281,8 @@ def _sorted(
     rooms: Float[np.ndarray, "r c"],
 ) -> Sorted:
     """What is found of one box, given what trajectories from it do."""
-    least, n = rooms.min(axis=0), len(lower)
-    with np.errstate(invalid="ignore"):
-        moved = np.nan_to_num(abs(np.diff(rooms[:, : 2 * n].reshape(len(rooms), n, 2))[..., 0]))
-    near = np.clip(abs(rooms).min(axis=1), 1e-12, 1e300)  # the closer to the boundary, the more
-    axis = int((moved / near[:, None]).max(axis=0).argmax())
-    if (upper - lower)[axis] <= 0:
-        axis = int((upper - lower).argmax())
+    least = rooms.min(axis=0)
+    axis = _axis(least, upper - lower)
     if (least < 0).any() and (least >= 0).any():
         return Sorted(VerdictStatus.UNKNOWN, np.nan, axis)
     box = jax.device_get(Box(lower, upper))

@@ -82,6 +82,7 @@ from reachjax.training import (
     volume_penalty,
 )
 from reachjax.tubes.decisions import decide
+from reachjax.tubes.largest import LargestSet, largest_set
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
 from reachjax.tubes.plotting import plot_cells, plot_set, plot_tube
 from reachjax.tubes.reach import Interrupted, ReachTube, reach, reach_step
@@ -137,6 +138,7 @@ __all__ = [
     "InteriorPoint",
     "Interrupted",
     "Intersection",
+    "LargestSet",
     "LeakyReLU",
     "LinearBounds",
     "LinearCertificate",
@@ -171,6 +173,7 @@ __all__ = [
     "decide",
     "failures",
     "keep_compilations",
+    "largest_set",
     "log_volume",
     "log_widths",
     "plot_cells",

@@ -1,0 +1,80 @@
+"""The largest sets that are proved: what is returned is proved, and hardly anything larger is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from tests.tubes.test_forever import scalar
+
+WANTED = {"goal": rj.Box([-0.6, -0.6], [0.6, 0.6]), "safe": rj.Box([-3.5, -1.5], [3.5, 1.5])}
+HORIZON = 5
+QUICK = rj.BranchAndCut(nodes=20)
+
+
+@pytest.fixture(scope="module")
+def loop():
+    data = np.load("tests/data/double_integrator_with_margin.npz")
+    net = rj.MLP.from_layers([(data[f"W{i}"], data[f"b{i}"]) for i in range(3)])
+    plant = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
+    return rj.ClosedLoop(plant, net, rj.Box([-1.0], [1.0]))
+
+
+def wins(loop, X):
+    """Whether all trajectories from corners and samples of a set have what is wanted."""
+    states = jnp.concatenate([X.corners(), X.sample(jax.random.key(0), 3000)])
+    runs = loop.simulate(states, HORIZON)
+    inside = WANTED["safe"].contains(runs, 1e-9).all() & WANTED["goal"].contains(runs[:, -1], 1e-9)
+    return bool(inside.all())
+
+
+@pytest.mark.parametrize(
+    "X0",
+    [rj.Box([1.0, -0.2], [1.2, 0.2]), rj.Ellipsoid([0.5, 0.0], [[0.01, 0.0], [0.0, 0.01]])],
+    ids=["box", "ellipsoid"],
+)
+def test_it_is_proved_and_much_larger(loop, X0):
+    found = rj.largest_set(loop, X0, HORIZON, rounds=10, relaxation=QUICK, **WANTED)
+    assert found.verdict.status is rj.VerdictStatus.PROVED
+    assert type(found.region) is type(X0)
+    assert wins(loop, found.region)
+    assert found.region.volume() > 20 * X0.volume()
+
+
+def test_a_set_that_is_too_large_is_shrunk():
+    safe = rj.Box([-2.0], [1.0])
+    found = rj.largest_set(scalar(0.9), rj.Box([-8.0], [9.0]), 3, safe=safe, rounds=10)
+    assert found.region.upper == pytest.approx(1.0, abs=0.02)
+    assert found.region.lower == pytest.approx(-2.0, abs=0.02)
+    assert (found.region.upper <= 1.0) & (found.region.lower >= -2.0)
+
+
+def test_avoided_sets_are_kept_away_from():
+    avoid = [rj.Box([1.0], [1.5]), rj.Box([-3.0], [-2.0])]
+    found = rj.largest_set(scalar(0.5), rj.Box([0.1], [0.2]), 2, avoid=avoid, rounds=10)
+    assert found.region.upper == pytest.approx(1.0, abs=0.02)
+    assert found.region.lower == pytest.approx(-2.0, abs=0.02)
+
+
+def test_it_can_be_gone_on_with_and_shows_its_progress(loop):
+    seen = []
+
+    def bar(items):
+        for item in items:
+            seen.append(item)
+            yield item
+
+    X0, more = rj.Box([1.0, -0.1], [1.1, 0.1]), {"relaxation": QUICK, "progress": bar, **WANTED}
+    some = rj.largest_set(loop, X0, HORIZON, rounds=2, time_limit=0.5, **more)
+    later = rj.largest_set(loop, some.region, HORIZON, rounds=5, **more)
+    assert later.region.volume() >= some.region.volume() * (1 - 1e-9)
+    assert seen
+    assert np.isfinite(seen).all()
+
+
+def test_what_begins_where_nothing_is_proved_is_named(loop):
+    with pytest.raises(ValueError, match="nothing is proved around the center of X0"):
+        rj.largest_set(loop, rj.Box([3.6, 0.0], [3.8, 0.1]), HORIZON, rounds=1, **WANTED)
+    with pytest.raises(TypeError, match="X0 must be a Box or an Ellipsoid"):
+        rj.largest_set(loop, rj.Polytope(np.eye(2), [1.0, 1.0]), HORIZON, **WANTED)

@@ -251,6 +251,8 @@ class Horizon:
             switching = np.flatnonzero((layer.places >= 0) | layer.unit.stated)
             if layer.unit.closed:
                 self.enclosed = np.append(self.enclosed, found[number - 1].places)
+            if isinstance(layer.unit, SmoothUnit):  # it has none that are of the lines' sectors
+                continue
             if layer.unit.free:  # its column says all that its facts do
                 self.free = np.append(self.free, layer.places)
                 self._varying = np.append(self._varying, layer.places)

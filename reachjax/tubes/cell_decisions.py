@@ -29,7 +29,7 @@ from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.requirements import Requirement
 from reachjax.tubes.steps import boxed
-from reachjax.tubes.targets import target_of
+from reachjax.tubes.targets import target_of, values_of
 from reachjax.tubes.verdicts import Counterexample, DecidedCell, Verdict, VerdictStatus
 
 Margins = dict[str, Float[np.ndarray, " h+1"]]
@@ -288,12 +288,11 @@ def bounded(
     if item.time == 0:
         compared = item.compared_with(jax.device_put(part))
         return item.proved(compared), float(compared.margins.min())
-    target, units = target_of(item, ladder, None, middle)
-    start = ladder.horizon.start
-    uppers = [form.ends(start)[1] for form in target.forms]
-    bounds = np.array([upper.min() for upper in uppers])
+    rows, units = values_of(item, ladder)
+    uppers = rows.ends(ladder.horizon.start)[1]
+    bounds = uppers if item.inside else uppers.min(keepdims=True)
     if not _all_right(item, bounds) and len(ladder.horizon.zero):
-        bounds = ladder.climbed(target).bounds
+        bounds = ladder.climbed(target_of(item, ladder, None, middle)[0]).bounds
     return _all_right(item, bounds), float(np.min(-bounds / units))
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
+from reachjax.programs.affine import AffineForms
 from reachjax.proofs.witnesses import Simulated, Simulations
 from reachjax.tubes.ladder import Ladder, Target
 from reachjax.tubes.requirements import Requirement
@@ -26,20 +28,16 @@ def target_of(
     Returns:
         The target, and what a distance of 1 in the units of the state changes its values by.
     """
-    parts = item.region.facets_in_units(inner=item.inside)
-    C, d, norms = (np.asarray(part) for part in parts)
-    state, start = ladder.horizon.state, ladder.horizon.start
-    if item.inside:
-        excess = C @ state + (-d)
-        forms = [excess[i : i + 1] for i in range(len(d))]
-    else:
-        forms = [(1 / norms) * (d - C @ state)]
+    C, d, norms = _facets(item)
+    rows, units = values_of(item, ladder)
+    forms = [rows[i : i + 1] for i in range(len(d))] if item.inside else [rows]
 
     def values(after: np.ndarray) -> np.ndarray:
         excess = after @ C.T - d
         return excess if item.inside else (-excess / norms).min(axis=1, keepdims=True)
 
-    sizes = [np.subtract(*form.ends(start)[::-1]).max() for form in forms]
+    lower, upper = rows.ends(ladder.horizon.start)
+    sizes = upper - lower if item.inside else [np.max(upper - lower)]
 
     def enough(number: int, bound: float, attained: float) -> bool:
         return bound <= -BELOW * sizes[number] or attained > 0
@@ -48,4 +46,21 @@ def target_of(
         known = Simulated.nothing(middle, len(forms))
     else:
         known = simulations.known(values(simulations.runs.states[:, len(ladder.horizon.steps)]))
-    return Target(forms, values, enough, known), norms if item.inside else np.ones(1)
+    return Target(forms, values, enough, known), units
+
+
+def values_of(item: Requirement, ladder: Ladder) -> tuple[AffineForms, Float[np.ndarray, " k"]]:
+    """Forms of which all must be below zero, or if states must be outside, one at each state.
+
+    Returns:
+        The forms, and what a distance of 1 in the units of the state changes them by.
+    """
+    C, d, norms = _facets(item)
+    state = ladder.horizon.state
+    if item.inside:
+        return C @ state + (-d), norms
+    return (1 / norms) * (d - C @ state), np.ones(1)
+
+
+def _facets(item: Requirement) -> list[np.ndarray]:
+    return [np.asarray(part) for part in item.region.facets_in_units(inner=item.inside)]

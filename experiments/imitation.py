@@ -1,7 +1,7 @@
 """Learning a controller from a policy's decisions: networks fitted to its samples.
 
-The network is `pi(x) = W_L relu(... relu(W_0 x + b_0) ...) + b_L`, its output affine and not
-projected, and its weights minimise over the samples `(x_i, u_i)`
+The network is `pi(x) = W_L relu(... relu(W_0 x + b_0) ...) + b_L`, or one of `tanh`, its
+output affine and not projected, and its weights minimise over the samples `(x_i, u_i)`
 
     mean_i |pi(x_i) - u_i|^2  +  penalty * sum_l |W_l|_F^2 .
 
@@ -58,6 +58,7 @@ def train_networks(
     restarts: int = 4,
     validation: float = 0.1,
     standardise: bool = False,
+    activation: str = "relu",
     path: str | Path | None = None,
     retrain: bool = False,
     progress: bool = True,
@@ -85,6 +86,8 @@ def train_networks(
     }
     if standardise:  # named only then: files of networks trained without it stay valid
         settings["standardise"] = True
+    if activation != "relu":
+        settings["activation"] = activation
     kept = None if retrain else stored.load(path, settings)
     if kept is None:
         # Single precision whatever JAX's global setting is: the fit needs no more.
@@ -93,13 +96,15 @@ def train_networks(
         if scales:
             x, u = ((a - m) / s for a, (m, s) in zip((x, u), scales, strict=True))
         x, u = np.asarray(x, np.float32), np.asarray(u, np.float32)
-        trained = _train(x, u, hidden, seed, penalty, steps, learning_rate, restarts, progress)
+        options = penalty, steps, learning_rate, restarts, activation, progress
+        trained = _train(x, u, hidden, seed, *options)
         trained = _folded(trained, *scales) if scales else trained
         kept = {f"W{i}": W for i, (W, _) in enumerate(trained)}
         kept |= {f"b{i}": b for i, (_, b) in enumerate(trained)}
         stored.save(path, settings, **kept)
     pairs = [(kept[f"W{i}"], kept[f"b{i}"]) for i in range(len(hidden) + 1)]
-    return [fit([(W[r], b[r]) for W, b in pairs], samples, validation) for r in range(restarts)]
+    every = ([(W[r], b[r]) for W, b in pairs] for r in range(restarts))
+    return [fit(layers, samples, validation, activation) for layers in every]
 
 
 def training_share(samples: Samples, validation: float) -> int:
@@ -111,19 +116,23 @@ def training_share(samples: Samples, validation: float) -> int:
     return split
 
 
-def fit(layers, samples: Samples, validation: float = 0.1) -> Fit:
+def fit(layers, samples: Samples, validation: float = 0.1, activation: str = "relu") -> Fit:
     """The network `layers` with its errors on the samples trained on and on the others."""
     split = training_share(samples, validation)
-    squares = np.sum((evaluate(layers, samples.states) - samples.inputs) ** 2, axis=1)
+    found = evaluate(layers, samples.states, activation)
+    squares = np.sum((found - samples.inputs) ** 2, axis=1)
     return Fit(layers, float(squares[:split].mean() ** 0.5), float(squares[split:].mean() ** 0.5))
 
 
-def evaluate(layers, states: Float[ndarray, "count n"]) -> Float[ndarray, "count m"]:
+def evaluate(
+    layers, states: Float[ndarray, "count n"], activation: str = "relu"
+) -> Float[ndarray, "count m"]:
     """The network's output at each row of `states`, in double precision."""
     *hidden, (W_out, b_out) = layers
     z = np.asarray(states, float)
     for W, b in hidden:
-        z = np.maximum(z @ W.T + b, 0)
+        y = z @ W.T + b
+        z = np.tanh(y) if activation == "tanh" else np.maximum(y, 0)
     return z @ W_out.T + b_out
 
 
@@ -143,19 +152,20 @@ def _folded(layers, of_states, of_inputs):
 
 
 class _Policy(nnx.Module):
-    def __init__(self, sizes, rngs):
+    def __init__(self, sizes, activation, rngs):
+        self.activation = {"relu": nnx.relu, "tanh": nnx.tanh}[activation]
         self.layers = nnx.List([nnx.Linear(i, o, rngs=rngs) for i, o in pairwise(sizes)])
 
     def __call__(self, x):
         for layer in self.layers[:-1]:
-            x = nnx.relu(layer(x))
+            x = self.activation(layer(x))
         return self.layers[-1](x)
 
 
-def _train(x, u, hidden, seed, penalty, steps, learning_rate, restarts, progress):
+def _train(x, u, hidden, seed, penalty, steps, learning_rate, restarts, activation, progress):
     """Pairs `(W, b)`, one a layer, with a leading axis for the restarts."""
     sizes = [x.shape[1], *hidden, u.shape[1]]
-    structure, _ = nnx.split(_Policy(sizes, nnx.Rngs(0)))
+    structure, _ = nnx.split(_Policy(sizes, activation, nnx.Rngs(0)))
     optimiser = optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
 
     def loss(weights):
@@ -170,7 +180,7 @@ def _train(x, u, hidden, seed, penalty, steps, learning_rate, restarts, progress
 
     @jax.vmap
     def start(key):
-        _, weights = nnx.split(_Policy(sizes, nnx.Rngs(key)))
+        _, weights = nnx.split(_Policy(sizes, activation, nnx.Rngs(key)))
         return weights, optimiser.init(weights)
 
     # The last block may run past `steps`, where the rate is 0 and nothing moves.

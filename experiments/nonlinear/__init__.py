@@ -1,0 +1,1 @@
+"""Loops that are not affine or no ReLU chains: a pendulum, a car, TORA, an oscillator."""

@@ -21,6 +21,7 @@ and from `(1 - s_i w_i) (1 - s_j w_j) >= 0`, `s_i` being the sign of `g_i`, wher
 from __future__ import annotations
 
 import itertools
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -79,8 +80,7 @@ class InitialColumns(Replaceable):
     @property
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """Which `w_i` and `w_j` each product is of, `i <= j`; none unless it is curved."""
-        n = self.spread.shape[1]
-        return np.triu_indices(n if self.curved else 0)
+        return _pairs(self.spread.shape[1] if self.curved else 0)
 
     @property
     def count(self) -> int:
@@ -100,8 +100,9 @@ class InitialColumns(Replaceable):
         rest = abs(rows[:, n:]).sum(axis=1)
         below, above = self.ends(rows[:, :n])
         if not self.round:
-            above = smaller(above + rest, _highest(rows, self.pairs))
-            below = larger(below - rest, -_highest(-rows, self.pairs))
+            both = _highest(namespace(rows).concatenate([rows, -rows]), self.pairs)
+            above = smaller(above + rest, both[: len(rows)])
+            below = larger(below - rest, -both[len(rows) :])
         else:
             below, above = below - rest, above + rest
         return below - constant(error * size), above + constant(error * size)
@@ -142,6 +143,11 @@ class InitialColumns(Replaceable):
         lower = least - at - constant((error + gamma(4) * abs(least)) * (1 + gamma(n)))
         upper = most - at + constant((error + gamma(4) * abs(most)) * (1 + gamma(n)))
         return larger(-norms, lower), smaller(norms, upper)
+
+
+@lru_cache(maxsize=64)
+def _pairs(n: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.triu_indices(n)
 
 
 def _highest(rows: Rows, pairs: tuple[np.ndarray, np.ndarray]) -> Any:

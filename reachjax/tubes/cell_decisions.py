@@ -9,6 +9,7 @@ units most. Of a cell nothing is kept but its box and its margins.
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from typing import Any, NamedTuple
@@ -39,6 +40,9 @@ SHOTS = 64
 
 FEW = 50
 """Linear programs that a bound may take in a cell: halving it is the other way."""
+
+TRIED = 8
+"""After so many cells of a size of which none was proved, one in so many is tried."""
 
 AHEAD = 4
 """How many cells an executor is given for each of its workers, at least."""
@@ -148,6 +152,8 @@ class _Run:
         blank = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
         self._margins, self._simulated = blank, {name: row.copy() for name, row in blank.items()}
         self.example: Counterexample | None = None
+        self._tried: dict[int, deque[int]] = {}
+        self._size = _size(boxed(X0, "X0"))
 
     def results(self, begun: Sequence[Cell], executor: Executor | None) -> Iterator[int]:
         """How many cells are decided, after each that is bounded."""
@@ -159,6 +165,10 @@ class _Run:
             while open_cells or running:
                 while open_cells and len(running) < workers:
                     cell = open_cells.pop()
+                    axis = self._hopeless(cell)
+                    if axis is not None:
+                        open_cells += self._halved(cell, axis)[::-1]
+                        continue
                     part = jax.device_get(cell.part)
                     running[_submitted(executor, self._task, part, self._deadline)] = cell
                 finished, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -175,17 +185,39 @@ class _Run:
         """The halves of a cell that is not proved, as long as there may be more."""
         if outcome.proved:
             self._kept(cell, outcome, VerdictStatus.PROVED)
+            self._tried.pop(self._depth(cell), None)
             return []
+        self._tried.setdefault(self._depth(cell), deque()).append(outcome.axis)
         self._shoot(cell)
-        late = time.monotonic() >= self._deadline
-        full = self._most is not None and self._count >= self._most
-        flat = not float(cell.box.widths[outcome.axis]) > 0
-        if late or full or flat or self.example is not None:
+        if self.example is not None or not self._may_halve(cell, outcome.axis):
             self._kept(cell, outcome, VerdictStatus.UNKNOWN)
             return []
-        found = halves_along(self._X0, cell.box, outcome.axis)
+        return self._halved(cell, outcome.axis)
+
+    def _may_halve(self, cell: Cell, axis: int) -> bool:
+        late = time.monotonic() >= self._deadline
+        full = self._most is not None and self._count >= self._most
+        return not (late or full) and float(cell.box.widths[axis]) > 0
+
+    def _halved(self, cell: Cell, axis: int) -> list[Cell]:
+        found = halves_along(self._X0, cell.box, axis)
         self._count += len(found) - 1
         return found
+
+    def _depth(self, cell: Cell) -> int:
+        """How often the initial set was halved to get a cell."""
+        return round(self._size - _size(cell.box))
+
+    def _hopeless(self, cell: Cell) -> int | None:
+        """Along which axis to halve a cell at once, if none of its size was proved lately."""
+        tried = self._tried.get(self._depth(cell), deque())
+        if len(tried) < TRIED or not self._may_halve(cell, tried[-1]):
+            return None
+        if len(tried) % TRIED == 0:  # this one is tried, and counted when it is judged
+            tried.append(tried[-1])
+            return None
+        tried.append(tried[-1])
+        return tried[-1]
 
     def _kept(self, cell: Cell, outcome: Outcome, status: VerdictStatus) -> None:
         lower, upper = np.asarray(cell.box.lower), np.asarray(cell.box.upper)
@@ -237,6 +269,12 @@ class _Run:
             self.example,
             cells=tuple(self._done),
         )
+
+
+def _size(box: Box) -> float:
+    """The logarithm of a volume, in halvings; of coordinates that are flat none."""
+    widths = np.asarray(box.widths)
+    return float(np.log2(widths[widths > 0]).sum())
 
 
 def _submitted(executor: Executor | None, *given: Any) -> Future:

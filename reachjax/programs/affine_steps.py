@@ -5,7 +5,8 @@ the initial state and `|g w| <= S`, `|h| <= R` for what else there is,
 
     f(y) = p + s d + q (g w)^2 + e v,    |v| <= 1,    e = (error of the model) + |q| (2 S R + R^2),
 
-and `(g w)^2` is a row over products of the `w`, which are columns too (`initial`). What the units
+and `(g w)^2` is a row over products of the `w`, which are columns too (`initial`). Where `h` is so
+large that lines leave less out, it is these. What the units
 of a smooth controller leave out is summed up at its outputs, one column for each: a step adds as
 many columns for ten neurons as for a thousand. They stay columns, which the feedback contracts.
 """
@@ -19,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.units import AbstractUnit, SmoothUnit, UnboundedError
+from reachjax.loops.units import AbstractUnit, Quadratic, SmoothUnit, UnboundedError
 from reachjax.numerics.rounding import Ball, gamma, namespace
 from reachjax.programs.affine import AffineForms, Place, met
 from reachjax.programs.initial import Ends, InitialColumns, constant, settled
@@ -200,15 +201,18 @@ def _smooth(
 ) -> tuple[AffineForms, UnitForms]:
     """What a layer of smooth units makes of its inputs, whose bounds are known."""
     xp, (lower, upper), w = namespace(y.rows), ends, start.spread.shape[1]
-    model, values = unit.quadratic(lower, upper), Ball.between(*unit.interval(lower, upper))
-    center, rows = y.rows[:, 0], y.rows[:, 2:]
+    values, center, rows = Ball.between(*unit.interval(lower, upper)), y.rows[:, 0], y.rows[:, 2:]
+    own = start.norms(rows[:, :w])
+    rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(rows.shape[1])) + y.radii[:, 0]
+    model, line = unit.quadratic(lower, upper), unit.linear(lower, upper)
+    lost = abs(model.curvature) * (2 * own + rest) * rest
+    better = model.gap + lost <= line.gap
+    model = Quadratic(*(xp.where(better, *pair) for pair in zip(model, line, strict=True)))
+    lost = xp.where(better, lost, 0.0)
     off = center - model.center
     middle = model.offset + (model.slope + model.curvature * off) * off
     slope = model.slope + 2 * model.curvature * off
     slope, curvature, middle = settled((slope, model.curvature, middle))
-    own = start.norms(rows[:, :w])
-    rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(rows.shape[1])) + y.radii[:, 0]
-    lost = abs(curvature) * (2 * own + rest) * rest
     level, products = start.squared(rows[:, :w])
     linear = slope[:, None] * rows
     bent = linear[:, w : start.count] + curvature[:, None] * products

@@ -177,7 +177,7 @@ class SmoothUnit(AbstractUnit):
         xp = namespace(lower, upper)
         lower, upper = settled((lower, upper))
         center = settled(lower / 2 + upper / 2)
-        linear = self._linear(center, lower, upper)
+        linear = self.linear(lower, upper)
         fine = self.defined(lower, upper)
         lower, upper, middle = (xp.where(fine, y, 1.0) for y in (lower, upper, center))
         radius = larger(upper - middle, middle - lower) * (1 + gamma(2)) + TINY
@@ -207,9 +207,10 @@ class SmoothUnit(AbstractUnit):
         *chosen, gap = (xp.where(known, each, 0.0) for each in chosen)
         return Quadratic(*settled((*chosen, xp.where(known, gap, math.inf))))
 
-    def _linear(self, center: Array, lower: Array, upper: Array) -> Quadratic:
+    def linear(self, lower: Array, upper: Array) -> Quadratic:
         """The lines as a quadratic without curvature."""
         (slope, low), (_, high) = self.lines(lower, upper)
+        center = settled(lower / 2 + upper / 2)
         start, half = slope * center, low / 2 + high / 2
         gap = high / 2 - low / 2 + gamma(4) * constant(abs(start) + abs(low) + abs(high))
         gap = gap + TINY * constant(abs(slope) + abs(center) + 2)

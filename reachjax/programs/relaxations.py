@@ -254,17 +254,20 @@ class BranchAndCut(AbstractRelaxation):
     Its affine form over the whole horizon, the linear program with all facts of the horizon, splits
     of that by the phases of units, each a linear program, and last products of facts, by
     semidefinite programs as in `CuttingPlanes`. The first three go back to the initial set and know
-    how all states depend on it. Where numbers are traced (inside `jax.jit`), where a window is
+    how all states depend on it. Of a loop with smooth units, whose forms are of the second degree,
+    the initial set, if it has no curved surface, is halved into cells instead, each with forms of
+    its own: what these leave out falls with the third power of the width. Where numbers are traced (inside `jax.jit`), where a window is
     given, and for ellipsoids, it is `CuttingPlanes`.
 
     Args:
         nodes: how many linear programs a facet may take before it gets products.
         products_by: the rounds in which these are added.
         remove_stable: whether neurons that bounds prove to be affine leave the basis.
+        cells: how many cells there may be; 1 for none, and the ladder instead.
 
     Raises:
-        TypeError: `nodes` is no whole number, or `products_by` is no `CuttingPlanes`.
-        ValueError: `nodes` is negative.
+        TypeError: `nodes` or `cells` is no whole number, or `products_by` is no `CuttingPlanes`.
+        ValueError: `nodes` is negative, or there is no cell.
 
     Source: branch and cut for unrolled networks as in Bunel, Turkaslan, Torr, Kohli, Kumar (NeurIPS
     2018), with the products of Burer (2009) for cuts.
@@ -273,12 +276,14 @@ class BranchAndCut(AbstractRelaxation):
     nodes: int = 10_000
     products_by: CuttingPlanes = CuttingPlanes()
     remove_stable: bool = True
+    cells: int = 1000
 
     linear_bounds: ClassVar[bool] = True
 
     def __post_init__(self):
         super().__post_init__()
         whole_number("BranchAndCut.nodes", self.nodes, 0)
+        whole_number("BranchAndCut.cells", self.cells, 1)
         require_kind(
             "BranchAndCut.products_by", self.products_by, CuttingPlanes, "of type CuttingPlanes"
         )

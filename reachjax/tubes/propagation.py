@@ -28,6 +28,7 @@ from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, AbstractTemplate, Template
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.by_branching import sets_by_branching
+from reachjax.tubes.by_cells import sets_by_cells
 from reachjax.tubes.by_forms import sets_by_forms
 from reachjax.tubes.by_programs import sets_by_programs
 from reachjax.tubes.steps import Reached, Setting, boxed
@@ -183,6 +184,9 @@ def _following(
         steps = sets_by_forms(loop, X0, box, template, horizon, start)
         return itertools.islice(steps, len(known), None)
     if window is None and isinstance(relaxation, BranchAndCut) and isinstance(template, Template):
+        if loop.curved and relaxation.cells > 1 and X0.parts[1] is None:
+            given = setting, relaxation.cells, X0, box, template, horizon
+            return sets_by_cells(*given, known=len(known))
         return sets_by_branching(setting, relaxation.nodes, X0, box, template, horizon, known)
     return sets_by_programs(setting, X0, template, horizon, window, known)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes.cells import grid, halves
+from reachjax.sets.cells import grid, halves
 from tests.closed_loops import autonomous, closed_loop, random_loop, recursion
 
 RECURSION = {"relaxation": rj.LocalBounds(), "window": 1}

@@ -15,7 +15,10 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.numerics.checks import whole_number
-from reachjax.sets import AbstractSet, Box, Intersection, Polytope
+from reachjax.sets.base import AbstractSet
+from reachjax.sets.box import Box
+from reachjax.sets.intersection import Intersection
+from reachjax.sets.polytope import Polytope
 
 TOUCHING = 1e-6
 """A cell that a set barely touches is enlarged by this part of its box."""
@@ -86,8 +89,41 @@ def halves_along(X: AbstractSet, box: Box, axis: int) -> list[Cell]:
     return _reached(X, [below, above])
 
 
+def from_tree(X: AbstractSet, axes: Sequence[int]) -> list[Cell]:
+    """The cells that halving a set again and again leaves.
+
+    Args:
+        X: the set, which no part is left out of.
+        axes: of the box around it, and then of the halves that the set reaches, each with all of
+            its own before the next: along which coordinate it is halved, or -1 if it is not.
+
+    Raises:
+        ValueError: an entry is missing, is left over, or is no coordinate.
+
+    Example:
+        >>> X = Box([0.0, 0.0], [1.0, 1.0])
+        >>> [cell.box.upper.tolist() for cell in from_tree(X, [1, -1, 0, -1, -1])]
+        [[1.0, 0.5], [0.5, 1.0], [1.0, 1.0]]
+    """
+    found, left = [], [Cell(X.bounding_box(), X)]
+    for axis in axes:
+        if not left or not -1 <= axis < X.dimension:
+            break
+        cell = left.pop()
+        if axis < 0:
+            found.append(cell)
+        else:
+            left += halves_along(X, cell.box, int(axis))[::-1]
+    else:
+        if not left:
+            return found
+    raise ValueError(f"axes must be those of a tree over {X.dimension} coordinates, but {axes} arrived")
+
+
 def _reached(X: AbstractSet, boxes: Iterable[Box]) -> list[Cell]:
     """What a set has in common with boxes, but for those that it surely does not reach."""
+    if isinstance(X, Box):
+        return [Cell(box, X.cut(box)) for box in boxes if not X.misses(box)]
     return [Cell(box, _within(X, box)) for box in boxes if not X.misses(box)]
 
 

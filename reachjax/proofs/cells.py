@@ -1,0 +1,76 @@
+"""Proofs of facets by affine forms over each cell of the initial set."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from reachjax.loops import ClosedLoop
+from reachjax.numerics.checks import floats_of, require_double_precision
+from reachjax.numerics.pytrees import pytree, static
+from reachjax.programs.unrolled import unrolled
+from reachjax.proofs.certificates import AbstractProof
+from reachjax.sets import AbstractSet
+from reachjax.sets.cells import from_tree
+
+
+@pytree
+class CellCertificate(AbstractProof):
+    """Proof of the offsets of one step, `directions x[t] <= bounds`, by forms over cells of `X0`.
+
+    The cells are what halving the box around the initial set again and again leaves, so that they
+    cover it whatever they are; of each, forms are made of nothing but the loop.
+
+    Attributes:
+        loop: the closed loop.
+        X0: the initial set.
+        directions: `(f, n_x)`, of the facets.
+        axes: `(nodes,)`, along which coordinate each part is halved, the initial set first and each
+            half with all of its own before the next; -1 where it is a cell.
+        k: how many steps after the initial set.
+        start: the time of the initial set.
+    """
+
+    loop: ClosedLoop
+    X0: AbstractSet
+    directions: Float[Array | np.ndarray, "f n_x"]
+    axes: Int[Array | np.ndarray, " nodes"]
+    k: int = static()
+    start: int = static()
+
+    def __repr__(self) -> str:
+        return f"CellCertificate(facets={len(self.bounds)}, cells={self.cells}, steps={self.k})"
+
+    @property
+    def cells(self) -> int:
+        """How many there are."""
+        return int(np.sum(np.asarray(self.axes) < 0))
+
+    def recheck(self, axes: Int[np.ndarray, " nodes"] | None = None) -> Float[np.ndarray, " f"]:
+        """Prove the offsets anew, cell by cell, with these or other cells.
+
+        Infinite where numbers overflow.
+
+        Raises:
+            ValueError: the axes are no tree: its cells would leave something out.
+
+        Example:
+            >>> import jax.numpy as jnp
+            >>> from reachjax import Box, ClosedLoop, Network, NonlinearPlant, Template, reach
+            >>> plant = NonlinearPlant(lambda x, u: x + 0.1 * jnp.sin(x) + u, states=1, inputs=1)
+            >>> loop = ClosedLoop(plant, Network(lambda x: -jnp.tanh(x), inputs=1, outputs=1))
+            >>> proof = reach(loop, Box([0.0], [1.0]), 2, Template.box(1)).proof(2)
+            >>> bool((proof.recheck() == proof.bounds).all())
+            True
+            >>> bool((proof.recheck([-1]) >= proof.bounds).all())  # one cell
+            True
+        """
+        require_double_precision(certificate=floats_of(self))
+        given = np.asarray(self.axes if axes is None else axes).tolist()
+        directions = np.broadcast_to(self.directions, (self.k, *self.directions.shape))
+        found = []
+        for cell in from_tree(jax.device_put(self.X0), given):
+            *_, last = unrolled(self.loop, cell.part, cell.box, directions, self.start)
+            found.append(np.where(np.isnan(last.offsets), np.inf, last.offsets))
+        return np.max(found, axis=0)

@@ -1,0 +1,253 @@
+"""Sets of a template around the states of smooth loops, by affine forms over cells of `X0`.
+
+What forms leave out of smooth functions falls with the third power of a cell's width. So the cell
+that decides the facet with the widest gap is halved, all steps being looked at together, until each
+bound is attained by a trajectory up to the gap that may stay open.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.loops.scenarios import Scenarios
+from reachjax.numerics.checks import is_concrete, owned
+from reachjax.programs.affine_steps import step_columns
+from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
+from reachjax.proofs.cells import CellCertificate
+from reachjax.proofs.proposal import SolverStatus
+from reachjax.sets import AbstractSet, Box, Polytope, Template
+from reachjax.sets.cells import Cell, halves_along
+from reachjax.tubes.ladder import FLAT, ROUNDED
+from reachjax.tubes.steps import Reached, Setting
+
+WORK = 1.5e11
+"""Products of all cells together, of which one core does some ten to the tenth in a second."""
+
+OVERHEAD = 2.5e7
+"""The products that a step costs beside those of its matrices."""
+
+LOOKED = 8
+"""After so many halvings, where cells say that facets are largest is simulated."""
+
+
+class _Node:
+    """A part of the initial set, with its halves or what forms over it say.
+
+    Args:
+        cell: the part.
+        steps: for each step what forms say.
+    """
+
+    def __init__(self, cell: Cell, steps: list[ByForms]):
+        self.cell, self.steps = cell, steps
+        self.offsets = np.array([step.offsets for step in steps])
+        self.axis, self.halves = -1, list[_Node]()
+
+    @property
+    def axes(self) -> list[int]:
+        """Along which coordinates it and its parts are halved, as `from_tree` takes them."""
+        return [self.axis, *(axis for half in self.halves for axis in half.axes)]
+
+
+def sets_by_cells(
+    setting: Setting,
+    most: int,
+    X0: AbstractSet,
+    box: Box,
+    template: Template,
+    horizon: int,
+    known: int = 0,
+) -> Iterator[Reached]:
+    """The smallest sets that are proved within the setting's gap and time, and so many cells.
+
+    Args:
+        setting: what all steps have in common.
+        most: how many cells there may be.
+        X0: the initial set.
+        box: around it.
+        template: what the sets look like.
+        horizon: how many steps there are.
+        known: how many of them are known.
+
+    Raises:
+        KeyboardInterrupt: somebody stopped the search for cells, after all sets but the last.
+        ValueError: states overflow.
+    """
+    began, interrupted = time.perf_counter(), False
+    directions = jnp.stack([template.at(k).directions for k in range(1, horizon + 1)])
+    fixed = jax.lax.stop_gradient((setting.loop, X0, directions))
+    search = _Search(setting, *fixed, most, known)
+    try:
+        search.run()
+    except KeyboardInterrupt:
+        interrupted = True
+    seconds = time.perf_counter() - began
+    for k in range(known, horizon):
+        if interrupted and k == horizon - 1:
+            raise KeyboardInterrupt
+        offsets, deciding = search.bounds[k], search.deciding[k]
+        bounds = owned(offsets)
+        if not is_concrete(setting.loop, X0, directions):
+            moving = _moving(setting, box, directions, [search.leaves[i] for i in deciding], k)
+            moving = jnp.where(jnp.isfinite(moving), moving, 0.0)
+            bounds = bounds + (moving - jax.lax.stop_gradient(moving))
+        facets = len(offsets)
+        proof = CellCertificate(
+            loop=setting.loop,
+            X0=X0,
+            directions=directions[k],
+            axes=np.array(search.axes),
+            codes=np.full(facets, int(SolverStatus.SOLVED)),
+            bounds=bounds,
+            witnesses=np.full(facets, np.nan),
+            witness_states=np.full((facets, 0), np.nan),
+            seconds=np.full(facets, seconds / facets / (horizon - known)),
+            k=k + 1,
+            start=setting.start,
+        )
+        yield Reached(Polytope(directions[k], bounds), proof, search.farthest(k), climb=False)
+
+
+class _Search:
+    """Cells so far, and what they prove.
+
+    Args:
+        setting: what all steps have in common.
+        loop: of numbers.
+        X0: the initial set.
+        directions: `(N, f, n_x)`.
+        most: how many cells there may be.
+        known: of how many steps nothing is asked.
+    """
+
+    def __init__(
+        self,
+        setting: Setting,
+        loop: ClosedLoop,
+        X0: AbstractSet,
+        directions: Float[Array, "N f n_x"],
+        most: int,
+        known: int,
+    ):
+        self._setting, self._X0, self._known = setting, X0, known
+        self._loop, self._directions = jax.device_get((loop, directions))
+        self._scenarios = Scenarios.of(loop, X0, len(directions), setting.start)
+        cell = Cell(X0.bounding_box(), X0)
+        self._root = self._made(cell)
+        self.leaves = [self._root]
+        self._note()
+        if not np.isfinite(self.bounds).all():
+            k = int(np.argmin(np.isfinite(self.bounds).all(axis=1))) + 1
+            raise ValueError(
+                f"the loop's states at t = {setting.start + k} overflow or are not numbers: check "
+                "the weights of loop.controller and the entries of loop.plant"
+            )
+        budget = WORK / _work(self._loop, len(directions)) if np.isinf(setting.deadline) else np.inf
+        self._left = min(2 * most - 2, budget)
+
+    def _made(self, cell: Cell) -> _Node:
+        given = self._loop, cell.part, cell.box, self._directions, self._setting.start
+        return _Node(cell, list(unrolled(*given)))
+
+    def _note(self) -> None:
+        every = np.array([leaf.offsets for leaf in self.leaves])
+        every = np.where(np.isnan(every), np.inf, every)
+        self.deciding, self.bounds = every.argmax(axis=0), every.max(axis=0)
+
+    @property
+    def axes(self) -> list[int]:
+        """The tree of all cells."""
+        return self._root.axes
+
+    def run(self) -> None:
+        """Halve cells until gaps are closed, or nothing is left."""
+        simulations = self._setting.simulations
+        if simulations is None:
+            return
+        least, most = self._simulated()
+        gap = self._setting.gap
+        floor = FLAT * (self.bounds - least) / 2
+        if gap:
+            floor = np.fmax(floor, ROUNDED / gap * abs(self.bounds))
+        for count in itertools.count():
+            if count % LOOKED == 0:
+                simulations.include(*(self.farthest(k) for k in range(len(self.bounds))))
+                least, most = self._simulated()
+            open_parts = (self.bounds - most) / np.fmax((most - least) / 2, floor)
+            open_parts[: self._known] = -np.inf
+            worst = np.unravel_index(open_parts.argmax(), open_parts.shape)
+            if open_parts[worst] <= gap or self._left < 2 or self._setting.late:
+                return
+            self._setting.note(f"{len(self.leaves)} cells, largest gap {open_parts[worst]:.1e}")
+            if not self._halve(int(self.deciding[worst])):
+                return
+            self._note()
+
+    def _simulated(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and largest simulated values of all facets."""
+        simulations = self._setting.simulations
+        assert simulations is not None  # else nothing is looked at
+        found = [simulations.values(k, rows) for k, rows in enumerate(self._directions, start=1)]
+        return np.array([each.least for each in found]), np.array([each.most for each in found])
+
+    def _halve(self, number: int) -> bool:
+        """Whether a leaf could be halved."""
+        leaf = self.leaves[number]
+        widths = np.asarray(leaf.cell.box.widths)
+        moves = np.where(widths > 0, leaf.steps[0].moves, -1.0)
+        axis = int((moves if moves.max() > 0 else widths).argmax())
+        if not widths[axis] > 0:
+            return False
+        halves = [self._made(half) for half in halves_along(self._X0, leaf.cell.box, axis)]
+        leaf.axis, leaf.halves, leaf.steps = axis, halves, []
+        self.leaves[number : number + 1] = halves
+        self._left -= len(halves)
+        return True
+
+    def farthest(self, k: int) -> Float[np.ndarray, "f s"]:
+        """Scenarios at which the deciding cells say that facets are largest after `k + 1` steps."""
+        found = []
+        for facet, number in enumerate(self.deciding[k]):
+            step, one = self.leaves[number].steps[k], slice(facet, facet + 1)
+            drawn = [values[one] for values in step.drawn]
+            found.append(self._scenarios.of_units(np.asarray(step.corners)[one], drawn))
+        return np.concatenate(found)
+
+
+def _work(loop: ClosedLoop, horizon: int) -> float:
+    """The products that one cell costs."""
+    more, between = step_columns(loop)
+    columns = loop.states**2 + between + more * np.arange(1, horizon + 1)
+    parameters = sum(np.size(leaf) for leaf in jax.tree.leaves(loop))
+    return float(np.sum(OVERHEAD + parameters * columns))
+
+
+def _moving(
+    setting: Setting,
+    box: Box,
+    directions: Float[Array, "N f n_x"],
+    deciding: list[_Node],
+    k: int,
+) -> Float[Array, " f"]:
+    """Numbers with the derivatives of what the deciding cells prove after `k + 1` steps."""
+    offsets: list[Array] = []
+    known: dict[int, Array] = {}
+    lower, upper = (np.asarray(jax.lax.stop_gradient(end)) for end in (box.lower, box.upper))
+    sides = np.where(upper > lower, upper - lower, 1.0)
+    for facet, leaf in enumerate(deciding):
+        if id(leaf) not in known:
+            ends = (np.asarray(end) for end in (leaf.cell.box.lower, leaf.cell.box.upper))
+            shares = ((end - lower) / sides for end in ends)
+            cell = Box(*(box.lower + share * (box.upper - box.lower) for share in shares))
+            given = setting.loop, cell, cell, directions, setting.start
+            known[id(leaf)] = unrolled_at_once(*given).offsets[k]
+        offsets.append(known[id(leaf)][facet])
+    return jnp.stack(offsets)

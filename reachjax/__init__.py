@@ -47,6 +47,7 @@ from reachjax.programs.relaxations import (
     PaperQC,
 )
 from reachjax.proofs.branches import BranchCertificate, Rung
+from reachjax.proofs.cells import CellCertificate
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.proofs.ellipsoids import EllipsoidCertificate
 from reachjax.proofs.facets import Certificate
@@ -121,6 +122,7 @@ __all__ = [
     "Box",
     "BranchAndCut",
     "BranchCertificate",
+    "CellCertificate",
     "Certificate",
     "ChangeOfBasis",
     "Clarabel",

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.units import AbstractUnit, Mark, SmoothUnit
+from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
 from reachjax.programs.initial import Ends, InitialColumns, constant, product_facts
@@ -50,15 +50,12 @@ class ByForms(NamedTuple):
             units and what cuts the initial set.
         drawn: for each step so far the values `(m, d)` of disturbances there; nothing of compiled
             code.
-        moves: `(n_x,)`, how much each coordinate of the initial set moves what units that are bent
-            get in the first step; nothing of compiled code.
     """
 
     offsets: Float[Array | np.ndarray, "*N m"]
     slopes: Float[Array | np.ndarray, "*N units"]
     corners: Float[Array | np.ndarray, "*N m n_x"]
     drawn: tuple[Float[np.ndarray, "m d"], ...] = ()
-    moves: Float[np.ndarray, " n_x"] | tuple[()] = ()
 
 
 def unrolled(
@@ -93,7 +90,6 @@ def unrolled(
         start = InitialColumns.of(X0, box, loop.curved)
         state = AffineForms.beginning(start)
     free: list[np.ndarray] = []
-    moves = np.zeros(loop.states)
     for k, rows in enumerate(np.asarray(directions)):
         with np.errstate(all="ignore"):
             given = None if slopes is None else np.asarray(slopes[k])
@@ -103,19 +99,7 @@ def unrolled(
             found = _bounds(forms, units, start)
         here = [layer.places for layer in units if layer.unit.free]
         free.append(np.concatenate([np.zeros(0, int), *here]))
-        moves = moves if k else moved_by(units, loop.states)
-        drawn = tuple(np.sign(forms.columns[:, each]) for each in free)
-        yield found._replace(drawn=drawn, moves=moves)
-
-
-def moved_by(units: Sequence[UnitForms], n: int) -> Float[np.ndarray, " n"]:
-    """How much each of the first columns moves what units get, those that are bent."""
-    found = np.zeros(n)
-    for layer in units:
-        bent = isinstance(layer.unit, SmoothUnit) | (layer.places >= 0)
-        sizes = abs(layer.inputs.columns[:, :n])
-        found += sizes[np.broadcast_to(bent, layer.places.shape)].sum(axis=0)
-    return found
+        yield found._replace(drawn=tuple(np.sign(forms.columns[:, each]) for each in free))
 
 
 @partial(jax.jit, static_argnames="t")

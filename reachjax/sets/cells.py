@@ -117,7 +117,9 @@ def from_tree(X: AbstractSet, axes: Sequence[int]) -> list[Cell]:
     else:
         if not left:
             return found
-    raise ValueError(f"axes must be those of a tree over {X.dimension} coordinates, but {axes} arrived")
+    raise ValueError(
+        f"axes must be those of a tree over {X.dimension} coordinates, but {axes} arrived"
+    )
 
 
 def _reached(X: AbstractSet, boxes: Iterable[Box]) -> list[Cell]:

@@ -141,6 +141,8 @@ class _Search:
         self._loop, self._directions = jax.device_get((loop, directions))
         self._scenarios = Scenarios.of(loop, X0, len(directions), setting.start)
         cell = Cell(X0.bounding_box(), X0)
+        sides = np.asarray(cell.box.widths)
+        self._sides = np.where(sides > 0, sides, 1.0)  # a side without length is not halved
         self._root = self._made(cell)
         self.leaves = [self._root]
         self._note()
@@ -199,11 +201,10 @@ class _Search:
         return np.array([each.least for each in found]), np.array([each.most for each in found])
 
     def _halve(self, number: int) -> bool:
-        """Whether a leaf could be halved."""
+        """Whether a leaf could be halved, along the side of which most is left."""
         leaf = self.leaves[number]
-        widths = np.asarray(leaf.cell.box.widths)
-        moves = np.where(widths > 0, leaf.steps[0].moves, -1.0)
-        axis = int((moves if moves.max() > 0 else widths).argmax())
+        widths = np.asarray(leaf.cell.box.widths) / self._sides
+        axis = int(widths.argmax())
         if not widths[axis] > 0:
             return False
         halves = [self._made(half) for half in halves_along(self._X0, leaf.cell.box, axis)]

@@ -20,8 +20,8 @@ from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.loops.units import SmoothUnit
 from reachjax.numerics.checks import described, whole_number, wrapped
-from reachjax.programs.unrolled import moved_by
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, Box
 from reachjax.sets.balance import balanced
@@ -350,7 +350,10 @@ def _axis(ladder: Ladder, item: Requirement) -> int:
     """The coordinate that moves the inputs of the first step's units most, or what is required."""
     horizon = ladder.horizon
     n = len(horizon.start.center)
-    size = moved_by(horizon.steps[0] if horizon.steps else (), n)
+    size = np.zeros(n)
+    for layer in horizon.steps[0] if horizon.steps else ():
+        bent = isinstance(layer.unit, SmoothUnit) | (layer.places >= 0)
+        size += abs(layer.inputs.columns[:, :n])[np.broadcast_to(bent, layer.places.shape)].sum(0)
     if not size.any():
         C = np.asarray(item.region.facets[0])
         size = abs(C @ horizon.start.spread).sum(axis=0)

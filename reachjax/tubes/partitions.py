@@ -31,8 +31,8 @@ from reachjax.numerics.checks import (
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.sets import AbstractSet, Template
-from reachjax.solvers import AbstractSolver, Auto
 from reachjax.sets.cells import grid, halves
+from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.propagation import GAP, SAMPLES
 from reachjax.tubes.reach import ReachTube, reach
 from reachjax.tubes.seals import Seal, require_sealed, seal_of

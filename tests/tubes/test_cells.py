@@ -1,0 +1,128 @@
+"""Sets of smooth loops by cells of the initial set: what they prove, and what cannot fool them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+
+PERIOD = 0.1
+
+
+def pendulum(x, u):
+    return jnp.array([x[0] + PERIOD * x[1], x[1] + PERIOD * (5 * jnp.sin(x[0]) + u[0])])
+
+
+def damped(x, u):
+    return 0.9 * x + 0.1 * jnp.sin(x) + jnp.ones(len(x)) * u[0]
+
+
+def loop_of(states: int) -> rj.ClosedLoop:
+    rng = np.random.default_rng(states)
+    W = [rng.normal(size=(6, states)), rng.normal(size=(1, 6))]
+    net = rj.MLP.from_layers([(W[0], np.zeros(6)), (W[1] / 4, [0.0])], activation=rj.Tanh())
+    f = pendulum if states == 2 else damped
+    return rj.ClosedLoop(rj.NonlinearPlant(f, states, 1), net, rj.Box([-1.0], [1.0]))
+
+
+STARTS = {
+    "one": rj.Box([-0.5], [0.7]),
+    "two": rj.Box([0.1, -0.2], [0.5, 0.3]),
+    "flat": rj.Box([0.1, 0.2], [0.5, 0.2]),
+    "triangle": rj.Polytope([[-1, 0], [0, -1], [1, 1]], [0.0, 0.0, 0.6]),
+    "three": rj.Box([-0.3, 0.0, 0.1], [0.3, 0.4, 0.2]),
+}
+
+
+@pytest.fixture(scope="module", params=list(STARTS))
+def tube(request) -> rj.ReachTube:
+    X0 = STARTS[request.param]
+    relaxation = rj.BranchAndCut(cells=24)
+    return rj.reach(loop_of(X0.dimension), X0, 3, rj.Template.box(X0.dimension), relaxation)
+
+
+def test_no_state_is_outside(tube):
+    states = np.asarray(tube.simulate(5000, seed=1))
+    for t, region in enumerate(tube.sets):
+        assert np.asarray(region.contains(states[:, t], 1e-12)).all()
+
+
+def test_cells_prove_no_less_than_one_cell_does(tube):
+    for t in (1, 2, 3):
+        proof = tube.proof(t)
+        assert isinstance(proof, rj.CellCertificate)
+        assert 1 <= proof.cells <= 24
+        assert (proof.recheck() == proof.bounds).all()
+        assert (proof.recheck([-1]) >= proof.bounds - 1e-12).all()
+
+
+@pytest.mark.parametrize(
+    "axes", [[], [0], [0, -1], [0, -1, -1, -1], [7, -1, -1], [-2], [-1, -1], [0, 0, -1, -1]]
+)
+def test_what_leaves_something_out_is_no_tree(tube, axes):
+    with pytest.raises(ValueError, match="axes must be those of a tree"):
+        tube.proof(1).recheck(axes)
+
+
+def test_any_tree_is_sound(tube):
+    rng, n = np.random.default_rng(0), tube.loop.states
+    for _ in range(3):
+        axes = [int(rng.integers(n)), int(rng.integers(n)), -1, -1, -1]
+        try:
+            found = tube.proof(3).recheck(axes)
+        except ValueError:  # the set reaches one half only
+            continue
+        assert (found >= np.asarray(tube.proof(3).witnesses) - 1e-12).all()
+
+
+def test_a_gap_that_may_stay_open_takes_fewer_cells():
+    given = loop_of(2), STARTS["two"], 3, rj.Template.box(2)
+    few, many = (rj.reach(*given, gap=gap).proof(3).cells for gap in (0.1, 1e-4))
+    assert few < many
+
+
+def test_one_cell_climbs_the_ladder():
+    tube = rj.reach(
+        loop_of(2), STARTS["two"], 2, rj.Template.box(2), rj.BranchAndCut(cells=1, nodes=10)
+    )
+    assert isinstance(tube.proof(2), rj.BranchCertificate)
+
+
+def test_a_tube_goes_on():
+    tube = rj.reach(loop_of(2), STARTS["two"], 2, rj.Template.box(2)).extended(2)
+    whole = rj.reach(loop_of(2), STARTS["two"], 4, rj.Template.box(2))
+    np.testing.assert_allclose(tube.sets[4].b, whole.sets[4].b, atol=1e-3)
+
+
+def test_what_is_interrupted_keeps_what_is_proved(monkeypatch):
+    def stopped(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("reachjax.tubes.by_cells._Search.run", stopped)
+    with pytest.raises(rj.Interrupted) as caught:
+        rj.reach(loop_of(2), STARTS["two"], 3, rj.Template.box(2))
+    assert caught.value.tube.horizon == 2
+
+
+def test_derivatives_are_those_of_what_is_proved():
+    def size(lower, gravity):
+        def f(gravity, x, u):
+            return jnp.array(
+                [x[0] + PERIOD * x[1], x[1] + PERIOD * (gravity * jnp.sin(x[0]) + u[0])]
+            )
+
+        plant = rj.NonlinearPlant(jax.tree_util.Partial(f, gravity), 2, 1)
+        loop = rj.ClosedLoop(plant, loop_of(2).controller, rj.Box([-1.0], [1.0]))
+        relaxation = rj.BranchAndCut(cells=16)
+        tube = rj.reach(loop, rj.Box(lower, [0.5, 0.3]), 3, rj.Template.box(2), relaxation)
+        return jnp.sum(tube.sets[3].b)
+
+    at = jnp.array([0.1, -0.2]), jnp.array(5.0)
+    slopes, h = jax.grad(size, argnums=(0, 1))(*at), 1e-5
+    for i in range(2):
+        step = h * jnp.eye(2)[i]
+        along = (size(at[0] + step, at[1]) - size(at[0] - step, at[1])) / (2 * h)
+        np.testing.assert_allclose(slopes[0][i], along, rtol=1e-5, atol=1e-8)
+    along = (size(at[0], at[1] + h) - size(at[0], at[1] - h)) / (2 * h)
+    np.testing.assert_allclose(slopes[1], along, rtol=1e-5)

@@ -159,19 +159,26 @@ def test_derivatives_are_central_differences(name, relaxation):
         tube = rj.reach(loop, X0, HORIZON, template, relaxation, samples=20, gap=1e-7)
         return sum(rj.log_widths(X).sum() for X in tube.sets[1:])
 
+    def size_of_the_same_cells(given):  # a step may turn the choice of the next cell to halve
+        sets = (X.replace(b=p.replace(loop=given[0], X0=given[1]).recheck()) for X, p in reached)
+        return sum(rj.log_widths(X).sum() for X in sets)
+
+    tube = rj.reach(loop, X0, HORIZON, template, relaxation, samples=20, gap=1e-7)
+    reached = list(zip(tube.sets[1:], tube.certificates[1:], strict=True))
+    celled = all(hasattr(proof, "axes") for _, proof in reached)
+    size_near = size_of_the_same_cells if celled else size
     if isinstance(X0, rj.Ellipsoid):  # whose shape stays symmetric
         fixed, X0 = X0, X0.center
-        sized, size = size, lambda given: sized((given[0], fixed.replace(center=given[1])))
+        sized = size
+        size = size_near = lambda given: sized((given[0], fixed.replace(center=given[1])))
     flat, restore = ravel_pytree((loop, X0))
     slopes = ravel_pytree(jax.grad(size)((loop, X0)))[0]
     rng = np.random.default_rng(0)
     for _ in range(3):
         direction, step = rng.normal(size=flat.shape), 1e-6
-        ends = [size(restore(flat + sign * step * direction)) for sign in (1, -1)]
+        ends = [size_near(restore(flat + sign * step * direction)) for sign in (1, -1)]
         difference = (ends[0] - ends[1]) / (2 * step)
-        # ranges of rectifiers that linear programs found have the derivatives of their forms
-        mixed = name == "boxed" and relaxation == rj.BranchAndCut()
-        assert slopes @ direction == pytest.approx(float(difference), rel=0.02 if mixed else 1e-4)
+        assert slopes @ direction == pytest.approx(float(difference), rel=1e-4)
 
 
 def test_a_remainder_that_is_infinite_says_where_and_what_to_do():

@@ -361,7 +361,8 @@ def split(scenarios: Any, n_x: int, n_w: int, n_v: int) -> Scenario:
     states, rest = scenarios[..., :n_x], scenarios[..., n_x:]
     if n_w + n_v == 0:
         return Scenario(states, None, None)
-    drawn = rest.reshape(*rest.shape[:-1], -1, n_w + n_v)
+    steps = rest.shape[-1] // (n_w + n_v)  # of no scenarios too
+    drawn = rest.reshape(*rest.shape[:-1], steps, n_w + n_v)
     w, v = drawn[..., :n_w], drawn[..., n_w:]
     return Scenario(states, w if n_w else None, v if n_v else None)
 

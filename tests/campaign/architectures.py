@@ -6,6 +6,8 @@ they cover 1 to 13 states, 0 to 3 hidden layers, every kind of set, template, re
 
 from dataclasses import dataclass
 
+from tests.campaign.kinds import KINDS, Kind
+
 LOCAL = (
     "rj.LocalBounds()",
     "rj.LocalBounds(repeated=False)",
@@ -70,7 +72,7 @@ BOX, BALL = "rj.Template.box({n})", "rj.EllipsoidTemplate()"
 SHAPED = "rj.EllipsoidTemplate({shape})"
 
 ARCHITECTURES = (
-    # the default number of cases takes one block of each of these eight
+    # the default number of cases takes half a block of each of these eight
     Architecture("small, box", **SMALL, region="box", template=BOX, relaxations=LOCAL + PAPER),
     Architecture(
         "small, polytope",
@@ -289,7 +291,16 @@ ARCHITECTURES = (
 BLOCK = 25
 """So many consecutive cases share an architecture."""
 
+QUICK, QUICK_KINDS = 8, 4
+EVERY = (
+    *ARCHITECTURES[:QUICK],
+    *KINDS[:QUICK_KINDS],
+    *ARCHITECTURES[QUICK:],
+    *KINDS[QUICK_KINDS:],
+)
+"""Chains of ReLUs under affine plants, and loops of every other kind."""
 
-def architecture(number: int) -> Architecture:
+
+def architecture(number: int) -> Architecture | Kind:
     """That of a case."""
-    return ARCHITECTURES[number // BLOCK % len(ARCHITECTURES)]
+    return EVERY[number // BLOCK % len(EVERY)]

@@ -91,6 +91,27 @@ class Case:
         return "BranchAndCut" in self.parts["relaxation"]
 
     @property
+    def nonempty(self) -> bool:
+        """Whether a point of its initial set is known."""
+        return self.initial.inner is not None
+
+    @property
+    def tried(self) -> dict[str, str]:
+        """What it is, by kind of thing."""
+        return {
+            "architecture": self.shapes.name,
+            "set": self.initial.kind,
+            "template": self.parts["template"].split("([[")[0].split("(loop")[0],
+            "relaxation": self.parts["relaxation"],
+            "window": str(self.window),
+            "options": self.options.removeprefix(", ") or "none",
+            "solver": self.parts["solver"] if self.fault is None else "faulty",
+            "fault": str(self.fault),
+            "scales": self.scales.kind,
+            "time": "varying" if self.shapes.varying else "constant",
+        }
+
+    @property
     def rng(self) -> np.random.Generator:
         """What points and thresholds are drawn from."""
         return np.random.default_rng([self.seed, self.number, 1])
@@ -116,6 +137,7 @@ def drawn(number: int, seed: int = 0) -> Case:
     """The case of a number."""
     rng = np.random.default_rng([seed, number])
     shapes = architecture(number)
+    assert isinstance(shapes, Architecture)  # others are drawn by `kinds`
     scales = random_scales(rng, shapes.states, shapes.inputs)
     initial = random_region(rng, shapes.region, scales.states, shapes.facets)
     region = initial.region

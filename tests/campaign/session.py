@@ -11,8 +11,8 @@ import pytest
 from tests.campaign.outcomes import Outcome
 from tests.campaign.tables import report, summary
 
-DEFAULT = range(0, 200, 2)
-"""Half of one block of each of the first eight architectures."""
+DEFAULT = range(0, 300, 2)
+"""Half of one block of each of the first twelve architectures."""
 
 PROPERTY = "campaign"
 

@@ -13,16 +13,15 @@ import json
 import jax
 import pytest
 
-from tests.campaign.architectures import ARCHITECTURES, BLOCK, architecture
-from tests.campaign.cases import drawn
-from tests.campaign.claims import tried
+from tests.campaign import cases, claims, kinds, of_kinds
+from tests.campaign.architectures import BLOCK, EVERY, architecture
 from tests.campaign.outcomes import Outcome
 from tests.campaign.session import PROPERTY, Journal, numbers
 
 MOST_PRINTED = 3
 """So many failing cases of a block are printed; the report has the others."""
 
-LOOPS = [shapes.loop for shapes in ARCHITECTURES]
+LOOPS = [shapes.loop for shapes in EVERY]
 
 
 def pytest_generate_tests(metafunc):
@@ -40,7 +39,7 @@ def _block(number: int) -> int:
 
 def _shapes(number: int) -> tuple[int, int]:
     shapes = architecture(number)
-    return LOOPS.index(shapes.loop), ARCHITECTURES.index(shapes)
+    return LOOPS.index(shapes.loop), EVERY.index(shapes)
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +67,20 @@ def test_nothing_that_is_said_is_false(block, journal, finished, compiled, reque
     for number in block:
         outcome = finished.get(number)
         if outcome is None:
-            outcome = tried(drawn(number, journal.seed))
+            outcome = _tried(number, journal.seed)
             journal.add(outcome)
         outcomes.append(outcome)
         request.node.user_properties.append((PROPERTY, json.dumps(outcome.record())))
     failing = [outcome for outcome in outcomes if outcome.failures]
     if failing:
         pytest.fail(_said(failing, len(block)), pytrace=False)
+
+
+def _tried(number: int, seed: int) -> Outcome:
+    shapes = architecture(number)
+    if isinstance(shapes, kinds.Kind):
+        return of_kinds.tried(kinds.drawn(shapes, number, seed))
+    return claims.tried(cases.drawn(number, seed))
 
 
 def _said(failing: list[Outcome], count: int) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from tests.campaign.cases import Case
 from tests.campaign.errors import message_kind, place, unclear
+from tests.campaign.kinds import KindCase
 from tests.campaign.outcomes import Failure, Outcome
 
 DOUBTS = re.compile(r"scale|seem|may be|perhaps|gave up|thin")
@@ -23,23 +24,9 @@ class Trial:
         case: to be run.
     """
 
-    def __init__(self, case: Case):
+    def __init__(self, case: Case | KindCase):
         self.case = case
-        self.outcome = Outcome(
-            case.number,
-            {
-                "architecture": case.shapes.name,
-                "set": case.initial.kind,
-                "template": case.parts["template"].split("([[")[0].split("(loop")[0],
-                "relaxation": case.parts["relaxation"],
-                "window": str(case.window),
-                "options": case.options.removeprefix(", ") or "none",
-                "solver": case.parts["solver"] if case.fault is None else "faulty",
-                "fault": str(case.fault),
-                "scales": case.scales.kind,
-                "time": "varying" if case.shapes.varying else "constant",
-            },
-        )
+        self.outcome = Outcome(case.number, case.tried)
 
     def run(self, checked: Callable) -> Outcome:
         """Check claims by `checked(trial)`; nothing is raised but what ends the process."""
@@ -77,7 +64,7 @@ class Trial:
     def _untrue(self, error: Exception) -> str | None:
         """Whether an error says of a set with points in it that it has none, or is unbounded."""
         text = str(error)
-        if "X0" not in text or self.case.initial.inner is None or "overflow" in text:
+        if "X0" not in text or not self.case.nonempty or "overflow" in text:
             return None
         said = [word for word in ("empty", "unbounded", "no point in common") if word in text]
         return f"untrue: X0 is said to be {said[0]}" if said and not DOUBTS.search(text) else None

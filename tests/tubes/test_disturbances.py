@@ -322,3 +322,9 @@ def loop_with(W=UNIT, V=None, plant=PLANT):
 def test_mistakes_are_named(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+def test_no_scenarios_are_split_into_parts_of_none():
+    loop, _ = double_integrator()
+    states, w, v = loop.split(np.zeros((0, 2 + 3 * 4)))
+    assert (states.shape, w.shape, v.shape) == ((0, 2), (0, 3, 2), (0, 3, 2))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 import itertools
+import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -17,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float
 from reachjax.loops.functions import Function
 from reachjax.loops.units import AbstractActivation, AtUnit, ReLU, evaluate
 from reachjax.numerics.checks import Numbers, same_size, whole_number
+from reachjax.numerics.files import existing_file
 from reachjax.numerics.pytrees import Replaceable, converted, pytree, static
 
 
@@ -142,7 +144,7 @@ class MLP(AbstractNetwork):
             ValueError: it holds something else than a chain of linear layers, or computes something
                 else, or the order of its layers or the activation cannot be told.
         """
-        from reachjax.loops.flax_layers import flax_layers, read_activation
+        from reachjax.loops.formats.flax_layers import flax_layers, read_activation
 
         known = read_activation(activation)
         read = flax_layers(source, known, module)
@@ -198,6 +200,62 @@ class Network(AbstractNetwork):
             sizes = (whole_number("Network.inputs", inputs, 1),)
             f = Function.of(f, sizes, whole_number("Network.outputs", outputs, 1), "Network.f")
         self._set(f=f)
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> Network:
+        """A network from a file, by its ending.
+
+        ONNX (`.onnx`, see `from_onnx`); MATLAB (`.mat`, version 7 or older) with variables `W`, `b`
+        and `act_fcns`, in a struct or not; NNet (`.nnet`), whose inputs are clipped and scaled; and
+        plain text as Sherlock has it, of ReLUs throughout, or as POLAR has it, with names of
+        activations.
+
+        Args:
+            path: of the file.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ImportError: the package `onnx` is missing.
+            ValueError: it cannot be read; the error says where.
+
+        Example:
+            >>> import pathlib, tempfile
+            >>> path = pathlib.Path(tempfile.mkdtemp()) / "absolute.txt"
+            >>> sizes, rows = "1 1 1 2", "1 0  -1 0  1 1 0"  # each row of weights, and its bias
+            >>> _ = path.write_text(f"{sizes} relu affine {rows}")
+            >>> Network.from_file(path)([-3.0]).tolist()  # |x|
+            [3.0]
+        """
+        from reachjax.loops.formats.chains import read_chain
+
+        path = existing_file("path", path)
+        if path.suffix == ".onnx":
+            return cls.from_onnx(path)
+        chain = read_chain(path)
+        return cls(chain, *chain.sizes)
+
+    @classmethod
+    def from_onnx(cls, path: str | os.PathLike[str]) -> Network:
+        """A network from an ONNX file, such as `torch.onnx.export` writes them.
+
+        Its weights are taken as they stand, and what is certified is the function of real numbers
+        that they define: a runtime in 32-bit floats differs from it by its own rounding, some 1e-7
+        of the sizes of numbers within the network. Input and output are flattened; dimensions that
+        the file leaves open, as of a batch, are 1.
+
+        Args:
+            path: of the file.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ImportError: the package `onnx` is missing.
+            TypeError: an operator's function has no bounds.
+            ValueError: it is no ONNX file, has several inputs or outputs, or an operator that is
+                not known.
+        """
+        from reachjax.loops.formats.onnx_graphs import read_graph
+
+        return cls(*read_graph(existing_file("path", path)))
 
     def __repr__(self) -> str:
         return f"Network(inputs={self.inputs}, outputs={self.outputs})"

@@ -1,0 +1,23 @@
+"""Paths that users pass in."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from reachjax.numerics.checks import require_kind
+
+
+def existing_file(name: str, path: Any) -> Path:
+    """The path of a file.
+
+    Raises:
+        FileNotFoundError: there is none.
+        TypeError: it is no path.
+    """
+    require_kind(name, path, (str, os.PathLike), "the path of a file")
+    found = Path(path)
+    if not found.is_file():
+        raise FileNotFoundError(f"{name} must be that of a file, but there is none at {found}")
+    return found

@@ -84,6 +84,7 @@ from reachjax.training import (
 )
 from reachjax.tubes.decisions import decide
 from reachjax.tubes.largest import LargestSet, largest_set
+from reachjax.tubes.loading import load
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
 from reachjax.tubes.plotting import plot_cells, plot_set, plot_tube
 from reachjax.tubes.reach import Interrupted, ReachTube, reach, reach_step
@@ -176,6 +177,7 @@ __all__ = [
     "failures",
     "keep_compilations",
     "largest_set",
+    "load",
     "log_volume",
     "log_widths",
     "plot_cells",

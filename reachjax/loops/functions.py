@@ -115,6 +115,16 @@ class Function:
         """The value, for arrays of JAX."""
         return _restored(self.structure, self.parameters)(*inputs)
 
+    def stored(self) -> tuple[Callable, Sizes, int]:
+        """The function with its parameters, and its sizes: what a file needs."""
+        function = _restored(self.structure, self.parameters)
+        return function, self.structure.inputs, self.structure.outputs
+
+    @classmethod
+    def restored(cls, parts: tuple[Callable, Sizes, int]) -> Function:
+        """From what was stored."""
+        return cls.of(*parts, name="the function of a file")
+
     def propagate(self, inputs: Sequence[Any], unit: AtUnit) -> Any:
         """The value over any kind of number, with `unit` at each layer of units."""
         if unit is evaluate and all(isinstance(each, jax.Array) for each in inputs):

@@ -21,3 +21,17 @@ def existing_file(name: str, path: Any) -> Path:
     if not found.is_file():
         raise FileNotFoundError(f"{name} must be that of a file, but there is none at {found}")
     return found
+
+
+def writable(name: str, path: Any) -> Path:
+    """The path of a file that may be written.
+
+    Raises:
+        FileNotFoundError: its folder does not exist.
+        TypeError: it is no path.
+    """
+    require_kind(name, path, (str, os.PathLike), "the path of a file")
+    found = Path(path)
+    if not found.parent.is_dir():
+        raise FileNotFoundError(f"{name} must lie in a folder, but there is none at {found.parent}")
+    return found

@@ -7,6 +7,7 @@ programs, which any executor may run.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from typing import Any
@@ -28,11 +29,13 @@ from reachjax.numerics.checks import (
     whole_number,
     wrapped,
 )
+from reachjax.numerics.files import writable
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.sets import AbstractSet, Template
 from reachjax.sets.cells import grid, halves
 from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.kept import keep
 from reachjax.tubes.propagation import GAP, SAMPLES
 from reachjax.tubes.reach import ReachTube, reach
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
@@ -64,6 +67,11 @@ class PartitionedTube(Replaceable):
     def __post_init__(self):
         self.require_sealed()
 
+    @classmethod
+    def sealed(cls, X0: AbstractSet, tubes: tuple[ReachTube, ...]) -> PartitionedTube:
+        """The tubes of cells of this set, which were proved together."""
+        return cls(X0, tubes, seal_of(X0, [tube.seal for tube in tubes]))
+
     def require_sealed(self) -> None:
         """Raise an error unless both parts are those that `reach_partitioned` returned together.
 
@@ -79,6 +87,12 @@ class PartitionedTube(Replaceable):
     def horizon(self) -> int:
         """The number of steps."""
         return self.tubes[0].horizon
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Keep the tubes of all cells in one file, as `ReachTube.save` does."""
+        self.require_sealed()
+        first = self.tubes[0]
+        keep(writable("path", path), self, first.loop, self.X0, first.horizon, first.start)
 
     def sets(self, t: int) -> tuple[AbstractSet, ...]:
         """One set of each cell: every state at time `t` is surely in one of them."""
@@ -198,7 +212,7 @@ def reach_partitioned(
     finally:
         if own is not None:
             own.shutdown(cancel_futures=True)
-    return PartitionedTube(X0, tuple(tubes), seal_of(X0, [tube.seal for tube in tubes]))
+    return PartitionedTube.sealed(X0, tuple(tubes))
 
 
 class _Run:

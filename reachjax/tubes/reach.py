@@ -6,6 +6,7 @@ recheck. A tube repeats it, each set being the next one's set of states (equatio
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,12 +15,14 @@ from jaxtyping import Array, Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.checks import floats_of, owned, require_double_precision, whole_number
+from reachjax.numerics.files import writable
 from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.kept import keep
 from reachjax.tubes.propagation import (
     GAP,
     SAMPLES,
@@ -102,6 +105,23 @@ class ReachTube(Replaceable):
         if certificate is None:
             raise ValueError(f"certificates are for t = 1 .. {self.horizon}, but {t} was asked for")
         return certificate
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Keep the tube in a file, certificates included, from which `reachjax.load` reads it.
+
+        The file is a zip of numpy's arrays with a description in JSON; nothing in it is executed.
+        A loop with a function that a user wrote cannot be kept: it is left out, and has to be given
+        again to `load`.
+
+        Args:
+            path: of the file; one that is there is replaced.
+
+        Raises:
+            OSError: it cannot be written.
+            ValueError: a part of the tube was changed.
+        """
+        self.require_sealed()
+        keep(writable("path", path), self, self.loop, self.sets[0], self.horizon, self.start)
 
     def simulate(self, samples: int = SAMPLES, seed: int = 0) -> Float[Array, "c h+1 n_x"]:
         """Trajectories from corners of the initial set and `samples` points drawn from it.

@@ -1,0 +1,270 @@
+"""The package's own objects as files: arrays, and a description of what they are part of.
+
+A file is a zip of numpy's arrays (`.npz`) with a document in JSON that says how they make up
+objects. Nothing in it is executed: classes are looked up by name, and in this package only.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import enum
+import hashlib
+import importlib.metadata
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+VERSION = 1
+"""Of the format: files of another one are refused."""
+
+PACKAGE = __name__.partition(".")[0]
+DOCUMENT = "document"
+PLAIN = bool | int | float | str | None
+
+BROKEN = (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error)
+"""What reading a file that is cut off, or not one of these, may end in."""
+
+
+class UnstorableError(Exception):
+    """That an object is none of the package's, such as a function that a user wrote."""
+
+
+class Writer:
+    """Objects on their way into a file; what is there more than once is written once.
+
+    Args:
+        outside: a class whose objects are left out where they cannot be stored.
+
+    Attributes:
+        arrays: so far.
+        left_out: whether an object of that class was.
+    """
+
+    def __init__(self, outside: type):
+        self.arrays: list[np.ndarray] = []
+        self.left_out = False
+        self._outside = outside
+        self._known: dict[int, tuple[Any, int]] = {}
+
+    def described(self, value: Any) -> Any:
+        """A value as plain data, its arrays by their numbers.
+
+        Raises:
+            UnstorableError: it holds an object that is none of the package's.
+        """
+        if isinstance(value, enum.Enum):
+            return {"enum": _name(type(value)), "member": value.name}
+        if value is None or isinstance(value, PLAIN):
+            return value
+        if isinstance(value, bytes):
+            return {"bytes": base64.b64encode(value).decode()}
+        if isinstance(value, np.ndarray | np.generic | jax.Array):
+            return {"array": self._placed(value), "on": "device" * isinstance(value, jax.Array)}
+        if isinstance(value, self._outside):
+            try:
+                return self._object(value)
+            except UnstorableError:
+                self.left_out = True
+                return {"outside": _name(type(value))}
+        if isinstance(value, tuple) and hasattr(value, "_fields"):
+            parts = [self.described(each) for each in value]
+            return {"named": _name(type(value)), "parts": parts}
+        if isinstance(value, tuple | list):
+            return {type(value).__name__: [self.described(each) for each in value]}
+        if isinstance(value, Mapping):
+            items = [[self.described(key), self.described(each)] for key, each in value.items()]
+            return {"mapping": items}
+        if hasattr(type(value), "stored"):
+            return {"stored": _name(type(value)), "as": self.described(value.stored())}
+        if dataclasses.is_dataclass(value):
+            return self._object(value)
+        raise UnstorableError(f"{value!r} cannot be stored")
+
+    def _placed(self, array: Any) -> int:
+        if id(array) not in self._known:
+            self._known[id(array)] = array, len(self.arrays)  # kept alive: numbers stay its own
+            self.arrays.append(np.asarray(array))
+        return self._known[id(array)][1]
+
+    def _object(self, value: Any) -> Any:
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        found = {name: self.described(each) for name, each in fields.items()}
+        return {"object": _name(type(value)), "fields": found}
+
+
+def _name(kind: type) -> str:
+    """A class of the package by name.
+
+    Raises:
+        UnstorableError: it is another one.
+    """
+    if kind.__module__.partition(".")[0] != PACKAGE:
+        raise UnstorableError(f"{kind.__qualname__} of {kind.__module__} cannot be stored")
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _class(name: str) -> Any:
+    module, _, path = name.partition(":")
+    if module.partition(".")[0] != PACKAGE:
+        raise ValueError(f"it names {name}, which is not of {PACKAGE}")
+    try:
+        found = importlib.import_module(module)
+        for part in path.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError):
+        raise ValueError(f"it names {name}, which this {PACKAGE} does not have") from None
+    if not isinstance(found, type):
+        raise ValueError(f"it names {name}, which is no class")
+    return found
+
+
+def _read(described: Any, arrays: list[np.ndarray], outside: Any) -> Any:
+    """The value of plain data."""
+    if described is None or isinstance(described, PLAIN):
+        return described
+
+    def read(each: Any) -> Any:
+        return _read(each, arrays, outside)
+
+    match described:
+        case {"enum": name, "member": member}:
+            return _class(name)[member]
+        case {"bytes": text}:
+            return base64.b64decode(text)
+        case {"array": number, "on": where}:
+            return jax.device_put(arrays[number]) if where else arrays[number]
+        case {"outside": _}:
+            return outside
+        case {"named": name, "parts": parts}:
+            return _class(name)(*map(read, parts))
+        case {"tuple": parts}:
+            return tuple(map(read, parts))
+        case {"list": parts}:
+            return [*map(read, parts)]
+        case {"mapping": items}:
+            return {read(key): read(each) for key, each in items}
+        case {"stored": name, "as": parts}:
+            return _class(name).restored(read(parts))
+        case {"object": name, "fields": fields}:
+            return _rebuilt(_class(name), {key: read(each) for key, each in fields.items()})
+    raise ValueError(f"it describes {described!r:.60}, which is unknown")
+
+
+def _rebuilt(kind: Any, fields: dict[str, Any]) -> Any:
+    """An object as it was, without the checks of what a user gives."""
+    if not dataclasses.is_dataclass(kind):
+        raise ValueError(f"it names {kind.__qualname__}, which has no fields")
+    expected = {f.name for f in dataclasses.fields(kind)}
+    if expected != set(fields):
+        differ = sorted(expected ^ set(fields))
+        raise ValueError(f"its {kind.__qualname__} has other fields than this version's: {differ}")
+    made = object.__new__(kind)
+    for name, value in fields.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+def write(path: Path, value: Any, outside: type) -> None:
+    """Write a file; one that is there is replaced once the new one is whole.
+
+    Args:
+        path: of the file.
+        value: of the package's own objects.
+        outside: a class whose objects are left out where they cannot be stored.
+
+    Raises:
+        OSError: it cannot be written.
+        UnstorableError: something else cannot be stored.
+    """
+    writer = Writer(outside)
+    described = writer.described(value)
+    arrays = {f"a{number}": array for number, array in enumerate(writer.arrays)}
+    head = {"format": PACKAGE, "version": VERSION, "release": _release(), "value": described}
+    head |= {"left_out": writer.left_out, "digest": _digest(described, writer.arrays)}
+    text = json.dumps(head)
+    partial = path.with_name(path.name + ".part")
+    try:
+        with partial.open("wb") as file:
+            np.savez_compressed(
+                file, **{DOCUMENT: np.frombuffer(text.encode(), np.uint8)}, **arrays
+            )
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _release() -> str:
+    try:
+        return importlib.metadata.version(PACKAGE)
+    except importlib.metadata.PackageNotFoundError:
+        return "of a checkout"
+
+
+def _digest(described: Any, arrays: list[np.ndarray]) -> str:
+    found = hashlib.blake2b(json.dumps(described).encode(), digest_size=32)
+    for array in arrays:
+        found.update(f"{array.dtype.str}{array.shape}".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()
+
+
+def read(path: Path, outside: Any, missing: str) -> tuple[Any, bool]:
+    """What a file holds, and whether objects were left out of it.
+
+    Args:
+        path: of the file.
+        outside: takes the place of objects that were left out; None if there is none.
+        missing: what to say if one is needed.
+
+    Raises:
+        ValueError: it is none of the package's, of another version, or broken; or something was
+            left out that is not given.
+    """
+    head, arrays = _opened(path)
+    if head["left_out"] and outside is None:
+        raise ValueError(f"{path} {missing}")
+    try:
+        return _read(head["value"], arrays, outside), bool(head["left_out"])
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+
+
+def _opened(path: Path) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """The document and the arrays of a file."""
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{path} is no file that {PACKAGE} wrote, or it is cut off")
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            if DOCUMENT not in found:
+                raise ValueError(f"{path} is no file that {PACKAGE} wrote")
+            head = json.loads(found[DOCUMENT].tobytes())
+            _require_version(path, head)
+            arrays = [found[f"a{number}"] for number in range(len(found.files) - 1)]
+    except _RefusedError:
+        raise
+    except BROKEN as error:
+        raise ValueError(f"{path} is no file that {PACKAGE} wrote, or broken: {error}") from error
+    if head.get("digest") != _digest(head.get("value"), arrays):
+        raise ValueError(f"{path} was changed after it was written: what it says is not proved")
+    return head, arrays
+
+
+class _RefusedError(ValueError):
+    """That a file is of the package, but cannot be read."""
+
+
+def _require_version(path: Path, head: Any) -> None:
+    if not isinstance(head, dict) or head.get("format") != PACKAGE:
+        raise _RefusedError(f"{path} is no file that {PACKAGE} wrote")
+    if head.get("version") != VERSION:
+        raise _RefusedError(
+            f"{path} is of version {head.get('version')!r} of the format (written by {PACKAGE} "
+            f"{head.get('release')}), but this {PACKAGE} reads version {VERSION}"
+        )

@@ -1,0 +1,264 @@
+"""Tubes from files are those that were written, and other files are refused."""
+
+import json
+import subprocess
+import sys
+import zipfile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from reachjax.numerics import storage
+from tests.closed_loops import closed_loop, random_loop
+from tests.disturbed_loops import double_integrator
+from tests.input_polytopes import polygon, polytope_loop
+
+BOX = rj.Template.box(2)
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return closed_loop(random_loop(2, (4, 3), seed=2))
+
+
+@pytest.fixture(scope="module")
+def X0():
+    return rj.Box([-0.2, -0.2], [0.2, 0.2])
+
+
+@pytest.fixture(scope="module")
+def tube(loop, X0):
+    return rj.reach(loop, X0, 2, BOX)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "tube.reach"
+
+
+def arrays(tree):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def equal(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    assert all(map(np.array_equal, arrays(one), arrays(other), [True] * len(arrays(one))))
+
+
+def sine(p, x, u):
+    return jnp.stack([x[0] + 0.1 * x[1], x[1] + p * jnp.sin(x[0]) + 0.1 * u[0]])
+
+
+def cosine(p, x, u):
+    return jnp.stack([x[0] + 0.1 * x[1], x[1] + p * jnp.cos(x[0]) + 0.1 * u[0]])
+
+
+def curved(f=sine, p=0.5):
+    plant = rj.NonlinearPlant(jax.tree_util.Partial(f, jnp.asarray(p)), states=2, inputs=1)
+    net = rj.MLP.from_layers([([[1.0, 0.5]], [0.0]), ([[-3.0]], [0.0])], rj.Tanh())
+    return rj.ClosedLoop(plant, net)
+
+
+SEMIDEFINITE = [rj.LocalBounds(), rj.CuttingPlanes(rounds=1), rj.PaperQC(), rj.AllProducts()]
+TEMPLATES = [rj.EllipsoidTemplate(), rj.MixedTemplate(BOX)]
+KINDS = {
+    **{str(one): ({"relaxation": one, "window": 1}, BOX) for one in SEMIDEFINITE},
+    "forms": ({"relaxation": rj.LinearBounds()}, BOX),
+    "branches": ({}, rj.Template.octagonal(2)),
+    **{
+        type(one).__name__: ({"relaxation": rj.LocalBounds(), "window": 1}, one)
+        for one in TEMPLATES
+    },
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_tube_of_every_kind_is_read_as_it_was(kind, loop, X0, path):
+    options, template = KINDS[kind]
+    tube = rj.reach(loop, X0, 2, template, **options)
+    tube.save(path)
+    again = rj.load(path, recheck=True)
+    equal(tube, again)
+    assert str(tube) == str(again)
+    assert [type(each) for each in again.certificates] == [type(e) for e in tube.certificates]
+    verdicts = [
+        rj.verify(each, safe=rj.Box([-9, -9], [9, 9]), samples=10) for each in (tube, again)
+    ]
+    assert verdicts[0].status is verdicts[1].status
+    equal(tube.extended(1, **options).sets, again.extended(1, **options).sets)
+
+
+def test_loops_of_every_kind(path):
+    loops = [double_integrator(), (polytope_loop(polygon(4)), rj.Box([-0.2, -0.2], [0.2, 0.2]))]
+    for loop, X0 in loops:
+        tube = rj.reach(loop, X0, 2, BOX, rj.LinearBounds())
+        tube.save(path)
+        equal(tube, rj.load(path, recheck=True))
+
+
+def test_a_network_of_a_file_is_kept(path):
+    net = rj.Network.from_onnx("tests/data/networks/torch_tanh.onnx")
+    loop = rj.ClosedLoop(rj.AffinePlant(0.9 * np.eye(2), [[0.0], [0.1]]), net)
+    tube = rj.reach(loop, rj.Box([-0.1, -0.1], [0.1, 0.1]), 2, BOX)
+    tube.save(path)
+    equal(tube, rj.load(path, recheck=True))
+
+
+def test_cells_are_kept(loop, X0, path):
+    parts = rj.reach_partitioned(loop, X0, 2, BOX, cells=(2, 1))
+    parts.save(path)
+    again = rj.load(path, recheck=True)
+    assert isinstance(again, rj.PartitionedTube)
+    equal(parts, again)
+
+
+def test_another_process_reads_the_same(tube, path):
+    tube.save(path)
+    script = (
+        "import jax; jax.config.update('jax_enable_x64', True); import reachjax as rj;"
+        f"tube = rj.load({str(path)!r}, recheck=True); print(tube.sets[2].b.tolist())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert json.loads(done.stdout) == tube.sets[2].b.tolist()
+
+
+def test_a_function_is_given_again(path):
+    loop, X0 = curved(), rj.Box([0.1, -0.1], [0.2, 0.1])
+    tube = rj.reach(loop, X0, 2, BOX)
+    tube.save(path)
+    with pytest.raises(ValueError, match=r"written without its loop.*load\(path, loop=\.\.\.\)"):
+        rj.load(path)
+    seen = []
+    again = rj.load(path, curved(), progress=lambda steps: [seen.append(1) or s for s in steps])
+    assert len(seen) == 2  # it is rechecked unasked
+    equal(tube.sets, again.sets)
+    for other in (curved(p=0.5000001), curved(cosine), closed_loop(random_loop(2))):
+        with pytest.raises(ValueError, match="loop must be that of the tube"):
+            rj.load(path, other)
+
+
+def test_what_does_not_prove_the_bounds_is_refused(path, loop, X0):
+    tube = rj.reach(loop, X0, 2, BOX, rj.LinearBounds())
+    proof = tube.proof(2)
+    lower = proof.replace(bounds=proof.bounds - 1e-3)
+    sets = (*tube.sets[:2], tube.sets[2].replace(b=lower.bounds))
+    proofs = (*tube.certificates[:2], lower)
+    rj.ReachTube.sealed(loop, tube.template, sets, proofs, 0).save(path)
+    rj.load(path)  # nothing was asked
+    with pytest.raises(ValueError, match="the recheck of step 2 proves"):
+        rj.load(path, recheck=True)
+
+
+def test_the_loop_of_a_file_is_compared(tube, loop, path):
+    tube.save(path)
+    equal(rj.load(path, loop), tube)
+    with pytest.raises(ValueError, match="loop must be that of the tube"):
+        rj.load(path, closed_loop(random_loop(2, (4, 3), seed=5)))
+
+
+# files that are something else -------------------------------------------------------------------
+
+
+def loaded(path):
+    try:
+        return rj.load(path)
+    except ValueError as error:
+        return error
+
+
+def changed(path, **changes):
+    """The file with another document."""
+    with np.load(path) as found:
+        held = dict(found)
+    head = json.loads(held[storage.DOCUMENT].tobytes()) | changes
+    held[storage.DOCUMENT] = np.frombuffer(json.dumps(head).encode(), np.uint8)
+    with path.open("wb") as file:
+        np.savez(file, **held)
+
+
+def test_a_file_of_another_version(tube, path):
+    tube.save(path)
+    changed(path, version=7, release="9.9")
+    with pytest.raises(
+        ValueError, match=r"of version 7 .*written by reachjax 9\.9.*reads version 1"
+    ):
+        rj.load(path)
+
+
+def test_a_file_that_was_changed(tube, path):
+    tube.save(path)
+    with np.load(path) as found:
+        held = dict(found)
+    held["a0"] = held["a0"] + 1e-9
+    with path.open("wb") as file:
+        np.savez(file, **held)
+    with pytest.raises(ValueError, match="changed after it was written"):
+        rj.load(path)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.6, 0.999])
+def test_a_file_that_is_cut_off(part, tube, path):
+    tube.save(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(part * len(whole))])
+    with pytest.raises(ValueError, match=r"tube\.reach is no file that reachjax wrote, or"):
+        rj.load(path)
+
+
+def test_a_file_with_a_flipped_bit(tube, path):
+    tube.save(path)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for place in rng.integers(len(whole), size=60):
+        spoilt = bytearray(whole)
+        spoilt[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bytes(spoilt))
+        found = loaded(path)
+        if isinstance(found, ValueError):
+            assert "tube.reach" in str(found)
+        else:  # of what nobody reads
+            equal(found, tube)
+
+
+def test_foreign_files(tube, path):
+    with path.open("wb") as file:
+        np.savez(file, a0=np.ones(2))
+    with pytest.raises(ValueError, match="is no file that reachjax wrote"):
+        rj.load(path)
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("note.txt", "hello")
+    with pytest.raises(ValueError, match="is no file that reachjax wrote"):
+        rj.load(path)
+    with pytest.raises(FileNotFoundError, match="there is none at"):
+        rj.load(path.with_name("none"))
+    with pytest.raises(FileNotFoundError, match="path must lie in a folder"):
+        tube.save(path.parent / "none" / "tube.reach")
+    with pytest.raises(TypeError, match="loop must be a ClosedLoop"):
+        rj.load(path, tube)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"object": "os:system", "fields": {}},
+        {"object": "reachjax.numerics.storage:importlib", "fields": {}},
+        {"object": "reachjax.loops:ClosedLoop", "fields": {}},
+        {"named": "subprocess:Popen", "parts": ["true"]},
+        {"stored": "reachjax.none:Nothing", "as": None},
+        {"array": 999, "on": ""},
+        {"what": 1},
+        3,
+    ],
+)
+def test_a_document_names_classes_of_the_package_only(value, tube, path):
+    tube.save(path)
+    with np.load(path) as found:
+        arrays = [found[f"a{k}"] for k in range(len(found.files) - 1)]
+    changed(path, value=value, digest=storage._digest(value, arrays))
+    with pytest.raises(ValueError, match=r"tube\.reach (cannot be read|must hold a tube)"):
+        rj.load(path)

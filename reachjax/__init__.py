@@ -103,6 +103,12 @@ from reachjax.tubes.winning_sets import WinningSet
 
 __version__ = "0.1.0"
 
+
+def __dir__() -> list[str]:
+    """The public names, and no others."""
+    return [*__all__]
+
+
 __all__ = [
     "MLP",
     "SCS",

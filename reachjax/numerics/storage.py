@@ -159,7 +159,7 @@ def _read(described: Any, arrays: list[np.ndarray], outside: Any) -> Any:
 
 def _rebuilt(kind: Any, fields: dict[str, Any]) -> Any:
     """An object as it was, without the checks of what a user gives."""
-    if not dataclasses.is_dataclass(kind):
+    if not hasattr(kind, "__dataclass_fields__"):
         raise ValueError(f"it names {kind.__qualname__}, which has no fields")
     expected = {f.name for f in dataclasses.fields(kind)}
     if expected != set(fields):
@@ -185,16 +185,14 @@ def write(path: Path, value: Any, outside: type) -> None:
     """
     writer = Writer(outside)
     described = writer.described(value)
-    arrays = {f"a{number}": array for number, array in enumerate(writer.arrays)}
     head = {"format": PACKAGE, "version": VERSION, "release": _release(), "value": described}
     head |= {"left_out": writer.left_out, "digest": _digest(described, writer.arrays)}
-    text = json.dumps(head)
+    arrays = {f"a{number}": array for number, array in enumerate(writer.arrays)}
+    arrays[DOCUMENT] = np.frombuffer(json.dumps(head).encode(), np.uint8)
     partial = path.with_name(path.name + ".part")
     try:
         with partial.open("wb") as file:
-            np.savez_compressed(
-                file, **{DOCUMENT: np.frombuffer(text.encode(), np.uint8)}, **arrays
-            )
+            np.savez_compressed(file, allow_pickle=False, **arrays)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

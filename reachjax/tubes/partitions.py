@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -35,10 +35,17 @@ from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.sets import AbstractSet, Template
 from reachjax.sets.cells import grid, halves
 from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.displays import SAMPLES as SHOWN
+from reachjax.tubes.displays import display, picture, table
 from reachjax.tubes.kept import keep
 from reachjax.tubes.propagation import GAP, SAMPLES
 from reachjax.tubes.reach import ReachTube, reach
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
+from reachjax.tubes.tables import frame, rows
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from pandas import DataFrame
 
 Bar = Callable[[Iterable[Any]], Iterable[Any]]
 """Wraps an iteration over cells, such as `tqdm.tqdm`."""
@@ -93,6 +100,40 @@ class PartitionedTube(Replaceable):
         self.require_sealed()
         first = self.tubes[0]
         keep(writable("path", path), self, first.loop, self.X0, first.horizon, first.start)
+
+    def __len__(self) -> int:
+        """The number of cells."""
+        return len(self.tubes)
+
+    def __getitem__(self, cell: int | slice) -> Any:
+        """The tube of a cell, or a tuple of them."""
+        return self.tubes[cell]
+
+    def __iter__(self) -> Iterator[ReachTube]:
+        return iter(self.tubes)
+
+    def to_dataframe(self) -> DataFrame:
+        """The rows of `ReachTube.to_dataframe`, with the number of the cell before them.
+
+        Raises:
+            ImportError: pandas is missing; it comes with `pip install 'reachjax[tables]'`.
+        """
+        numbered = enumerate(self.tubes)
+        return frame([{"cell": cell} | row for cell, tube in numbered for row in rows(tube)])
+
+    def plot(self, ax: Axes | None = None, **options: Any) -> Axes:
+        """Draw the sets of all cells: `reachjax.plot_tube(tube, ax, **options)`."""
+        from reachjax.tubes.plotting import plot_tube
+
+        return plot_tube(self, ax, **options)
+
+    def _repr_html_(self) -> str:
+        times = range(1, self.horizon + 1)
+        steps = [[t, float(np.max(self.gaps(t)))] for t in times]
+        few = max(1, SHOWN // len(self))
+        several = self.tubes[0].loop.states > 1
+        drawn = picture(lambda ax: self.plot(ax, samples=few)) if several else ""
+        return display(repr(self), table(["t", "largest gap"], steps), drawn)
 
     def sets(self, t: int) -> tuple[AbstractSet, ...]:
         """One set of each cell: every state at time `t` is surely in one of them."""

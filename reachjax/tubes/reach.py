@@ -7,9 +7,11 @@ recheck. A tube repeats it, each set being the next one's set of states (equatio
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from typing import Any
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
@@ -22,6 +24,8 @@ from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.displays import SAMPLES as SHOWN
+from reachjax.tubes.displays import display, picture, table
 from reachjax.tubes.kept import keep
 from reachjax.tubes.propagation import (
     GAP,
@@ -33,6 +37,11 @@ from reachjax.tubes.propagation import (
     propagated,
 )
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
+from reachjax.tubes.tables import frame, rows
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from pandas import DataFrame
 
 
 @pytree
@@ -94,6 +103,47 @@ class ReachTube(Replaceable):
     def horizon(self) -> int:
         """The number of steps."""
         return len(self.sets) - 1
+
+    def __len__(self) -> int:
+        """The number of sets, that of the initial time included."""
+        return len(self.sets)
+
+    def __getitem__(self, t: int | slice) -> Any:
+        """The set at a time, or a tuple of them; negative times count from the end."""
+        return self.sets[t]
+
+    def __iter__(self) -> Iterator[AbstractSet]:
+        return iter(self.sets)
+
+    def to_dataframe(self) -> DataFrame:
+        """A row for each step and facet: bound, witness, gap, status, seconds, kind of proof.
+
+        Of an ellipsoid, `facet` and `direction` are missing, and the bound is what its certificate
+        says.
+
+        Raises:
+            ImportError: pandas is missing; it comes with `pip install 'reachjax[tables]'`.
+
+        Example:
+            >>> from reachjax import MLP, AffinePlant, Box, Template, reach
+            >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+            >>> table = reach(loop, Box([1.0], [2.0]), 2, Template.box(1)).to_dataframe()
+            >>> table.groupby("t").bound.max().round(6).to_dict()
+            {1: 1.0, 2: 0.5}
+        """
+        return frame(rows(self))
+
+    def plot(self, ax: Axes | None = None, **options: Any) -> Axes:
+        """Draw the sets over simulated states: `reachjax.plot_tube(tube, ax, **options)`."""
+        from reachjax.tubes.plotting import plot_tube
+
+        return plot_tube(self, ax, **options)
+
+    def _repr_html_(self) -> str:
+        steps = [_shown(self, t) for t in range(1, self.horizon + 1)]
+        drawn = picture(lambda ax: self.plot(ax, samples=SHOWN)) if self.loop.states > 1 else ""
+        head = ["t", "largest gap", "statuses", "seconds", "proof"]
+        return display(repr(self), table(head, steps), drawn)
 
     def proof(self, t: int) -> AbstractProof:
         """The certificate of `sets[t]`.
@@ -162,6 +212,17 @@ class ReachTube(Replaceable):
         task = Task(self.loop, self.sets[0], horizon, self.template, self.start)
         proofs = [self.proof(t) for t in range(1, self.horizon + 1)]
         return _tube(task, Options.named(options), list(zip(self.sets[1:], proofs, strict=True)))
+
+
+def _shown(tube: ReachTube, t: int) -> list[Any]:
+    """A step in a notebook's table."""
+    proof = tube.proof(t)
+    ends = Counter(status.name for status in proof.statuses)
+    counted = ", ".join(f"{count} {name}" for name, count in ends.items())
+    gaps = np.asarray(proof.gaps, float)
+    known = gaps[~np.isnan(gaps)]
+    widest = float(known.max()) if len(known) else np.nan
+    return [t, widest, counted, float(np.sum(np.asarray(proof.seconds))), type(proof).__name__]
 
 
 class Interrupted(KeyboardInterrupt):

@@ -10,14 +10,19 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import html
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.sets import PolyhedralSet
+from reachjax.tubes.displays import display, picture, table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class VerdictStatus(enum.Enum):
@@ -113,8 +118,48 @@ class Verdict:
     cells: tuple[DecidedCell, ...] = ()
     recurrence: Recurrence | None = None
 
+    @property
+    def proved(self) -> bool:
+        """Whether every state surely is where it must be."""
+        return self.status is VerdictStatus.PROVED
+
+    @property
+    def refuted(self) -> bool:
+        """Whether a trajectory surely breaks the specification."""
+        return self.status is VerdictStatus.REFUTED
+
+    @property
+    def unknown(self) -> bool:
+        """Whether neither is known."""
+        return self.status is VerdictStatus.UNKNOWN
+
     def __bool__(self) -> bool:
-        raise TypeError("a verdict has three values: compare verdict.status with VerdictStatus")
+        raise TypeError("a verdict has three values: use verdict.proved, .refuted or .unknown")
+
+    def _repr_html_(self) -> str:
+        rows = [
+            [name, *_least_at(self.margins[name]), *_least_at(self.simulated[name])]
+            for name in self.margins
+        ]
+        head = ["requirement", "certified margin", "at t", "simulated margin", "at t"]
+        said = str(self).splitlines()[1 + len(rows) :]
+        notes = "".join(f"<p>{html.escape(line.strip())}</p>" for line in said)
+        return display(self.status.name, table(head, rows) + notes, picture(self._drawn))
+
+    def _drawn(self, ax: Axes) -> None:
+        """Its cells, or its margins over time."""
+        if self.cells and len(self.cells[0].lower) > 1:
+            from reachjax.tubes.plotting import plot_cells
+
+            plot_cells(self, ax)
+            return
+        for k, name in enumerate(self.margins):
+            times = np.arange(len(self.margins[name]))
+            ax.plot(times, self.margins[name], "o-", color=f"C{k}", label=f"{name}, certified")
+            ax.plot(times, self.simulated[name], "x:", color=f"C{k}", label=f"{name}, simulated")
+        ax.axhline(0.0, color="black", linewidth=0.8)
+        ax.set(xlabel="t", ylabel="margin")
+        ax.legend(fontsize="small")
 
     def __str__(self) -> str:
         lines = [self.status.name]
@@ -148,6 +193,14 @@ class Verdict:
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def _least_at(margins: Float[np.ndarray, " h+1"]) -> tuple[float, int | str]:
+    """The smallest margin, and when; of none, NaN."""
+    if np.isnan(margins).all():
+        return np.nan, ""
+    t = int(np.nanargmin(margins))
+    return float(margins[t]), t
 
 
 def _described(found: Recurrence) -> str:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
 from reachjax.numerics.checks import Numbers, require_kind, same_size
 from reachjax.sets import Box
+from reachjax.tubes.displays import display, picture, table
 from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 AT_ONCE = 1000
 """So many points are looked up at a time."""
@@ -39,9 +44,27 @@ class WinningSet:
         lines = [f"{'':10} {'cells':>7} {'volume':>10} {'part':>7}"]
         for status in VerdictStatus:
             size, count = self.volume(status), len(self.of(status))
-            part = size / total if total > 0 else np.nan
-            lines.append(f"{status.value:10} {count:7d} {size:10.4g} {part:7.2%}")
+            part = self._part(status, total)
+            lines.append(f"{status.value:10} {count:7d} {size:10.4g} {part:>7}")
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        total = sum(map(self.volume, VerdictStatus))
+        rows = [
+            [status.value, len(self.of(status)), self.volume(status), self._part(status, total)]
+            for status in VerdictStatus
+        ]
+        drawn = picture(self.plot) if self.domain.dimension > 1 else ""
+        return display(repr(self), table(["", "cells", "volume", "part"], rows), drawn)
+
+    def plot(self, ax: Axes | None = None, **options: Any) -> Axes:
+        """Draw the cells: `reachjax.plot_cells(found, ax, **options)`."""
+        from reachjax.tubes.plotting import plot_cells
+
+        return plot_cells(self, ax, **options)
+
+    def _part(self, status: VerdictStatus, total: float) -> str:
+        return f"{self.volume(status) / total if total > 0 else np.nan:.2%}"
 
     def of(self, status: VerdictStatus) -> tuple[DecidedCell, ...]:
         """The cells of which this is known."""

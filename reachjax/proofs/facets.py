@@ -67,7 +67,20 @@ class Certificate(AbstractCertificate):
             True
         """
         proposed = self._proposed(multipliers)
-        program, back = jax.device_get(self.program), np.linalg.pinv(self.program.transform)
+        program = jax.device_get(self.program)
+        back = _left_inverse(np.asarray(program.transform))
         moments = back @ np.asarray(self.moments) @ back.T
         solution = Solution(self.solver_offsets, proposed, moments, self.codes, self.seconds)
         return judged_offsets(program, solution).value
+
+
+def _left_inverse(T: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "m n"]:
+    """A pseudo-inverse of a matrix whose rows and columns may be of very different sizes."""
+    rows = _sizes(T, axis=1)
+    columns = _sizes(T / rows[:, None], axis=0)
+    return np.linalg.pinv(T / rows[:, None] / columns) / rows / columns[:, None]
+
+
+def _sizes(T: np.ndarray, axis: int) -> np.ndarray:
+    size = abs(T).max(axis=axis, initial=0.0)
+    return np.where(size > 0, size, 1.0)

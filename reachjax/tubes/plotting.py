@@ -155,7 +155,7 @@ def plot_cells(
         ax.add_collection(PatchCollection(boxes, **look))
         handles.append(Patch(facecolor=color, label=f"{status.value}: {len(cells)}"))
     ax.autoscale_view()
-    ax.legend(handles=handles)
+    ax.legend(handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False)
     ax.set_xlabel(f"$x_{{{i + 1}}}$")
     ax.set_ylabel(f"$x_{{{j + 1}}}$")
     return ax

@@ -208,7 +208,11 @@ def tube():
         ({}, ValueError, "nothing to verify: give a goal, avoid sets or a safe set"),
         ({"avoid": []}, ValueError, "nothing to verify"),
         ({"avoid": STRIP}, TypeError, r"avoid must be a sequence of sets.* a Polytope arrived"),
-        ({"goal": [0, 1]}, TypeError, r"goal must be a Box .*, but \[0, 1\] arrived"),
+        (
+            {"goal": [0, 1]},
+            TypeError,
+            r"goal must be a Box, a Polytope or an Ellipsoid, but \[0, 1\] arrived",
+        ),
         ({"goal": LINE}, ValueError, "goal has dimension 1, but the loop has 2 states"),
         ({"safe": LINE}, ValueError, "safe has dimension 1, but the loop has 2 states"),
         ({"avoid": [X0, LINE]}, ValueError, r"avoid\[1\] has dimension 1, but the loop has 2"),
@@ -224,7 +228,7 @@ def test_bad_specifications_are_named(tube, required, error, message):
 
 
 def test_a_verdict_is_not_a_truth_value(tube):
-    with pytest.raises(TypeError, match=r"three values: compare verdict\.status"):
+    with pytest.raises(TypeError, match=r"three values: use verdict\.proved"):
         bool(rj.verify(tube, goal=STRIP, samples=10))
 
 

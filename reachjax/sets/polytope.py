@@ -50,6 +50,39 @@ class Polytope(PolyhedralSet):
             row = int(np.argmin(np.any(np.asarray(A) != 0, axis=1)))
             raise ValueError(f"row {row} of Polytope.A is zero: it is no facet")
 
+    @classmethod
+    def between(cls, lower: ArrayLike, upper: ArrayLike) -> Polytope:
+        """A box some of whose sides may be infinite, such as one for a specification.
+
+        Args:
+            lower: `(n,)`; minus infinity where there is no side.
+            upper: `(n,)`; infinity where there is none.
+
+        Raises:
+            ValueError: sizes differ, an entry is NaN, `lower > upper` in a coordinate, or no side
+                is finite.
+
+        Example:
+            >>> Polytope.between([0.0, -np.inf], [1.0, np.inf]).contains([0.5, 1e9]).item()
+            True
+        """
+        ends = [np.asarray(each, float) for each in (lower, upper)]
+        if ends[0].ndim != 1 or ends[0].shape != ends[1].shape:
+            raise ValueError(
+                "lower and upper must be vectors of one length, but of shapes "
+                f"{ends[0].shape} and {ends[1].shape} they arrived"
+            )
+        if not np.all(ends[0] <= ends[1]):
+            raise ValueError(f"lower must not be above upper, but {lower} and {upper} arrived")
+        eye = np.eye(len(ends[0]))
+        A, b = np.vstack([eye, -eye]), np.hstack([ends[1], -ends[0]])
+        finite = np.isfinite(b)
+        if not finite.any():
+            raise ValueError(
+                "lower and upper must have a finite entry, but all of them are infinite"
+            )
+        return cls(A[finite], b[finite])
+
     @property
     def dimension(self) -> int:
         """The number of coordinates."""

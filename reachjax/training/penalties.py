@@ -16,10 +16,17 @@ from jaxtyping import Array, Float
 from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import described, is_concrete, whole_number
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds, LocalBounds
-from reachjax.sets import AbstractSet, AbstractTemplate, Box, PolyhedralSet, Template
+from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
 from reachjax.tubes.propagation import require_kinds
 from reachjax.tubes.reach import ReachTube, reach
-from reachjax.tubes.requirements import AvoidSets, check_margin, requirements, shortfall
+from reachjax.tubes.requirements import (
+    AvoidSets,
+    Region,
+    Timed,
+    check_margin,
+    requirements,
+    shortfall,
+)
 from reachjax.tubes.sizes import log_volume
 
 
@@ -85,9 +92,9 @@ def specification_penalty(
     X0: AbstractSet,
     horizon: int,
     template: AbstractTemplate,
-    goal: PolyhedralSet | None = None,
+    goal: Timed | None = None,
     avoid: AvoidSets | None = None,
-    safe: PolyhedralSet | None = None,
+    safe: Region | None = None,
     *,
     margin: float = 0.0,
     cells: Sequence[int] | None = None,
@@ -104,7 +111,8 @@ def specification_penalty(
         X0: the set of initial states.
         horizon: the number of steps.
         template: what every set looks like: facet directions, ellipsoids, or both.
-        goal: where every state must be at the horizon.
+        goal: where every state must be at the horizon; or a mapping from times, or from ranges of
+            times, to where it must be then.
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
             time to a sequence.
         safe: where every state must be at all times.

@@ -336,7 +336,7 @@ def bounded(
 
 def fails_everywhere(item: Requirement, ladder: Ladder) -> bool:
     """Whether every state surely breaks a requirement at the time that the ladder has come to."""
-    facets = (np.asarray(part) for part in item.region.facets)
+    facets = (np.asarray(part) for part in item.looser.facets)
     C, d = balanced(*facets, inner=not item.inside)
     lower, upper = (C @ ladder.horizon.state + (-d)).ends(ladder.horizon.start)
     return bool((lower > 0).any() if item.inside else (upper <= 0).all())

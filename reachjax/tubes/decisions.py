@@ -32,12 +32,12 @@ from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated, Simulations
-from reachjax.sets import AbstractSet, PolyhedralSet
+from reachjax.sets import AbstractSet
 from reachjax.tubes.cell_decisions import CellTask, decided_by_cells, roots
 from reachjax.tubes.ladder import WORK, Climbed, Ladder
 from reachjax.tubes.propagation import Progress, deadline_of, require_kinds, simulations_from
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
-from reachjax.tubes.requirements import AvoidSets, Requirement, requirements
+from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.targets import target_of
 from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
@@ -53,8 +53,8 @@ def decide(
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
-    goal: PolyhedralSet | None = None,
-    safe: PolyhedralSet | None = None,
+    goal: Timed | None = None,
+    safe: Region | None = None,
     avoid: AvoidSets | None = None,
     *,
     relaxation: BranchAndCut = BranchAndCut(),  # noqa: B008  (immutable)
@@ -72,7 +72,8 @@ def decide(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number `N` of steps.
-        goal: where every state must be at the horizon.
+        goal: where every state must be at the horizon; or a mapping from times, or from ranges of
+            times, to where it must be then.
         safe: where every state must be at all times (its complement is avoided).
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
             time to a sequence.

@@ -26,11 +26,11 @@ from reachjax.numerics.checks import (
     wrapped,
 )
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds
-from reachjax.sets import Box, Ellipsoid, PolyhedralSet, Template
+from reachjax.sets import Box, Ellipsoid, Template
 from reachjax.tubes.decisions import decide
 from reachjax.tubes.propagation import deadline_of
 from reachjax.tubes.reach import reach
-from reachjax.tubes.requirements import AvoidSets, Requirement, requirements
+from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
 from reachjax.tubes.shapes import Kind, Shape
 from reachjax.tubes.verdicts import Verdict, VerdictStatus
 
@@ -63,8 +63,8 @@ def largest_set(
     loop: ClosedLoop,
     X0: Kind,
     horizon: int,
-    goal: PolyhedralSet | None = None,
-    safe: PolyhedralSet | None = None,
+    goal: Timed | None = None,
+    safe: Region | None = None,
     avoid: AvoidSets | None = None,
     *,
     rounds: int = 50,
@@ -80,7 +80,8 @@ def largest_set(
         X0: where to begin: a set of the kind that is wanted. To go on with what an earlier call
             found, give its `region`.
         horizon: the number of steps.
-        goal: where every state must be at the horizon.
+        goal: where every state must be at the horizon; or a mapping from times, or from ranges of
+            times, to where it must be then.
         safe: where every state must be at all times.
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
             time to a sequence.

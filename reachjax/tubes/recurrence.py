@@ -22,12 +22,13 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.witnesses import initial_states
-from reachjax.sets import AbstractSet, PolyhedralSet
+from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
+from reachjax.sets.ball_polytopes import inner_polytope
 from reachjax.tubes.decisions import decide
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.recurrent_sets import SAMPLES, Candidate, candidate_sets, periods, within
 from reachjax.tubes.refutations import SUSPECTS, counterexample, suspects
-from reachjax.tubes.requirements import AvoidSets, requirements
+from reachjax.tubes.requirements import AvoidSets, Region, requirements
 from reachjax.tubes.verdicts import Counterexample, Recurrence, Verdict, VerdictStatus
 
 LONG = 500
@@ -45,15 +46,15 @@ class Wanted(NamedTuple):
         avoid: where none may be.
     """
 
-    safe: PolyhedralSet | None
-    avoid: tuple[PolyhedralSet, ...]
+    safe: Region | None
+    avoid: tuple[Region, ...]
 
 
 def for_ever(
     verdict: Verdict,
     tubes: Sequence[ReachTube],
     X0: AbstractSet,
-    safe: PolyhedralSet | None,
+    safe: Region | None,
     avoid: AvoidSets | None,
     seed: int,
     deadline: float,
@@ -123,6 +124,11 @@ def _broken_later(
     return None
 
 
+def _flat(safe: Region | None) -> PolyhedralSet | None:
+    """A set of facets in which all that is looked for must lie."""
+    return inner_polytope(safe, "safe") if isinstance(safe, Ellipsoid) else safe
+
+
 def recurrence(
     tubes: Sequence[ReachTube],
     X0: AbstractSet,
@@ -151,7 +157,7 @@ def recurrence(
             if proved:
                 return found
             nearest = _nearer(nearest, found)
-    loop, candidates = tubes[0].loop, list(candidate_sets(tubes, runs, wanted.safe))
+    loop, candidates = tubes[0].loop, list(candidate_sets(tubes, runs, _flat(wanted.safe)))
     tries = [(each, period) for each in candidates for period in periods(loop, each)]
     tries.sort(key=lambda each: each[0].step + each[1])  # what takes fewer steps is cheaper
     for relaxation in (BranchAndCut(nodes=QUICK), BranchAndCut()):

@@ -13,7 +13,7 @@ from reachjax.loops.closed_loop import Scenario
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
-from reachjax.sets import AbstractSet, Box
+from reachjax.sets import AbstractSet, Box, Ellipsoid
 from reachjax.sets.balance import balanced
 from reachjax.tubes.requirements import Requirement
 from reachjax.tubes.verdicts import Counterexample
@@ -75,6 +75,12 @@ def surely_broken(loop: ClosedLoop, item: Requirement, scenario: Scenario, start
         drawn = (None if part is None else part[t] for part in (w, v))
         reached = successor_box(loop, reached, start + t, *drawn)
     lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
+    if item.ball is not None:
+        return (
+            _surely_beyond(item.ball, reached)
+            if item.inside
+            else _surely_within(item.ball, reached)
+        )
     C, d = balanced(*(np.asarray(part) for part in item.region.facets), inner=not item.inside)
     ends = np.where(C > 0, lower, upper), np.where(C > 0, upper, lower)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -85,3 +91,18 @@ def surely_broken(loop: ClosedLoop, item: Requirement, scenario: Scenario, start
         if item.inside:
             return bool(np.any(least - error > d))
         return bool(np.all(most + error <= d))
+
+
+def _surely_within(ball: Ellipsoid, box: Box) -> bool:
+    """Whether a box lies in an ellipsoid, in exact arithmetic: its corners do."""
+    return all(map(ball.surely_contains, np.asarray(box.corners())))
+
+
+def _surely_beyond(ball: Ellipsoid, box: Box) -> bool:
+    """Whether a box and an ellipsoid surely have no point in common: a tangent is between them."""
+    normal = np.asarray(ball.normal_towards(box))
+    least = np.where(normal > 0, np.asarray(box.lower), np.asarray(box.upper))
+    size = np.sum(abs(normal * least)) + TINY * len(normal)
+    with np.errstate(over="ignore", invalid="ignore"):
+        near = np.sum(normal * least) - gamma(len(normal)) * size - TINY * len(normal)
+    return bool(near > float(ball.support(normal[None])[0]))

@@ -16,10 +16,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import described, is_concrete, real_number, require_kind
-from reachjax.sets import AbstractSet, PolyhedralSet
+from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
+from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
 from reachjax.tubes.reach import ReachTube
 
-AvoidSets = Sequence[PolyhedralSet] | Mapping[int, Sequence[PolyhedralSet]]
+Region = PolyhedralSet | Ellipsoid
+
+AvoidSets = Sequence[Region] | Mapping[int, Sequence[Region]]
+
+Timed = Region | Mapping[int | range, Region]
+"""A set, or sets by the times, or the spans of times, at which they are meant."""
 
 
 class Compared(NamedTuple):
@@ -51,14 +57,24 @@ class Requirement:
     Attributes:
         name: `goal`, `safe` or `avoid[i]`.
         time: when.
-        region: the set.
+        region: the set; of an ellipsoid, a polytope within it where states must be inside, and one
+            around it where they must not.
         inside: whether states must be in it, or out of it.
+        ball: the ellipsoid; None of other sets.
     """
 
     name: str
     time: int
     region: PolyhedralSet
     inside: bool
+    ball: Ellipsoid | None = None
+
+    @property
+    def looser(self) -> PolyhedralSet:
+        """A set whose requirement is broken only where this one is."""
+        if self.ball is None:
+            return self.region
+        return (outer_polytope if self.inside else inner_polytope)(self.ball, self.name)
 
     def compared(self, tube: ReachTube) -> Compared:
         """What every state surely does not exceed, and should not: of each facet, or of the set."""
@@ -73,6 +89,9 @@ class Requirement:
 
     def simulated(self, trajectories: np.ndarray) -> np.ndarray:
         """How far each trajectory `(c,)` is on the right side; negative on the wrong one."""
+        if self.ball is not None:
+            depth = _depths(self.ball, trajectories[:, self.time])
+            return depth if self.inside else -depth
         C, d, norms = (np.asarray(part) for part in self.region.facets_in_units())
         with np.errstate(over="ignore", invalid="ignore"):
             room = (d - trajectories[:, self.time] @ C.T) / norms
@@ -92,7 +111,7 @@ class Requirement:
 
 
 def of_tube(
-    tube: ReachTube, goal: PolyhedralSet | None, avoid: AvoidSets | None, safe: PolyhedralSet | None
+    tube: ReachTube, goal: Timed | None, avoid: AvoidSets | None, safe: Region | None
 ) -> list[Requirement]:
     """A specification's requirements for a tube, one for each set and time.
 
@@ -109,14 +128,14 @@ def of_tube(
 def requirements(
     states: int,
     horizon: int,
-    goal: PolyhedralSet | None,
+    goal: Timed | None,
     avoid: AvoidSets | None,
-    safe: PolyhedralSet | None,
+    safe: Region | None,
 ) -> list[Requirement]:
     """A specification's requirements, one for each set and time.
 
     Raises:
-        TypeError: a set is of a kind without facets.
+        TypeError: a set is no Box, Polytope or Ellipsoid.
         ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
     """
     everywhere = range(horizon + 1)
@@ -128,31 +147,93 @@ def requirements(
                 "avoid must be a sequence of sets, avoid=[A, ...], or a mapping from a time to "
                 f"one, avoid={{t: [A, ...]}}, but {described(regions)} arrived"
             )
-    found = [Requirement("goal", horizon, goal, True)] if goal is not None else []
-    found += [Requirement("safe", t, safe, True) for t in everywhere if safe is not None]
+    found = [Requirement("goal", t, G, True) for t, G in _goals(goal, horizon)]
+    found += [Requirement("safe", t, safe, True) for t in everywhere if safe is not None]  # type: ignore[arg-type]
     for t, regions in timed.items():
         if isinstance(t, bool) or t not in everywhere:
             raise ValueError(f"avoid names time {t!r}, but the tube is for t = 0 .. {horizon}")
-        found += [Requirement(f"avoid[{i}]", t, A, False) for i, A in enumerate(regions)]
+        found += [Requirement(f"avoid[{i}]", t, A, False) for i, A in enumerate(regions)]  # type: ignore[arg-type]
     if not found:
         raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")
+    known: dict[tuple[int, bool], Requirement] = {}
     for item in found:
-        require_kind(item.name, item.region, PolyhedralSet, "a Box or a Polytope")
-        if item.region.steps is not None:
-            raise ValueError(f"{item.name} must be one box, but a time-varying one arrived")
-        if item.region.dimension != states:
-            raise ValueError(
-                f"{item.name} has dimension {item.region.dimension}, "
-                f"but the loop has {states} states"
-            )
-    return found
+        key = id(item.region), item.inside
+        if key not in known:
+            known[key] = _checked(item, states)
+    checked = (known[id(item.region), item.inside] for item in found)
+    return [
+        dataclasses.replace(one, name=item.name, time=item.time)
+        for one, item in zip(checked, found, strict=True)
+    ]
+
+
+def _goals(goal: Timed | None, horizon: int) -> list[tuple[int, Any]]:
+    """The goals, with their times.
+
+    Raises:
+        ValueError: a time is beyond the horizon, or named twice; or none is named.
+    """
+    if goal is None:
+        return []
+    if not isinstance(goal, Mapping):
+        return [(horizon, goal)]
+    found: dict[int, Any] = {}
+    for when, region in goal.items():
+        times = when if isinstance(when, range) else [when]
+        for t in times:
+            if isinstance(t, bool) or not isinstance(t, int | np.integer):
+                raise TypeError(
+                    f"goal must name times or ranges of them, but {described(t)} arrived"
+                )
+            if not 0 <= t <= horizon:
+                raise ValueError(f"goal names time {t!r}, but the tube is for t = 0 .. {horizon}")
+            if t in found:
+                raise ValueError(f"goal names time {t} twice: give the intersection of both sets")
+            found[int(t)] = region
+    if not found:
+        raise ValueError("goal must name a time, goal={t: G}, but none arrived")
+    return sorted(found.items(), key=lambda one: one[0])
+
+
+def _checked(item: Requirement, states: int) -> Requirement:
+    """A requirement of a set that can be decided.
+
+    Raises:
+        TypeError: it is of another kind.
+        ValueError: its dimension is another one, or it is an ellipsoid that cannot be decided.
+    """
+    region, kinds = item.region, (PolyhedralSet, Ellipsoid)
+    require_kind(item.name, region, kinds, "a Box, a Polytope or an Ellipsoid")
+    if region.steps is not None:
+        raise ValueError(f"{item.name} must be one box, but a time-varying one arrived")
+    if region.dimension != states:
+        raise ValueError(
+            f"{item.name} has dimension {region.dimension}, but the loop has {states} states"
+        )
+    if not isinstance(region, Ellipsoid):
+        return item
+    if not is_concrete(region):
+        raise ValueError(
+            f"{item.name} must be a polytope inside jax.jit, but a traced ellipsoid arrived"
+        )
+    polytope = (inner_polytope if item.inside else outer_polytope)(region, item.name)
+    return dataclasses.replace(item, region=polytope, ball=region)
+
+
+def _depths(ball: Ellipsoid, points: np.ndarray) -> Float[np.ndarray, " c"]:
+    """How deep points lie within an ellipsoid, at least, in the units of the state."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        away = np.linalg.norm(
+            (points - np.asarray(ball.center)) @ np.asarray(ball.normal_form.A).T, axis=1
+        )
+    return (1 - away) * np.sqrt(np.linalg.eigvalsh(np.asarray(ball.shape))[0])
 
 
 def shortfall(
     tube: ReachTube,
-    goal: PolyhedralSet | None = None,
+    goal: Timed | None = None,
     avoid: AvoidSets | None = None,
-    safe: PolyhedralSet | None = None,
+    safe: Region | None = None,
     *,
     margin: float = 0.0,
 ) -> Float[Array, ""]:
@@ -164,7 +245,8 @@ def shortfall(
 
     Args:
         tube: certified sets for `t = 0 .. horizon`.
-        goal: where every state must be at the horizon.
+        goal: where every state must be at the horizon; or a mapping from times, or from ranges of
+            times, to where it must be then.
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
             time to a sequence.
         safe: where every state must be at all times.

@@ -16,21 +16,21 @@ from reachjax.numerics.checks import is_concrete, whole_number
 from reachjax.numerics.rounding import TINY
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import initial_states
-from reachjax.sets import AbstractSet, PolyhedralSet
+from reachjax.sets import AbstractSet
 from reachjax.tubes.partitions import BESIDE, PartitionedTube
 from reachjax.tubes.propagation import deadline_of
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.recurrence import for_ever
 from reachjax.tubes.refutations import counterexample, suspects
-from reachjax.tubes.requirements import AvoidSets, Requirement, of_tube
+from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, of_tube
 from reachjax.tubes.verdicts import Verdict, VerdictStatus, of_cells
 
 
 def verify(
     tube: ReachTube | PartitionedTube,
-    goal: PolyhedralSet | None = None,
+    goal: Timed | None = None,
     avoid: AvoidSets | None = None,
-    safe: PolyhedralSet | None = None,
+    safe: Region | None = None,
     *,
     samples: int = 10_000,
     seed: int = 0,
@@ -41,7 +41,8 @@ def verify(
 
     Args:
         tube: certified sets for `t = 0 .. horizon`; of a partitioned tube, those of every cell.
-        goal: where every state must be at the horizon.
+        goal: where every state must be at the horizon; or a mapping from times, or from ranges of
+            times, to where it must be then.
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
             time to a sequence.
         safe: where every state must be at all times (its complement is avoided).
@@ -53,7 +54,7 @@ def verify(
         time_limit: seconds to look for such a set; None: until a few are tried.
 
     Raises:
-        TypeError: a set is of a kind without facets.
+        TypeError: a set is no Box, Polytope or Ellipsoid.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, a part
             of the tube was exchanged for another one, or the tube is traced inside `jax.jit`; or
             something is required for ever of a loop that varies in time, or at given times only.

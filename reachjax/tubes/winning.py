@@ -30,11 +30,11 @@ from reachjax.numerics.checks import (
     wrapped,
 )
 from reachjax.programs.relaxations import BranchAndCut
-from reachjax.sets import Box, PolyhedralSet
+from reachjax.sets import Box
 from reachjax.tubes.cell_decisions import CellTask, bounded, fails_everywhere
 from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.propagation import deadline_of
-from reachjax.tubes.requirements import AvoidSets, Requirement, requirements
+from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
 from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
 from reachjax.tubes.winning_sets import WinningSet
 
@@ -69,8 +69,8 @@ def winning_set(
     loop: ClosedLoop,
     domain: Box,
     horizon: int,
-    goal: PolyhedralSet | None = None,
-    safe: PolyhedralSet | None = None,
+    goal: Timed | None = None,
+    safe: Region | None = None,
     avoid: AvoidSets | None = None,
     *,
     cells: int = 10_000,
@@ -87,7 +87,8 @@ def winning_set(
         loop: the closed loop.
         domain: the initial states that are asked about.
         horizon: the number of steps.
-        goal: where every state must be at the horizon.
+        goal: where every state must be at the horizon; or a mapping from times, or from ranges of
+            times, to where it must be then.
         safe: where every state must be at all times.
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
             time to a sequence.

@@ -212,7 +212,7 @@ GOAL = {"goal": rj.Box([0.0, 0.0], [1.0, 1.0])}
 WRONG = {
     "nothing": ({}, ValueError, "goal"),
     "dimension": ({"goal": rj.Box([0.0], [1.0])}, ValueError, "goal"),
-    "a round goal": ({"goal": BALL}, TypeError, "goal"),
+    "a goal that is no set": ({"goal": 1.0}, TypeError, "goal"),
     "late": ({"avoid": {3: [BOX]}}, ValueError, "avoid"),
     "relaxation": ({**GOAL, "relaxation": rj.CuttingPlanes()}, TypeError, "relaxation"),
     "time": ({**GOAL, "time_limit": -1.0}, ValueError, "time_limit"),

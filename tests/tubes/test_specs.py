@@ -133,7 +133,7 @@ def test_three_dimensions_and_a_narrow_avoid_set():
 
 def test_a_verdict_is_no_truth_value(tube):
     verdict = rj.verify(tube, safe=rj.Box([0, 0], [1, 1]))
-    with pytest.raises(TypeError, match=r"compare verdict\.status"):
+    with pytest.raises(TypeError, match=r"use verdict\.proved"):
         bool(verdict)
 
 

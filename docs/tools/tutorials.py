@@ -67,6 +67,8 @@ def _page(notebook: nbformat.NotebookNode, stem: str) -> tuple[str, dict[str, by
                 name = f"{stem}-{len(figures)}.png"
                 figures[name] = base64.b64decode(data["image/png"])
                 parts.append(f"![What the code above draws]({name})")
+            elif "text/html" in data:  # one line is one block of markdown
+                parts.append(data["text/html"].replace("\n", ""))
             elif output.output_type == "execute_result":
                 parts.append(_text(data["text/plain"]))
     return "\n\n".join(parts), figures

@@ -24,8 +24,9 @@ class Result:
         tube: of the default method.
         states: `(c, horizon + 1, n)`, simulated.
         verdict: on the specification, from the initial set alone.
-        volumes: of each method, certified over sampled box volumes at the last step.
-        widths: of each method, the largest certified over sampled width at any step.
+        volumes: of each method, certified over simulated box volumes at the last step: sampled
+            trajectories, and those that climb.
+        widths: of each method, the largest certified over simulated width at any step.
         beyond: of each method, how far a sampled state is outside, in parts of a width.
         seconds: of each method, and of the verdict.
     """
@@ -57,7 +58,8 @@ def analysed(task: Task, samples: int, seed: int = 0) -> Result:
         lambda: rj.decide(task.loop, task.X0, task.horizon, **task.required)
     )
     states = np.asarray(tubes["default"].simulate(samples, seed))
-    support = task.support(states)
+    climbed = [np.asarray(tubes["default"].proof(t + 1).witnesses) for t in range(task.horizon)]
+    support = np.fmax(task.support(states), np.stack(climbed))  # of trajectories too
     wide = task.widths(support)
     ratios, beyond = {}, {}
     for name, tube in tubes.items():

@@ -13,8 +13,8 @@ from experiments.nonlinear.problems import Problem
 from experiments.nonlinear.training import Trained
 
 NOTE = """\
-volume: certified over sampled box volume at the last step
-width: the largest certified over sampled width at any step
+volume: certified over simulated box volume at the last step
+width: the largest certified over simulated width at any step
 s: seconds of a second call
 outside: how far a sampled state is beyond a set, in parts of a width"""
 

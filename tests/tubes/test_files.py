@@ -214,9 +214,12 @@ def test_a_file_with_a_flipped_bit(tube, path):
     tube.save(path)
     whole = path.read_bytes()
     rng = np.random.default_rng(0)
-    for place in rng.integers(len(whole), size=60):
+    flips = [(place, rng.integers(8)) for place in rng.integers(len(whole), size=60)]
+    names = whole.rfind(b"PK\x01\x02")  # in the list of contents: how its last entry is packed
+    flips += [(names + place, bit) for place in range(6, 12) for bit in range(8)]
+    for place, bit in flips:
         spoilt = bytearray(whole)
-        spoilt[place] ^= 1 << int(rng.integers(8))
+        spoilt[place] ^= 1 << int(bit)
         path.write_bytes(bytes(spoilt))
         found = loaded(path)
         if isinstance(found, ValueError):

@@ -131,6 +131,23 @@ def unrolled_at_once(
 
 
 @partial(jax.jit, static_argnames="t")
+def unrolled_from_boxes(
+    loop: ClosedLoop,
+    lower: Float[Array, "c n_x"],
+    upper: Float[Array, "c n_x"],
+    directions: Float[Array, "N m n_x"],
+    t: int = 0,
+) -> Float[Array, "c N m"]:
+    """Upper bounds of directions after 1, ..., N steps from each of many boxes, in one call."""
+
+    def one(lower: Float[Array, " n_x"], upper: Float[Array, " n_x"]) -> Float[Array, "N m"]:
+        box = Box(lower, upper)
+        return unrolled_at_once(loop, box, box, directions, t).offsets
+
+    return jax.vmap(one)(lower, upper)
+
+
+@partial(jax.jit, static_argnames="t")
 def weighed_at_once(
     loop: ClosedLoop,
     X0: AbstractSet,

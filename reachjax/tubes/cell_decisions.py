@@ -1,7 +1,8 @@
 """Verdicts by cells: each cell of an initial set is proved, or halved, or left undecided.
 
-A cell is bounded by forms, whose remainders fall with the third power of its width, and where
-rectifiers switch by linear programs. It is left at the first requirement that is not proved: what
+Cells are bounded by forms, whose remainders fall with the third power of their widths: many in one
+compiled call once there are as many. Those that are left over are bounded one by one, where
+rectifiers switch by linear programs, and left at the first requirement that is not proved: what
 comes later would only be worse. Halves are taken along the coordinate that moves the inputs of
 units most. Of a cell nothing is kept but its box and its margins.
 """
@@ -29,11 +30,10 @@ from reachjax.sets.cells import Cell, grid, halves_along
 from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.requirements import Requirement
+from reachjax.tubes.sieve import TOGETHER, Margins, Sieve
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.targets import target_of, values_of
 from reachjax.tubes.verdicts import Counterexample, DecidedCell, Verdict, VerdictStatus
-
-Margins = dict[str, Float[np.ndarray, " h+1"]]
 
 SHOTS = 64
 """How many trajectories are simulated from a cell that is not proved."""
@@ -65,6 +65,12 @@ class CellTask(NamedTuple):
     required: tuple[Requirement, ...]
     nodes: int
 
+    @property
+    def by_programs(self) -> bool:
+        """Whether linear programs may prove what forms do not."""
+        layers = self.loop.unit_layers
+        return self.nodes > 0 and not all(isinstance(each.unit, SmoothUnit) for each in layers)
+
 
 class Outcome(NamedTuple):
     """What is found of a cell.
@@ -82,7 +88,8 @@ class Outcome(NamedTuple):
     @property
     def margin(self) -> float:
         """The smallest."""
-        return float(min(np.nanmin(row) for row in self.margins.values() if np.isfinite(row).any()))
+        known = [np.nanmin(row) for row in self.margins.values() if not np.isnan(row).all()]
+        return float(min(known, default=-np.inf))
 
 
 def roots(X0: AbstractSet, cells: Any) -> tuple[list[Cell], int | None]:
@@ -154,32 +161,50 @@ class _Run:
         self.example: Counterexample | None = None
         self._tried: dict[int, deque[int]] = {}
         self._size = _size(boxed(X0, "X0"))
+        self._sieve = Sieve(task.loop, task.horizon, task.start, task.required)
 
     def results(self, begun: Sequence[Cell], executor: Executor | None) -> Iterator[int]:
         """How many cells are decided, after each that is bounded."""
-        open_cells = list(begun)[::-1]
+        open_cells, left_over = list(begun)[::-1], list[tuple[Cell, Margins | None]]()
         self._count = len(open_cells)
-        running: dict[Future, Cell] = {}
+        running: dict[Future, tuple[Cell, Margins | None]] = {}
         workers = 1 if executor is None else AHEAD * getattr(executor, "_max_workers", AHEAD)
         try:
-            while open_cells or running:
-                while open_cells and len(running) < workers:
-                    cell = open_cells.pop()
+            while open_cells or left_over or running:
+                while (open_cells or left_over) and len(running) < workers:
+                    if not left_over and len(open_cells) >= TOGETHER and not self._late:
+                        left_over = self._sifted(open_cells[-TOGETHER:])
+                        del open_cells[-TOGETHER:]
+                        yield len(self._done)
+                        continue
+                    cell, known = left_over.pop() if left_over else (open_cells.pop(), None)
                     axis = self._hopeless(cell)
                     if axis is not None:
                         open_cells += self._halved(cell, axis)[::-1]
                         continue
                     part = jax.device_get(cell.part)
-                    running[_submitted(executor, self._task, part, self._deadline)] = cell
+                    given = executor, self._task, part, self._deadline, known
+                    running[_submitted(*given)] = cell, known
                 finished, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in finished:
-                    open_cells += self._judged(running.pop(future), future.result())[::-1]
+                    open_cells += self._judged(running.pop(future)[0], future.result())[::-1]
                     yield len(self._done)
                 if self.example is not None:
                     return
         finally:
             for future in running:
                 future.cancel()
+
+    def _sifted(self, cells: Sequence[Cell]) -> list[tuple[Cell, Margins | None]]:
+        """Those of some cells that forms do not prove, with the margins that these say."""
+        ends = [(np.asarray(cell.box.lower), np.asarray(cell.box.upper)) for cell in cells]
+        found: list[tuple[Cell, Margins | None]] = []
+        for cell, sifted in zip(cells, self._sieve.sifted(ends), strict=True):
+            if sifted.proved:
+                self._judged(cell, Outcome(True, sifted.margins, 0))
+            else:
+                found.append((cell, sifted.margins))
+        return found
 
     def _judged(self, cell: Cell, outcome: Outcome) -> list[Cell]:
         """The halves of a cell that is not proved, as long as there may be more."""
@@ -194,10 +219,13 @@ class _Run:
             return []
         return self._halved(cell, outcome.axis)
 
+    @property
+    def _late(self) -> bool:
+        return time.monotonic() >= self._deadline
+
     def _may_halve(self, cell: Cell, axis: int) -> bool:
-        late = time.monotonic() >= self._deadline
         full = self._most is not None and self._count >= self._most
-        return not (late or full) and float(cell.box.widths[axis]) > 0
+        return not (self._late or full) and float(cell.box.widths[axis]) > 0
 
     def _halved(self, cell: Cell, axis: int) -> list[Cell]:
         found = halves_along(self._X0, cell.box, axis)
@@ -285,22 +313,29 @@ def _submitted(executor: Executor | None, *given: Any) -> Future:
     return future
 
 
-def outcome_of(task: CellTask, part: AbstractSet, deadline: float) -> Outcome:
+def outcome_of(
+    task: CellTask, part: AbstractSet, deadline: float, known: Margins | None = None
+) -> Outcome:
     """What is found of one cell, wherever it runs.
 
     Args:
         task: what is decided.
         part: of the initial set, of numpy arrays.
         deadline: when to stop, as `time.monotonic` says it.
+        known: the margins by forms over the cell's box, which do not prove all; None if unknown.
     """
     with jax.enable_x64(True):
         box = boxed(jax.device_put(part), "X0")
         begun = _open_box(part, box)
         around = jax.device_get(box)
-        margins = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
+        blank = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
+        margins = {name: row.copy() for name, row in (known or blank).items()}
         scenarios = Scenarios.of(task.loop, begun, task.horizon, task.start)
         limits = min(FEW, task.nodes), deadline, WORK
         ladder = Ladder(task.loop, begun, around, scenarios, task.start, *limits)
+        if known is not None and isinstance(begun, Box) and not task.by_programs:
+            ladder.advance(tighten=False)  # nothing but forms could be tried again
+            return Outcome(False, margins, _axis(ladder, _least(task.required, margins)))
         for k in range(task.horizon + 1):
             if k:
                 ladder.advance(tighten=False)
@@ -308,10 +343,16 @@ def outcome_of(task: CellTask, part: AbstractSet, deadline: float) -> Outcome:
                 if item.time == k:
                     middle = scenarios.middle(np.asarray(around.center))
                     proved, margin = bounded(item, ladder, part, middle)
-                    margins[item.name][k] = margin
+                    margins[item.name][k] = np.fmax(margins[item.name][k], margin)
                     if not proved:
                         return Outcome(False, margins, _axis(ladder, item))
         return Outcome(True, margins, 0)
+
+
+def _least(required: Sequence[Requirement], margins: Margins) -> Requirement:
+    """The first requirement that is not proved, in time."""
+    broken = [item for item in required if not margins[item.name][item.time] > 0]
+    return min(broken or required, key=lambda item: item.time)
 
 
 def _open_box(part: AbstractSet, box: Box) -> AbstractSet:

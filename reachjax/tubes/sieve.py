@@ -1,0 +1,157 @@
+"""Which of many cells affine forms decide, all in one compiled call.
+
+What one cell takes in numpy, hundreds take together. Cells that are left over are for whoever can
+do more: linear programs, or halving them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.numerics.rounding import gamma
+from reachjax.programs.unrolled import unrolled_from_boxes
+from reachjax.sets.balance import balanced
+from reachjax.tubes.requirements import Requirement
+
+TOGETHER = 32
+"""So many cells are a call: fewer are filled up, so that one shape is compiled."""
+
+Margins = dict[str, Float[np.ndarray, " h+1"]]
+
+Ends = tuple[Float[np.ndarray, " n_x"], Float[np.ndarray, " n_x"]]
+"""Lower and upper corners of a cell."""
+
+
+class Sifted(NamedTuple):
+    """What is found of a cell.
+
+    Attributes:
+        proved: whether all requirements hold from every state of it.
+        refuted: whether one of them fails from every state of it.
+        margins: of all requirements; NaN at times at which they are not meant.
+    """
+
+    proved: bool
+    refuted: bool
+    margins: Margins
+
+    @property
+    def margin(self) -> float:
+        """The smallest."""
+        known = [np.nanmin(row) for row in self.margins.values() if not np.isnan(row).all()]
+        return float(min(known, default=-np.inf))
+
+
+class _Rows(NamedTuple):
+    """Directions whose upper bounds decide a requirement, and the limits of these.
+
+    To be inside, all of `C x <= d`; to be outside, one of `-C x < -d`. The other way round, by
+    limits that are rounded the other way, it surely fails.
+
+    Attributes:
+        item: the requirement.
+        first: the number of its first direction among those of its time.
+        directions: `(2 k, n_x)`, those that prove it, then those that refute it.
+        limits: `(2 k,)`.
+        units: `(k,)`, what a distance of 1 in the units of the state changes the first by.
+    """
+
+    item: Requirement
+    first: int
+    directions: Float[np.ndarray, "2k n_x"]
+    limits: Float[np.ndarray, " 2k"]
+    units: Float[np.ndarray, " k"]
+
+    @classmethod
+    def of(cls, item: Requirement, first: int) -> _Rows:
+        """Those of a requirement."""
+        C, d, norms = (np.asarray(part) for part in item.region.facets_in_units(item.inside))
+        facets = (np.asarray(part) for part in item.looser.facets)
+        D, e = balanced(*facets, inner=not item.inside)
+        sign = 1.0 if item.inside else -1.0
+        directions, limits = np.concatenate([sign * C, -sign * D]), np.concatenate([d, -e])
+        limits[: len(d)] *= sign
+        limits[len(d) :] *= sign
+        return cls(item, first, directions, limits, norms)
+
+    @property
+    def end(self) -> int:
+        """The number of the first direction after its own."""
+        return self.first + len(self.limits)
+
+    def judged(self, uppers: Float[np.ndarray, " m"]) -> tuple[bool, bool, float]:
+        """Whether it surely holds, or surely fails, and its margin, given bounds at its time."""
+        found, k = uppers[self.first : self.end], len(self.units)
+        room = (self.limits - found)[:k] / self.units
+        known = np.isfinite(found)
+        if self.item.inside:
+            holds = known[:k].all() and (found[:k] <= self.limits[:k]).all()
+            fails = (known & (found < self.limits))[k:].any()
+            margin = room.min(initial=np.inf)
+        else:
+            holds = (known & (found < self.limits))[:k].any()
+            fails = known[k:].all() and (found[k:] <= self.limits[k:]).all()
+            margin = np.fmax.reduce(room)
+        return bool(holds), bool(fails), float(np.nan_to_num(margin, nan=-np.inf))
+
+
+class Sieve:
+    """Affine forms over many cells, and what they decide.
+
+    Args:
+        loop: the closed loop.
+        horizon: the number of steps.
+        start: the time of the cells.
+        required: the requirements.
+    """
+
+    def __init__(self, loop: ClosedLoop, horizon: int, start: int, required: Sequence[Requirement]):
+        self._loop, self._start = jax.device_put(loop), start
+        ends = np.zeros(horizon + 1, dtype=int)
+        self._rows: list[_Rows] = []
+        for item in required:
+            self._rows.append(_Rows.of(item, int(ends[item.time])))
+            ends[item.time] = self._rows[-1].end
+        directions = np.zeros((horizon + 1, int(ends.max()), loop.states))
+        for rows in self._rows:
+            directions[rows.item.time, rows.first : rows.end] = rows.directions
+        self._directions = directions
+        blank = np.full(horizon + 1, np.nan)
+        self._blank: Margins = {item.name: blank for item in required}
+
+    def sifted(self, cells: Sequence[Ends]) -> list[Sifted]:
+        """What is found of each cell, at most `TOGETHER` of them."""
+        filled = [*cells, *[cells[-1]] * (TOGETHER - len(cells))]
+        lower, upper = (np.stack(ends) for ends in zip(*filled, strict=True))
+        first, later = self._directions[0], jnp.asarray(self._directions[1:])
+        bounds = unrolled_from_boxes(self._loop, lower, upper, later, self._start)
+        bounds = np.concatenate([_at_first(first, lower, upper)[:, None], bounds], axis=1)
+        with np.errstate(invalid="ignore"):
+            return [self._judged(uppers) for uppers in bounds[: len(cells)]]
+
+    def _judged(self, uppers: Float[np.ndarray, "h+1 m"]) -> Sifted:
+        """What bounds say of one cell."""
+        margins, proved, refuted = {k: row.copy() for k, row in self._blank.items()}, True, False
+        for rows in self._rows:
+            item = rows.item
+            holds, fails, margin = rows.judged(uppers[item.time])
+            margins[item.name][item.time] = margin
+            proved, refuted = proved and holds, refuted or fails
+        return Sifted(proved, refuted, margins)
+
+
+def _at_first(
+    rows: Float[np.ndarray, "m n"], lower: Float[np.ndarray, "c n"], upper: Float[np.ndarray, "c n"]
+) -> Float[np.ndarray, "c m"]:
+    """What rows attain on boxes: exactly, if each is a coordinate, else rounded up."""
+    largest = np.maximum(rows * lower[:, None], rows * upper[:, None])
+    whole = np.isin(rows, (-1.0, 0.0, 1.0)).all(axis=1) & (np.count_nonzero(rows, axis=1) < 2)
+    error = gamma(2 * rows.shape[1]) * abs(largest).sum(axis=2)
+    return largest.sum(axis=2) + np.where(whole, 0.0, error)

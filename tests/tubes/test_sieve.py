@@ -1,0 +1,81 @@
+"""Cells that one compiled call decides are decided rightly, whatever the loop."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from reachjax.tubes.requirements import requirements
+from reachjax.tubes.sieve import TOGETHER, Sieve
+from tests.closed_loops import closed_loop, random_loop
+from tests.disturbed_loops import attacked, double_integrator
+from tests.input_polytopes import polygon, polytope_loop
+
+HORIZON = 3
+
+
+def smooth():
+    def f(x, u):
+        return jnp.stack([x[0] + 0.1 * x[1], x[1] + 0.1 * jnp.sin(x[0]) + 0.1 * u[0], 0.9 * x[2]])
+
+    net = rj.MLP.from_layers(
+        [(0.5 * np.ones((4, 3)), np.zeros(4)), (-np.ones((1, 4)), [0.0])], rj.Tanh()
+    )
+    return rj.ClosedLoop(rj.NonlinearPlant(f, states=3, inputs=1), net)
+
+
+LOOPS = {
+    "one state": lambda: closed_loop(random_loop(1, (3,), seed=4)),
+    "three states": lambda: closed_loop(random_loop(3, (4, 3), seed=2)),
+    "smooth": smooth,
+    "disturbed": lambda: double_integrator()[0],
+    "polytope of inputs": lambda: polytope_loop(polygon(4)),
+}
+
+
+def cells(n, width=0.3):
+    rng = np.random.default_rng(0)
+    lower = rng.uniform(-1, 1, (TOGETHER - 3, n))
+    return [(low, low + rng.choice([0.0, width], n)) for low in lower]
+
+
+@pytest.mark.parametrize("kind", LOOPS)
+def test_what_is_decided_of_cells_is_true(kind):
+    loop = LOOPS[kind]()
+    n = loop.states
+    goal, avoid = rj.Ellipsoid(np.zeros(n), 0.7 * np.eye(n)), rj.Box([-0.4] * n, [-0.1] * n)
+    wanted = requirements(n, HORIZON, goal, [avoid], rj.Box([-1.0] * n, [1.0] * n))
+    boxes = cells(n)
+    decided = []
+    for (low, high), found in zip(
+        boxes, Sieve(loop, HORIZON, 0, wanted).sifted(boxes), strict=True
+    ):
+        runs = attacked(loop, rj.Box(low, high), HORIZON, 100)
+        rooms = np.array([item.simulated(runs) for item in wanted])
+        decided.append((found.proved, found.refuted))
+        if found.proved:
+            assert (rooms >= 0).all()
+        if found.refuted:
+            assert (rooms <= 0).any(axis=0).all()
+        for item, row in zip(wanted, rooms, strict=True):
+            assert found.margins[item.name][item.time] <= row.min() + 1e-12
+        assert not (found.proved and found.refuted)
+    assert np.any(decided, axis=0).any()
+
+
+def test_few_cells_are_bounded_as_many():
+    loop = LOOPS["three states"]()
+    sieve = Sieve(
+        loop, HORIZON, 0, requirements(3, HORIZON, None, None, rj.Box(-np.ones(3), np.ones(3)))
+    )
+    boxes = cells(3)
+    many, few = sieve.sifted(boxes), sieve.sifted(boxes[:2])
+    assert [str(one) for one in many[:2]] == [str(one) for one in few]
+
+
+def test_touching_at_first_is_inside():
+    loop = LOOPS["one state"]()
+    wanted = requirements(1, 1, None, None, rj.Box([-1e9], [1e9]))
+    wanted[0] = requirements(1, 1, {0: rj.Box([-0.1], [0.3])}, None, None)[0]
+    (found,) = Sieve(loop, 1, 0, wanted).sifted([(np.array([-0.1]), np.array([0.3]))])
+    assert found.proved

@@ -37,6 +37,7 @@ from reachjax.tubes.cell_decisions import CellTask, bounded, fails_everywhere
 from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.propagation import deadline_of
 from reachjax.tubes.requirements import AvoidSets, Region, Timed, requirements
+from reachjax.tubes.seals import seal_of
 from reachjax.tubes.sieve import TOGETHER, Ends, Sieve, Sifted
 from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
 from reachjax.tubes.winning_sets import WinningSet
@@ -121,7 +122,7 @@ def winning_set(
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind, or a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or what
-            is known is of another domain.
+            is known is of another question.
 
     Example:
         >>> from reachjax import MLP, AffinePlant
@@ -149,15 +150,23 @@ def winning_set(
     required = requirements(loop.states, horizon, goal, avoid, safe)
     loop, domain = jax.device_get(owned((loop, domain)))
     task = CellTask(loop, horizon, start, tuple(required), relaxation.nodes)
-    cells_so_far = [_whole(domain)]
+    asked = {
+        f"{number}: {item.name}, {item.time}, {item.inside}": (item.region, item.ball)
+        for number, item in enumerate(required)
+    }
+    seal, cells_so_far = seal_of(loop, domain, asked, start=start), [_whole(domain)]
     if known is not None:
         require_kind("known", known, WinningSet, "a WinningSet, as winning_set(...) returns it")
-        known.require_domain(domain)
+        if not np.array_equal(known.seal, seal):
+            raise ValueError(
+                "known must be of the same loop, domain, start, horizon and requirements, but of "
+                "another question arrived: what was proved of that says nothing of this one"
+            )
         cells_so_far = list(known.cells)
     run = _Run(task, domain, cells_so_far, most, deadline_of(time_limit))
     for _ in wrapped(progress, run.results(executor)):
         pass
-    return WinningSet(domain, tuple(run.done))
+    return WinningSet(domain, tuple(run.done), seal)
 
 
 def _whole(domain: Box) -> DecidedCell:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
-from reachjax.numerics.checks import Numbers, require_kind, same_size
+from reachjax.numerics.checks import Numbers, same_size
 from reachjax.sets import Box
 from reachjax.tubes.displays import display, picture, table
+from reachjax.tubes.seals import Seal
 from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
 
 if TYPE_CHECKING:
@@ -31,10 +32,12 @@ class WinningSet:
     Attributes:
         domain: the initial states that were asked about.
         cells: they cover it.
+        seal: a hash of the question: of the loop, the domain, and what is required of it when.
     """
 
     domain: Box
     cells: tuple[DecidedCell, ...]
+    seal: Seal
 
     def __repr__(self) -> str:
         return f"WinningSet(cells={len(self.cells)}, states={self.domain.dimension})"
@@ -100,16 +103,3 @@ class WinningSet:
                 inside = np.all((lower <= some) & (some <= upper), axis=2)
                 found[first : first + AT_ONCE] = np.any(inside, axis=1)
         return found.reshape(points.shape[:-1])
-
-    def require_domain(self, domain: Box) -> None:
-        """Raise an error unless the cells are of this domain.
-
-        Raises:
-            ValueError: they are of another one.
-        """
-        require_kind("domain", domain, Box, "a Box")
-        ends = [(np.asarray(each.lower), np.asarray(each.upper)) for each in (self.domain, domain)]
-        if not all(np.array_equal(one, other) for one, other in zip(*ends, strict=True)):
-            raise ValueError(
-                f"known must be of the domain {domain}, but one of {self.domain} arrived"
-            )

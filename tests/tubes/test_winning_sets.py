@@ -138,6 +138,28 @@ def test_it_is_shown(loop):
     assert found.contains([[100.0, 0.0]]).tolist() == [False]
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"goal": rj.Box([-0.5, -0.6], [0.6, 0.6])},
+        {"goal": {4: WANTED["goal"]}},
+        {"avoid": []},
+        {"horizon": HORIZON + 1, "goal": {HORIZON: WANTED["goal"]}},
+        {"start": 1},
+        {"loop": None},
+    ],
+)
+def test_what_is_known_of_another_question_is_refused(loop, changes):
+    asked = {"loop": loop, "domain": DOMAIN, "horizon": HORIZON, **WANTED, "cells": 2}
+    few = rj.winning_set(**asked)
+    rj.winning_set(**asked, known=few)
+    asked |= changes
+    if asked["loop"] is None:
+        asked["loop"] = loop.replace(input_box=rj.Box([-1.0], [1.0 + 1e-15]))
+    with pytest.raises(ValueError, match="known must be of the same loop"):
+        rj.winning_set(**asked, known=few)
+
+
 def test_bad_input_is_named(loop):
     few = rj.winning_set(loop, DOMAIN, HORIZON, cells=1, **WANTED)
     other = rj.Box([-1.0, -1.0], [1.0, 1.0])
@@ -145,7 +167,7 @@ def test_bad_input_is_named(loop):
         rj.winning_set(loop, rj.Ellipsoid([0, 0], np.eye(2)), HORIZON, **WANTED)
     with pytest.raises(ValueError, match="nothing to verify"):
         rj.winning_set(loop, DOMAIN, HORIZON)
-    with pytest.raises(ValueError, match="known must be of the domain"):
+    with pytest.raises(ValueError, match="known must be of the same loop, domain"):
         rj.winning_set(loop, other, HORIZON, known=few, **WANTED)
     with pytest.raises(TypeError, match="known must be a WinningSet"):
         rj.winning_set(loop, DOMAIN, HORIZON, known=DOMAIN, **WANTED)

@@ -35,8 +35,8 @@ from reachjax.tubes.steps import boxed
 from reachjax.tubes.targets import target_of, values_of
 from reachjax.tubes.verdicts import Counterexample, DecidedCell, Verdict, VerdictStatus
 
-SHOTS = 64
-"""How many trajectories are simulated from a cell that is not proved."""
+SHOTS, FEWER = 64, 8
+"""How many trajectories are simulated from a cell that is not proved; and from each of many."""
 
 FEW = 50
 """Linear programs that a bound may take in a cell: halving it is the other way."""
@@ -165,7 +165,7 @@ class _Run:
 
     def results(self, begun: Sequence[Cell], executor: Executor | None) -> Iterator[int]:
         """How many cells are decided, after each that is bounded."""
-        open_cells, left_over = list(begun)[::-1], list[tuple[Cell, Margins | None]]()
+        open_cells, left_over = deque(begun), deque[tuple[Cell, Margins | None]]()
         self._count = len(open_cells)
         running: dict[Future, tuple[Cell, Margins | None]] = {}
         workers = 1 if executor is None else AHEAD * getattr(executor, "_max_workers", AHEAD)
@@ -173,21 +173,22 @@ class _Run:
             while open_cells or left_over or running:
                 while (open_cells or left_over) and len(running) < workers:
                     if not left_over and len(open_cells) >= TOGETHER and not self._late:
-                        left_over = self._sifted(open_cells[-TOGETHER:])
-                        del open_cells[-TOGETHER:]
+                        some = [open_cells.popleft() for _ in range(TOGETHER)]
+                        left_over.extend(self._sifted(some))
                         yield len(self._done)
                         continue
-                    cell, known = left_over.pop() if left_over else (open_cells.pop(), None)
-                    axis = self._hopeless(cell)
+                    cell, known = left_over.popleft() if left_over else (open_cells.popleft(), None)
+                    bounded = known is not None and not self._task.by_programs
+                    axis = None if bounded else self._hopeless(cell)
                     if axis is not None:
-                        open_cells += self._halved(cell, axis)[::-1]
+                        open_cells.extend(self._halved(cell, axis))
                         continue
                     part = jax.device_get(cell.part)
                     given = executor, self._task, part, self._deadline, known
                     running[_submitted(*given)] = cell, known
                 finished, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in finished:
-                    open_cells += self._judged(running.pop(future)[0], future.result())[::-1]
+                    open_cells.extend(self._judged(running.pop(future)[0], future.result()))
                     yield len(self._done)
                 if self.example is not None:
                     return
@@ -264,8 +265,9 @@ class _Run:
         """Simulate a few trajectories from a cell: corners and points."""
         rng = np.random.default_rng(len(self._done))
         lower, upper = np.asarray(cell.box.lower), np.asarray(cell.box.upper)
-        ends = rng.uniform(size=(SHOTS, len(lower)))
-        ends[: SHOTS // 2] = ends[: SHOTS // 2] > 0.5
+        shots = SHOTS if self._count < SHOTS else FEWER
+        ends = rng.uniform(size=(shots, len(lower)))
+        ends[: shots // 2] = ends[: shots // 2] > 0.5
         states = np.clip(lower + ends * (upper - lower), lower, upper)
         states = states[np.asarray(self._X0.contains(states))]
         if len(states):

@@ -20,11 +20,12 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.programs.affine_steps import step_columns
-from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
+from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.proofs.cells import CellCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet, Box, Polytope, Template
 from reachjax.sets.cells import Cell, halves_along
+from reachjax.tubes.cell_slopes import moving_offsets
 from reachjax.tubes.ladder import FLAT, ROUNDED
 from reachjax.tubes.steps import Reached, Setting
 
@@ -117,7 +118,8 @@ def sets_by_cells(
         offsets, deciding = search.bounds[k], search.deciding[k]
         bounds = owned(offsets)
         if not is_concrete(setting.loop, X0, directions):
-            moving = _moving(setting, box, directions, [search.leaves[i] for i in deciding], k)
+            cells = [search.leaves[i].cell for i in deciding]
+            moving = moving_offsets(setting, X0, box, directions, cells, k)
             moving = jnp.where(jnp.isfinite(moving), moving, 0.0)
             bounds = bounds + (moving - jax.lax.stop_gradient(moving))
         facets = len(offsets)
@@ -278,26 +280,3 @@ def _work(loop: ClosedLoop, horizon: int) -> float:
     columns = loop.states**2 + between + more * np.arange(1, horizon + 1)
     parameters = sum(np.size(leaf) for leaf in jax.tree.leaves(loop))
     return float(np.sum(OVERHEAD + parameters * columns))
-
-
-def _moving(
-    setting: Setting,
-    box: Box,
-    directions: Float[Array, "N f n_x"],
-    deciding: list[_Node],
-    k: int,
-) -> Float[Array, " f"]:
-    """Numbers with the derivatives of what the deciding cells prove after `k + 1` steps."""
-    offsets: list[Array] = []
-    known: dict[int, Array] = {}
-    lower, upper = (np.asarray(jax.lax.stop_gradient(end)) for end in (box.lower, box.upper))
-    sides = np.where(upper > lower, upper - lower, 1.0)
-    for facet, leaf in enumerate(deciding):
-        if id(leaf) not in known:
-            ends = (np.asarray(end) for end in (leaf.cell.box.lower, leaf.cell.box.upper))
-            shares = ((end - lower) / sides for end in ends)
-            cell = Box(*(box.lower + share * (box.upper - box.lower) for share in shares))
-            given = setting.loop, cell, cell, directions, setting.start
-            known[id(leaf)] = unrolled_at_once(*given).offsets[k]
-        offsets.append(known[id(leaf)][facet])
-    return jnp.stack(offsets)

@@ -57,12 +57,13 @@ class Counterexample:
 
 
 class DecidedCell(NamedTuple):
-    """What is known of one cell of an initial set.
+    """What is known of one cell of an initial set, or of a domain.
 
     Attributes:
         lower: `(n_x,)`, of its box.
         upper: `(n_x,)`.
-        status: of the cell alone: refuted is one in which a counterexample begins.
+        status: of the cell alone. Refuted is, in a verdict, one in which a counterexample begins;
+            in a winning set, one from every state of which the specification fails.
         margin: the smallest certified one.
     """
 

@@ -18,7 +18,6 @@ import numpy as np
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.checks import (
-    is_concrete,
     owned,
     require_bar,
     require_double_precision,
@@ -36,7 +35,13 @@ from reachjax.sets import AbstractSet
 from reachjax.tubes.cell_decisions import decided_by_cells, roots
 from reachjax.tubes.cell_tasks import CellTask
 from reachjax.tubes.ladder import WORK, Climbed, Ladder
-from reachjax.tubes.propagation import Progress, deadline_of, require_kinds, simulations_from
+from reachjax.tubes.propagation import (
+    Progress,
+    deadline_of,
+    known_numbers,
+    require_kinds,
+    simulations_from,
+)
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
 from reachjax.tubes.steps import boxed
@@ -76,8 +81,8 @@ def decide(
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
         safe: where every state must be at all times (its complement is avoided).
-        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
-            time to a sequence.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
+            times, or from ranges of times, to sequences.
         relaxation: how many linear programs a bound may take.
         start: the time of `X0`, for time-varying loops.
         samples: how many trajectories are simulated in search of a counterexample, besides those
@@ -125,14 +130,8 @@ def decide(
     loop.check_horizon(horizon, start)
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
-    deadline, fixed = deadline_of(time_limit), jax.lax.stop_gradient((loop, X0))
-    if not is_concrete(fixed):
-        raise ValueError(
-            "loop or X0 holds traced numbers, and a verdict is decided on known ones: call decide "
-            "outside of jax.jit"
-        )
+    deadline, (loop, X0) = deadline_of(time_limit), known_numbers("decide", loop, X0, "X0")
     required = requirements(loop.states, horizon, goal, avoid, safe)
-    loop, X0 = owned(fixed)
     simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     if cells is not None:
         counts, most = roots(X0, cells)

@@ -28,7 +28,7 @@ from reachjax.numerics.checks import (
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds
 from reachjax.sets import Box, Ellipsoid, Template
 from reachjax.tubes.decisions import decide
-from reachjax.tubes.propagation import deadline_of
+from reachjax.tubes.propagation import deadline_of, known_numbers
 from reachjax.tubes.reach import reach
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
 from reachjax.tubes.shapes import Kind, Shape
@@ -86,8 +86,8 @@ def largest_set(
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
         safe: where every state must be at all times.
-        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
-            time to a sequence.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
+            times, or from ranges of times, to sequences.
         rounds: steps of the ascent by affine forms.
         relaxation: how many linear programs a bound may take: most of the time goes into the last
             few percents.
@@ -120,6 +120,7 @@ def largest_set(
     whole_number("rounds", rounds, 0)
     loop.check_horizon(horizon, start)
     require_bar(progress)
+    loop, X0 = known_numbers("largest_set", loop, X0, "X0")
     required = requirements(loop.states, horizon, goal, avoid, safe)
 
     def decided(region: Kind) -> Verdict:

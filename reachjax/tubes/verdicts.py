@@ -165,14 +165,15 @@ class Verdict:
     def __str__(self) -> str:
         lines = [self.status.name]
         for name, margins in self.margins.items():
-            simulated = float(np.nanmin(self.simulated[name]))
+            least, _ = _least_at(self.simulated[name])
+            simulated = "unknown" if np.isnan(least) else f"{least:+.4g}"
             if np.isnan(margins).all():  # refuted before anything was bounded
-                lines.append(f"  {name}: simulated margin {simulated:+.4g}")
+                lines.append(f"  {name}: simulated margin {simulated}")
                 continue
             t = int(np.nanargmin(margins))
             lines.append(
                 f"  {name}: certified margin {margins[t]:+.4g} (smallest, at t = {t}), "
-                f"simulated margin {simulated:+.4g}"
+                f"simulated margin {simulated}"
             )
         if self.counterexample is not None:
             e = self.counterexample

@@ -24,7 +24,6 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.loops.units import UnboundedError
 from reachjax.numerics.checks import (
-    owned,
     require_bar,
     require_double_precision,
     require_executor,
@@ -38,7 +37,7 @@ from reachjax.sets import Box
 from reachjax.tubes.cell_jobs import CellJobs
 from reachjax.tubes.cell_tasks import CellTask, bounded, fails_everywhere
 from reachjax.tubes.ladder import WORK, Ladder
-from reachjax.tubes.propagation import deadline_of
+from reachjax.tubes.propagation import deadline_of, known_numbers
 from reachjax.tubes.requirements import AvoidSets, Region, Timed, requirements
 from reachjax.tubes.sieve import TOGETHER, Ends, Margins, Sieve, Sifted
 from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
@@ -108,8 +107,8 @@ def winning_set(
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
         safe: where every state must be at all times.
-        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
-            time to a sequence.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
+            times, or from ranges of times, to sequences.
         cells: how many there may be. The largest that are undecided are halved.
         relaxation: how many linear programs a bound may take, once there are as many cells.
         start: the time of the initial states.
@@ -153,7 +152,7 @@ def winning_set(
     require_executor(executor)
     require_bar(progress)
     required = requirements(loop.states, horizon, goal, avoid, safe)
-    loop, domain = jax.device_get(owned((loop, domain)))
+    loop, domain = jax.device_get(known_numbers("winning_set", loop, domain, "domain"))
     task = CellTask(loop, horizon, start, tuple(required), relaxation.nodes)
     cells_so_far = [_whole(domain)]
     if known is not None:

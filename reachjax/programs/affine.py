@@ -149,6 +149,12 @@ class AffineForms:
         reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(constant(middle))
         return met(by_forms, (middle - reach, middle + reach))
 
+    def largest(self, there: Float[Array | np.ndarray, "k c"]) -> Float[Array | np.ndarray, " k"]:
+        """The largest value of each form where the first columns are these, but for rounding."""
+        count = there.shape[1]
+        first, rest = self.columns[:, :count], self.columns[:, count:]
+        return self.rows[:, 0] + (first * there).sum(axis=1) + abs(rest).sum(axis=1)
+
     def widened(self, width: int) -> AffineForms:
         """The same over at least so many columns, the new ones empty (numpy)."""
         more = width - self.rows.shape[1] + 2

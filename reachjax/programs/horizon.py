@@ -230,7 +230,8 @@ class Horizon:
                 parts = [getattr(layer, name) for layer in layers]
                 known[number] = np.concatenate([np.zeros(0), *parts])
         of_set, of_products = (multipliers[:, step == kind] for kind in (-1, -2))
-        return FactWeights(found, of_set, of_products, ranges)
+        nowhere = np.full((len(multipliers), self.start.count), np.nan)
+        return FactWeights(found, of_set, of_products, ranges, nowhere)
 
     def narrow(self, lower: Float[np.ndarray, " n_x"], upper: Float[np.ndarray, " n_x"]) -> None:
         """Meet the state with bounds that surely hold it."""

@@ -32,12 +32,15 @@ class FactWeights(NamedTuple):
         of_set: `(f, r)`, of the facets of the initial set.
         of_products: `(f, p)`, of the facts of products of its columns.
         ranges: `(N, 2, units)`, lower and upper bounds of the units' inputs, as they were known.
+        attained: `(f, c)`, the initial columns where each bound is attained, which is that of a
+            form there then; NaN for the norms of its form.
     """
 
     of_units: Float[Array | np.ndarray, "f N b units"]
     of_set: Float[Array | np.ndarray, "f r"]
     of_products: Float[Array | np.ndarray, "f p"]
     ranges: Float[Array | np.ndarray, "N 2 units"]
+    attained: Float[Array | np.ndarray, "f c"]
 
 
 class ByForms(NamedTuple):
@@ -203,8 +206,11 @@ def weighed_at_once(
             sectors = (block.rows for block in said.blocks if block.mark is Mark.SECTOR)
             for rows, weight in zip(sectors, jnp.moveaxis(given, 1, 0), strict=False):
                 total = total + weight[:, here] @ rows
-        return (state, total), (directions @ state + total).ends(start)[1]
+        forms = directions @ state + total
+        return (state, total), jnp.where(held, forms.largest(there), forms.ends(start)[1])
 
+    held = jnp.isfinite(weights.attained).all(axis=1)
+    there = jnp.where(held[:, None], weights.attained, 0.0)
     of_units = jnp.moveaxis(weights.of_units, 1, 0)
     given = jnp.arange(steps), of_units, jnp.asarray(weights.ranges)
     return jax.lax.scan(advance, (state, total), given)[1]

@@ -31,7 +31,7 @@ def maximiser(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> tuple[np.n
         RuntimeError: the linear program was not solved.
     """
     result = linprog(-direction, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
-    if result.status == 2 or (result.status == 4 and _is_empty(A, b)):
+    if result.status == 2 or (result.status == 4 and is_empty(A, b)):
         raise ValueError("the polytope A x <= b is empty: no point satisfies all its facets")
     if result.status == 3:
         raise ValueError(
@@ -60,7 +60,9 @@ def maximisers(
     return np.maximum(-result.ineqlin.marginals.reshape(k, m), 0.0), result.x.reshape(k, n)
 
 
-def _is_empty(A: np.ndarray, b: np.ndarray) -> bool:
+def is_empty(A: np.ndarray, b: np.ndarray) -> bool:
+    """Whether a linear program says that no point is in a polytope, which may be unbounded."""
+    A, b = balanced(A, b)
     zero = np.zeros(A.shape[1])
     return linprog(zero, A_ub=A, b_ub=b, bounds=(None, None), method="highs").status == 2
 

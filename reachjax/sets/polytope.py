@@ -59,8 +59,8 @@ class Polytope(PolyhedralSet):
             upper: `(n,)`; infinity where there is none.
 
         Raises:
-            ValueError: sizes differ, an entry is NaN, `lower > upper` in a coordinate, or no side
-                is finite.
+            ValueError: sizes differ, an entry is NaN, `lower > upper` in a coordinate, an infinite
+                side leaves no point, or no side is finite.
 
         Example:
             >>> Polytope.between([0.0, -np.inf], [1.0, np.inf]).contains([0.5, 1e9]).item()
@@ -74,6 +74,11 @@ class Polytope(PolyhedralSet):
             )
         if not np.all(ends[0] <= ends[1]):
             raise ValueError(f"lower must not be above upper, but {lower} and {upper} arrived")
+        if np.any(ends[0] == np.inf) or np.any(ends[1] == -np.inf):
+            raise ValueError(
+                "lower must be below infinity, and upper above minus infinity, but "
+                f"{lower} and {upper} arrived"
+            )
         eye = np.eye(len(ends[0]))
         A, b = np.vstack([eye, -eye]), np.hstack([ends[1], -ends[0]])
         finite = np.isfinite(b)

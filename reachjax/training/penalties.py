@@ -113,8 +113,8 @@ def specification_penalty(
         template: what every set looks like: facet directions, ellipsoids, or both.
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
-        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
-            time to a sequence.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
+            times, or from ranges of times, to sequences.
         safe: where every state must be at all times.
         margin: how far the sets should be from breaking a requirement, in the units of the state; a
             little more than zero keeps the proof when the weights move on.

@@ -20,11 +20,12 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.programs.affine_steps import step_columns
-from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
+from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.proofs.cells import CellCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet, Box, Polytope, Template
 from reachjax.sets.cells import Cell, halves_along
+from reachjax.tubes.cell_slopes import moving_offsets
 from reachjax.tubes.ladder import FLAT, ROUNDED
 from reachjax.tubes.steps import Reached, Setting
 
@@ -37,6 +38,14 @@ OVERHEAD = 2.5e7
 LOOKED = 8
 """After so many halvings, where cells say that facets are largest is simulated."""
 
+CONSTANT = 1e-12
+"""A facet whose values differ by no more than this part of the states' sizes is flat."""
+
+GENERATIONS, FALL = 8, 0.1
+"""A cell that is halved so often, and each coordinate twice, lowers a facet's bound by this part of
+what is open, or the facet is done: what disturbances leave open, no halving closes. What smooth
+functions leave open falls by a factor of 64 meanwhile."""
+
 
 class _Node:
     """A part of the initial set, with its halves or what forms over it say.
@@ -44,17 +53,30 @@ class _Node:
     Args:
         cell: the part.
         steps: for each step what forms say.
+        parent: what it is a half of; None of the initial set.
     """
 
-    def __init__(self, cell: Cell, steps: list[ByForms]):
-        self.cell, self.steps = cell, steps
+    def __init__(self, cell: Cell, steps: list[ByForms], parent: _Node | None = None):
+        self.cell, self.steps, self._parent = cell, steps, parent
         self.offsets = np.array([step.offsets for step in steps])
         self.axis, self.halves = -1, list[_Node]()
 
     @property
     def axes(self) -> list[int]:
         """Along which coordinates it and its parts are halved, as `from_tree` takes them."""
-        return [self.axis, *(axis for half in self.halves for axis in half.axes)]
+        found, left = list[int](), [self]
+        while left:
+            node = left.pop()
+            found.append(node.axis)
+            left += node.halves[::-1]
+        return found
+
+    def before(self, generations: int) -> _Node | None:
+        """What it is left of after so many halvings; None if there were fewer."""
+        node: _Node | None = self
+        for _ in range(generations):
+            node = node and node._parent
+        return node
 
 
 def sets_by_cells(
@@ -96,7 +118,8 @@ def sets_by_cells(
         offsets, deciding = search.bounds[k], search.deciding[k]
         bounds = owned(offsets)
         if not is_concrete(setting.loop, X0, directions):
-            moving = _moving(setting, box, directions, [search.leaves[i] for i in deciding], k)
+            cells = [search.leaves[i].cell for i in deciding]
+            moving = moving_offsets(setting, X0, box, directions, cells, k)
             moving = jnp.where(jnp.isfinite(moving), moving, 0.0)
             bounds = bounds + (moving - jax.lax.stop_gradient(moving))
         facets = len(offsets)
@@ -143,6 +166,7 @@ class _Search:
         cell = Cell(X0.bounding_box(), X0)
         sides = np.asarray(cell.box.widths)
         self._sides = np.where(sides > 0, sides, 1.0)  # a side without length is not halved
+        self._generations = max(GENERATIONS, 2 * int(np.sum(sides > 0)))
         self._root = self._made(cell)
         self.leaves = [self._root]
         self._note()
@@ -155,9 +179,9 @@ class _Search:
         budget = WORK / _work(self._loop, len(directions)) if np.isinf(setting.deadline) else np.inf
         self._left = min(2 * most - 2, budget)
 
-    def _made(self, cell: Cell) -> _Node:
+    def _made(self, cell: Cell, parent: _Node | None = None) -> _Node:
         given = self._loop, cell.part, cell.box, self._directions, self._setting.start
-        return _Node(cell, list(unrolled(*given)))
+        return _Node(cell, list(unrolled(*given)), parent)
 
     def _note(self) -> None:
         every = np.array([leaf.offsets for leaf in self.leaves])
@@ -175,23 +199,50 @@ class _Search:
         if simulations is None:
             return
         least, most = self._simulated()
-        gap = self._setting.gap
-        floor = FLAT * (self.bounds - least) / 2
-        if gap:
-            floor = np.fmax(floor, ROUNDED / gap * abs(self.bounds))
+        floor = self._floor(least, most)
         for count in itertools.count():
             if count % LOOKED == 0:
                 simulations.include(*(self.farthest(k) for k in range(len(self.bounds))))
                 least, most = self._simulated()
-            open_parts = (self.bounds - most) / np.fmax((most - least) / 2, floor)
-            open_parts[: self._known] = -np.inf
-            worst = np.unravel_index(open_parts.argmax(), open_parts.shape)
-            if open_parts[worst] <= gap or self._left < 2 or self._setting.late:
+            if self._left < 2 or self._setting.late:
                 return
-            self._setting.note(f"{len(self.leaves)} cells, largest gap {open_parts[worst]:.1e}")
-            if not self._halve(int(self.deciding[worst])):
+            excess, half = self.bounds - most, np.fmax((most - least) / 2, floor)
+            open_parts = np.divide(excess, half, out=np.zeros_like(excess), where=excess > 0)
+            open_parts[: self._known] = 0.0
+            number = self._widest(open_parts, excess)
+            if number is None or not self._halve(number):
                 return
             self._note()
+
+    def _widest(
+        self, open_parts: Float[np.ndarray, "N f"], excess: Float[np.ndarray, "N f"]
+    ) -> int | None:
+        """The leaf that decides the facet of the widest gap, of those that halving still closes."""
+        for place in np.argsort(-open_parts, axis=None, kind="stable"):
+            worst = np.unravel_index(place, open_parts.shape)
+            if not open_parts[worst] > self._setting.gap:
+                return None
+            number = int(self.deciding[worst])
+            leaf = self.leaves[number]
+            before = leaf.before(self._generations)
+            if before and before.offsets[worst] - leaf.offsets[worst] < FALL * excess[worst]:
+                continue
+            self._setting.note(f"{len(self.leaves)} cells, largest gap {open_parts[worst]:.1e}")
+            return number
+        return None
+
+    def _floor(
+        self, least: Float[np.ndarray, "N f"], most: Float[np.ndarray, "N f"]
+    ) -> Float[np.ndarray, "N f"]:
+        """What half a facet's range counts as, at least: of one that is flat, by states' sizes."""
+        gap, simulations = self._setting.gap, self._setting.simulations
+        floor = FLAT * (self.bounds - least) / 2
+        if not gap or simulations is None:
+            return floor
+        largest = np.maximum.accumulate(abs(simulations.runs.states).max(axis=0, initial=0.0))
+        sizes = np.einsum("kfn,kn->kf", abs(self._directions), largest[1:])
+        flat = most - least <= CONSTANT * sizes
+        return np.fmax(floor, ROUNDED / gap * np.where(flat, sizes, abs(self.bounds)))
 
     def _simulated(self) -> tuple[np.ndarray, np.ndarray]:
         """The least and largest simulated values of all facets."""
@@ -207,7 +258,7 @@ class _Search:
         axis = int(widths.argmax())
         if not widths[axis] > 0:
             return False
-        halves = [self._made(half) for half in halves_along(self._X0, leaf.cell.box, axis)]
+        halves = [self._made(half, leaf) for half in halves_along(self._X0, leaf.cell.box, axis)]
         leaf.axis, leaf.halves, leaf.steps = axis, halves, []
         self.leaves[number : number + 1] = halves
         self._left -= len(halves)
@@ -229,26 +280,3 @@ def _work(loop: ClosedLoop, horizon: int) -> float:
     columns = loop.states**2 + between + more * np.arange(1, horizon + 1)
     parameters = sum(np.size(leaf) for leaf in jax.tree.leaves(loop))
     return float(np.sum(OVERHEAD + parameters * columns))
-
-
-def _moving(
-    setting: Setting,
-    box: Box,
-    directions: Float[Array, "N f n_x"],
-    deciding: list[_Node],
-    k: int,
-) -> Float[Array, " f"]:
-    """Numbers with the derivatives of what the deciding cells prove after `k + 1` steps."""
-    offsets: list[Array] = []
-    known: dict[int, Array] = {}
-    lower, upper = (np.asarray(jax.lax.stop_gradient(end)) for end in (box.lower, box.upper))
-    sides = np.where(upper > lower, upper - lower, 1.0)
-    for facet, leaf in enumerate(deciding):
-        if id(leaf) not in known:
-            ends = (np.asarray(end) for end in (leaf.cell.box.lower, leaf.cell.box.upper))
-            shares = ((end - lower) / sides for end in ends)
-            cell = Box(*(box.lower + share * (box.upper - box.lower) for share in shares))
-            given = setting.loop, cell, cell, directions, setting.start
-            known[id(leaf)] = unrolled_at_once(*given).offsets[k]
-        offsets.append(known[id(leaf)][facet])
-    return jnp.stack(offsets)

@@ -1,95 +1,43 @@
 """Verdicts by cells: each cell of an initial set is proved, or halved, or left undecided.
 
 Cells are bounded by forms, whose remainders fall with the third power of their widths: many in one
-compiled call once there are as many. Those that are left over are bounded one by one, where
-rectifiers switch by linear programs, and left at the first requirement that is not proved: what
-comes later would only be worse. Halves are taken along the coordinate that moves the inputs of
-units most. Of a cell nothing is kept but its box and its margins.
+compiled call once there are as many. Those that are left over are bounded one by one
+(`cell_tasks`). Halves are taken along the coordinate that moves the inputs of units most. Of a cell
+nothing is kept but its box and its margins.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from typing import Any, NamedTuple
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import Executor
+from contextlib import closing
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
-from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
-from reachjax.loops.units import SmoothUnit
 from reachjax.numerics.checks import described, whole_number, wrapped
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, Box
-from reachjax.sets.balance import balanced
 from reachjax.sets.cells import Cell, grid, halves_along
-from reachjax.tubes.ladder import WORK, Ladder
+from reachjax.tubes.cell_jobs import CellJobs
+from reachjax.tubes.cell_tasks import CellTask, Outcome, Unbounded, outcome_of
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
-from reachjax.tubes.requirements import Requirement
 from reachjax.tubes.sieve import TOGETHER, Margins, Sieve
 from reachjax.tubes.steps import boxed
-from reachjax.tubes.targets import target_of, values_of
 from reachjax.tubes.verdicts import Counterexample, DecidedCell, Verdict, VerdictStatus
 
 SHOTS, FEWER = 64, 8
 """How many trajectories are simulated from a cell that is not proved; and from each of many."""
 
-FEW = 50
-"""Linear programs that a bound may take in a cell: halving it is the other way."""
+AHEAD = 4
+"""How many cells an executor is given for each of its workers."""
 
 TRIED = 8
 """After so many cells of a size of which none was proved, one in so many is tried."""
-
-AHEAD = 4
-"""How many cells an executor is given for each of its workers, at least."""
-
-
-class CellTask(NamedTuple):
-    """What is decided of every cell.
-
-    Attributes:
-        loop: of numpy arrays.
-        horizon: the number of steps.
-        start: the time of the initial set.
-        required: the requirements.
-        nodes: how many linear programs a bound may take.
-    """
-
-    loop: ClosedLoop
-    horizon: int
-    start: int
-    required: tuple[Requirement, ...]
-    nodes: int
-
-    @property
-    def by_programs(self) -> bool:
-        """Whether linear programs may prove what forms do not."""
-        layers = self.loop.unit_layers
-        return self.nodes > 0 and not all(isinstance(each.unit, SmoothUnit) for each in layers)
-
-
-class Outcome(NamedTuple):
-    """What is found of a cell.
-
-    Attributes:
-        proved: whether all requirements are.
-        margins: of those that were looked at; NaN of the others.
-        axis: along which it should be halved.
-    """
-
-    proved: bool
-    margins: Margins
-    axis: int
-
-    @property
-    def margin(self) -> float:
-        """The smallest."""
-        known = [np.nanmin(row) for row in self.margins.values() if not np.isnan(row).all()]
-        return float(min(known, default=-np.inf))
 
 
 def roots(X0: AbstractSet, cells: Any) -> tuple[list[Cell], int | None]:
@@ -137,9 +85,10 @@ def decided_by_cells(
     if simulations is not None:
         run.seen(simulations.runs)
     if run.example is None:
-        for _ in wrapped(progress, run.results(begun, executor)):
-            if run.example is not None:
-                break
+        with closing(run.results(begun, executor)) as results:  # a bar may end before they do
+            for _ in wrapped(progress, results):
+                if run.example is not None:
+                    break
     return run.verdict()
 
 
@@ -157,21 +106,29 @@ class _Run:
         self._done: list[DecidedCell] = []
         self._count = 0
         blank = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
-        self._margins, self._simulated = blank, {name: row.copy() for name, row in blank.items()}
+        self._blank = blank
+        self._margins, self._simulated = (
+            {name: row.copy() for name, row in blank.items()} for _ in range(2)
+        )
         self.example: Counterexample | None = None
         self._tried: dict[int, deque[int]] = {}
-        self._size = _size(boxed(X0, "X0"))
+        box = boxed(X0, "X0")
+        sides = np.asarray(box.widths)
+        self._size, self._sides = _size(box), np.where(sides > 0, sides, 1.0)
+        self._lost: Unbounded | None = None
+        self._bounded = False
         self._sieve = Sieve(task.loop, task.horizon, task.start, task.required)
 
-    def results(self, begun: Sequence[Cell], executor: Executor | None) -> Iterator[int]:
+    def results(
+        self, begun: Sequence[Cell], executor: Executor | None
+    ) -> Generator[int, None, None]:
         """How many cells are decided, after each that is bounded."""
         open_cells, left_over = deque(begun), deque[tuple[Cell, Margins | None]]()
         self._count = len(open_cells)
-        running: dict[Future, tuple[Cell, Margins | None]] = {}
-        workers = 1 if executor is None else AHEAD * getattr(executor, "_max_workers", AHEAD)
+        jobs = CellJobs[Cell](executor, AHEAD)
         try:
-            while open_cells or left_over or running:
-                while (open_cells or left_over) and len(running) < workers:
+            while open_cells or left_over or jobs:
+                while (open_cells or left_over) and len(jobs) < jobs.most:
                     if not left_over and len(open_cells) >= TOGETHER and not self._late:
                         some = [open_cells.popleft() for _ in range(TOGETHER)]
                         left_over.extend(self._sifted(some))
@@ -184,17 +141,17 @@ class _Run:
                         open_cells.extend(self._halved(cell, axis))
                         continue
                     part = jax.device_get(cell.part)
-                    given = executor, self._task, part, self._deadline, known
-                    running[_submitted(*given)] = cell, known
-                finished, _ = wait(running, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    open_cells.extend(self._judged(running.pop(future)[0], future.result()))
+                    jobs.submit(cell, outcome_of, self._task, part, self._deadline, known)
+                for cell, outcome in jobs.finished():
+                    open_cells.extend(self._judged(cell, outcome))
                     yield len(self._done)
                 if self.example is not None:
                     return
         finally:
-            for future in running:
-                future.cancel()
+            left = [*open_cells, *(cell for cell, _ in left_over), *jobs.cancelled()]
+            if self.example is None:
+                for cell in left:
+                    self._kept(cell, Outcome(False, self._blank, 0), VerdictStatus.UNKNOWN)
 
     def _sifted(self, cells: Sequence[Cell]) -> list[tuple[Cell, Margins | None]]:
         """Those of some cells that forms do not prove, with the margins that these say."""
@@ -209,6 +166,11 @@ class _Run:
 
     def _judged(self, cell: Cell, outcome: Outcome) -> list[Cell]:
         """The halves of a cell that is not proved, as long as there may be more."""
+        self._lost = outcome.unbounded or self._lost
+        self._bounded = self._bounded or outcome.unbounded is None
+        if outcome.axis < 0:
+            widths = np.asarray(cell.box.widths) / self._sides
+            outcome = outcome._replace(axis=int(widths.argmax()))
         if outcome.proved:
             self._kept(cell, outcome, VerdictStatus.PROVED)
             self._tried.pop(self._depth(cell), None)
@@ -287,13 +249,20 @@ class _Run:
         self.example = counterexample(self._loop, self._X0, found, self._task.start)
 
     def verdict(self) -> Verdict:
-        """All of it."""
+        """All of it.
+
+        Raises:
+            UnboundedError: there is no cell over which all units have bounds.
+        """
+        if self._lost and not self._bounded and self.example is None:
+            raise self._lost.error
         statuses = {each.status for each in self._done}
-        status = VerdictStatus.PROVED if statuses == {VerdictStatus.PROVED} else None
+        proved = statuses == {VerdictStatus.PROVED}
+        status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
         if self.example is not None:
             status = VerdictStatus.REFUTED
         return Verdict(
-            status or VerdictStatus.UNKNOWN,
+            status,
             self._margins,
             self._simulated,
             self.example,
@@ -305,99 +274,3 @@ def _size(box: Box) -> float:
     """The logarithm of a volume, in halvings; of coordinates that are flat none."""
     widths = np.asarray(box.widths)
     return float(np.log2(widths[widths > 0]).sum())
-
-
-def _submitted(executor: Executor | None, *given: Any) -> Future:
-    if executor is not None:
-        return executor.submit(outcome_of, *given)
-    future: Future = Future()
-    future.set_result(outcome_of(*given))
-    return future
-
-
-def outcome_of(
-    task: CellTask, part: AbstractSet, deadline: float, known: Margins | None = None
-) -> Outcome:
-    """What is found of one cell, wherever it runs.
-
-    Args:
-        task: what is decided.
-        part: of the initial set, of numpy arrays.
-        deadline: when to stop, as `time.monotonic` says it.
-        known: the margins by forms over the cell's box, which do not prove all; None if unknown.
-    """
-    with jax.enable_x64(True):
-        box = boxed(jax.device_put(part), "X0")
-        begun = _open_box(part, box)
-        around = jax.device_get(box)
-        blank = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
-        margins = {name: row.copy() for name, row in (known or blank).items()}
-        scenarios = Scenarios.of(task.loop, begun, task.horizon, task.start)
-        limits = min(FEW, task.nodes), deadline, WORK
-        ladder = Ladder(task.loop, begun, around, scenarios, task.start, *limits)
-        if known is not None and isinstance(begun, Box) and not task.by_programs:
-            ladder.advance(tighten=False)  # nothing but forms could be tried again
-            return Outcome(False, margins, _axis(ladder, _least(task.required, margins)))
-        for k in range(task.horizon + 1):
-            if k:
-                ladder.advance(tighten=False)
-            for item in task.required:
-                if item.time == k:
-                    middle = scenarios.middle(np.asarray(around.center))
-                    proved, margin = bounded(item, ladder, part, middle)
-                    margins[item.name][k] = np.fmax(margins[item.name][k], margin)
-                    if not proved:
-                        return Outcome(False, margins, _axis(ladder, item))
-        return Outcome(True, margins, 0)
-
-
-def _least(required: Sequence[Requirement], margins: Margins) -> Requirement:
-    """The first requirement that is not proved, in time."""
-    broken = [item for item in required if not margins[item.name][item.time] > 0]
-    return min(broken or required, key=lambda item: item.time)
-
-
-def _open_box(part: AbstractSet, box: Box) -> AbstractSet:
-    """The cell as it is; a polytope that is its box as a box."""
-    return jax.device_get(box) if isinstance(part, Box) else part
-
-
-def bounded(
-    item: Requirement, ladder: Ladder, part: AbstractSet, middle: Float[np.ndarray, " s"]
-) -> tuple[bool, float]:
-    """Whether a requirement surely holds where the ladder has come to, and its margin."""
-    if item.time == 0:
-        compared = item.compared_with(jax.device_put(part))
-        return item.proved(compared), float(compared.margins.min())
-    rows, units = values_of(item, ladder)
-    uppers = rows.ends(ladder.horizon.start)[1]
-    bounds = uppers if item.inside else uppers.min(keepdims=True)
-    if not _all_right(item, bounds) and len(ladder.horizon.zero):
-        bounds = ladder.climbed(target_of(item, ladder, None, middle)[0]).bounds
-    return _all_right(item, bounds), float(np.min(-bounds / units))
-
-
-def fails_everywhere(item: Requirement, ladder: Ladder) -> bool:
-    """Whether every state surely breaks a requirement at the time that the ladder has come to."""
-    facets = (np.asarray(part) for part in item.looser.facets)
-    C, d = balanced(*facets, inner=not item.inside)
-    lower, upper = (C @ ladder.horizon.state + (-d)).ends(ladder.horizon.start)
-    return bool((lower > 0).any() if item.inside else (upper <= 0).all())
-
-
-def _all_right(item: Requirement, bounds: Float[np.ndarray, " g"]) -> bool:
-    return bool(np.all(bounds <= 0 if item.inside else bounds < 0))
-
-
-def _axis(ladder: Ladder, item: Requirement) -> int:
-    """The coordinate that moves the inputs of the first step's units most, or what is required."""
-    horizon = ladder.horizon
-    n = len(horizon.start.center)
-    size = np.zeros(n)
-    for layer in horizon.steps[0] if horizon.steps else ():
-        bent = isinstance(layer.unit, SmoothUnit) | (layer.places >= 0)
-        size += abs(layer.inputs.columns[:, :n])[np.broadcast_to(bent, layer.places.shape)].sum(0)
-    if not size.any():
-        C = np.asarray(item.region.facets[0])
-        size = abs(C @ horizon.start.spread).sum(axis=0)
-    return int(size.argmax())

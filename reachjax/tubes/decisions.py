@@ -18,7 +18,6 @@ import numpy as np
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.checks import (
-    is_concrete,
     owned,
     require_bar,
     require_double_precision,
@@ -33,16 +32,23 @@ from reachjax.proofs.branches import BranchCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated, Simulations
 from reachjax.sets import AbstractSet
-from reachjax.tubes.cell_decisions import CellTask, decided_by_cells, roots
+from reachjax.tubes.cell_decisions import decided_by_cells, roots
+from reachjax.tubes.cell_tasks import CellTask
 from reachjax.tubes.ladder import WORK, Climbed, Ladder
-from reachjax.tubes.propagation import Progress, deadline_of, require_kinds, simulations_from
+from reachjax.tubes.propagation import (
+    Progress,
+    deadline_of,
+    known_numbers,
+    require_kinds,
+    simulations_from,
+)
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.targets import target_of
 from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
 
-FEW = 50
+FIRST_PROGRAMS = 50
 """Linear programs that each bound may take at first, while ranges are those of affine forms."""
 
 PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
@@ -75,8 +81,8 @@ def decide(
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
         safe: where every state must be at all times (its complement is avoided).
-        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
-            time to a sequence.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
+            times, or from ranges of times, to sequences.
         relaxation: how many linear programs a bound may take.
         start: the time of `X0`, for time-varying loops.
         samples: how many trajectories are simulated in search of a counterexample, besides those
@@ -124,14 +130,8 @@ def decide(
     loop.check_horizon(horizon, start)
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
-    deadline, fixed = deadline_of(time_limit), jax.lax.stop_gradient((loop, X0))
-    if not is_concrete(fixed):
-        raise ValueError(
-            "loop or X0 holds traced numbers, and a verdict is decided on known ones: call decide "
-            "outside of jax.jit"
-        )
+    deadline, (loop, X0) = deadline_of(time_limit), known_numbers("decide", loop, X0, "X0")
     required = requirements(loop.states, horizon, goal, avoid, safe)
-    loop, X0 = owned(fixed)
     simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     if cells is not None:
         counts, most = roots(X0, cells)
@@ -142,12 +142,12 @@ def decide(
     decision = _Decision(loop, X0, horizon, start, required, simulations)
     decision.at_first()
     on_host, begun, around = jax.device_get((loop, X0, boxed(X0, "X0")))
-    for nodes in dict.fromkeys((min(FEW, relaxation.nodes), relaxation.nodes)):
+    for nodes in dict.fromkeys((min(FIRST_PROGRAMS, relaxation.nodes), relaxation.nodes)):
         if not decision.ended:
             work = WORK if time_limit is None else np.inf
             scenarios = Scenarios.of(on_host, begun, horizon, start)
             ladder = Ladder(on_host, begun, around, scenarios, start, nodes, deadline, work)
-            decision.climb(ladder, tighten=nodes > FEW)
+            decision.climb(ladder, tighten=nodes > FIRST_PROGRAMS)
     return decision.verdict()
 
 
@@ -252,11 +252,11 @@ class _Decision:
             self._seen([item], self._simulations.include(scenarios))
         else:
             given = self._on_host, scenarios, self._horizon, self._start
-            runs = Runs(scenarios, self._scenarios.runs(*given))
-            self._seen([item], runs.some(np.isfinite(runs.states).all(axis=(1, 2))))
+            self._seen([item], Runs(scenarios, self._scenarios.runs(*given)))
 
     def _seen(self, items: list[Requirement], runs: Runs) -> None:
-        """What trajectories show, a counterexample perhaps."""
+        """What trajectories show that do not overflow, a counterexample perhaps."""
+        runs = runs.some(np.isfinite(runs.states).all(axis=(1, 2)))
         if not len(runs.states):
             return
         found: list[Suspect] = []

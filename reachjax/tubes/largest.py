@@ -28,7 +28,7 @@ from reachjax.numerics.checks import (
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds
 from reachjax.sets import Box, Ellipsoid, Template
 from reachjax.tubes.decisions import decide
-from reachjax.tubes.propagation import deadline_of
+from reachjax.tubes.propagation import deadline_of, known_numbers
 from reachjax.tubes.reach import reach
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
 from reachjax.tubes.shapes import Kind, Shape
@@ -42,6 +42,9 @@ BARRIER, SOFTER = 0.1, 0.9
 
 LONGEST, SHORTEST = 0.3, 1e-4
 """Steps of an ascent, in parts of the half-axes: the first one, and one that is not tried."""
+
+FARTHEST = 2.0**20
+"""How many times as long as one of `X0` a side may get: where nothing limits it, it ends there."""
 
 GROWTHS = 0.3, 0.1, 0.03, 0.01, 0.003
 """By which parts of itself a set or one of its sides is enlarged, as long as that is proved."""
@@ -78,19 +81,23 @@ def largest_set(
     Args:
         loop: the closed loop.
         X0: where to begin: a set of the kind that is wanted. To go on with what an earlier call
-            found, give its `region`.
+            found, give its `region`. Sides of a box that are flat stay as they are.
         horizon: the number of steps.
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
         safe: where every state must be at all times.
-        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
-            time to a sequence.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
+            times, or from ranges of times, to sequences.
         rounds: steps of the ascent by affine forms.
         relaxation: how many linear programs a bound may take: most of the time goes into the last
             few percents.
         start: the time of the initial set.
         time_limit: seconds, after which what is proved by then is returned.
         progress: wraps the iteration over sets that are tried, such as `tqdm.tqdm`.
+
+    Returns:
+        The set and its proof. A side that nothing limits is a million times as long as that of
+        `X0`, and no longer.
 
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
@@ -113,6 +120,7 @@ def largest_set(
     whole_number("rounds", rounds, 0)
     loop.check_horizon(horizon, start)
     require_bar(progress)
+    loop, X0 = known_numbers("largest_set", loop, X0, "X0")
     required = requirements(loop.states, horizon, goal, avoid, safe)
 
     def decided(region: Kind) -> Verdict:
@@ -152,19 +160,22 @@ class _Search:
     ):
         self._decided, self._deadline = decided, deadline
         self._shape = Shape.of(X0)
+        self._farthest = FARTHEST * self._shape.lengths
         self._margins = _margins(loop, required, horizon, start)
         self.best: LargestSet | None = None
 
     def tried(self, rounds: int) -> Iterator[float]:
         """The volumes of sets that are tried."""
         yield from self._shrunk()
-        if self.best is None:
+        if self.best is None or not self._shape.sides:
             return
         yield from self._climbed(rounds)
         yield from self._grown()
 
     def _attempt(self, shape: Shape) -> bool:
         """Whether a set is proved; it is the best one then."""
+        if self._too_long(shape):
+            return False
         try:
             region = shape.set()
         except ValueError:  # it is none
@@ -174,6 +185,10 @@ class _Search:
             return False
         self._shape, self.best = shape, LargestSet(region, verdict)
         return True
+
+    def _too_long(self, shape: Shape) -> bool:
+        """Whether a side is longer than any shall be."""
+        return bool(jnp.any(shape.lengths > self._farthest))
 
     def _shrunk(self) -> Iterator[float]:
         for _ in range(SMALLEST):
@@ -205,7 +220,8 @@ class _Search:
             here, along = value(shape, weight), slope(shape, weight).preconditioned(shape)
             while length > SHORTEST:
                 other = shape.moved(along, length)
-                if value(other, weight) > here:  # not if it is no number
+                better = value(other, weight) > here  # not if it is no number
+                if better and not self._too_long(other):
                     shape, length = other, min(2 * length, LONGEST)
                     break
                 length /= 2
@@ -222,7 +238,7 @@ class _Search:
                 yield self._shape.volume()
                 if time.monotonic() >= self._deadline:
                     return
-            for side in range(self._shape.sides):
+            for side in self._shape.sides:
                 while self._attempt(self._shape.extended(side, by)):
                     yield self._shape.volume()
                 yield self._shape.volume()

@@ -25,7 +25,7 @@ from reachjax.numerics.checks import (
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.witnesses import Simulations
-from reachjax.sets import AbstractSet, AbstractTemplate, Template
+from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.by_branching import sets_by_branching
 from reachjax.tubes.by_cells import sets_by_cells
@@ -248,6 +248,29 @@ def deadline_of(time_limit: float | None) -> float:
     if time_limit is None:
         return np.inf
     return time.monotonic() + real_number("time_limit", time_limit, 0.0)
+
+
+def known_numbers(call: str, loop: ClosedLoop, X: AbstractSet, name: str) -> tuple[Any, Any]:
+    """A loop and a set without derivatives.
+
+    Args:
+        call: which one needs numbers.
+        loop: the loop.
+        X: the set.
+        name: what the call's argument for it is.
+
+    Raises:
+        ValueError: numbers are traced inside `jax.jit`, or the set is a time-varying box.
+    """
+    fixed = jax.lax.stop_gradient((loop, X))
+    if not is_concrete(fixed):
+        raise ValueError(
+            f"loop or {name} holds traced numbers, and a verdict is decided on known ones: call "
+            f"{call} outside of jax.jit"
+        )
+    if isinstance(X, Box) and X.steps is not None:
+        raise ValueError(f"{name} must be one box, but a time-varying one arrived")
+    return owned(fixed)
 
 
 def require_kinds(**arguments: Any) -> None:

@@ -86,7 +86,8 @@ def candidate_sets(
             radii = np.maximum(radii, FLATTEST * radii.max())
             if radii.max() > 0:
                 region = _safe_part(_region(normals, center, radii), safe)
-                yield Candidate(step, region, normals, center, radii)
+                if region is not None:
+                    yield Candidate(step, region, normals, center, radii)
         step *= 2
 
 
@@ -106,15 +107,19 @@ def _region(
     return Box(center - lower, center + upper)
 
 
-def _safe_part(region: PolyhedralSet, safe: PolyhedralSet | None) -> PolyhedralSet:
-    """A set without what is not safe."""
+def _safe_part(region: PolyhedralSet, safe: PolyhedralSet | None) -> PolyhedralSet | None:
+    """A set without what is not safe; None if nothing of it is, or too little to draw states."""
     if safe is None or within([region], safe)[0]:
         return region
     if isinstance(region, Box) and isinstance(safe, Box):
-        lower = jnp.maximum(region.lower, safe.lower)
-        return Box(lower, jnp.maximum(lower, jnp.minimum(region.upper, safe.upper)))
+        return None if region.misses(safe) else region.cut(safe)
     (A, b), (C, d) = region.facets, safe.facets
-    return Polytope(jnp.concatenate([A, C]), jnp.concatenate([b, d]))
+    part = Polytope(jnp.concatenate([A, C]), jnp.concatenate([b, d]))
+    try:
+        part.sample(jax.random.key(0), 1)
+    except (ValueError, RuntimeError):
+        return None
+    return part
 
 
 def _directions(

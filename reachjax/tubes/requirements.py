@@ -8,24 +8,19 @@ certified by the tube's sets; it can be differentiated as the sets can.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.numerics.checks import described, is_concrete, real_number, require_kind
-from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
+from reachjax.numerics.checks import is_concrete, real_number, require_kind
+from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet, Polytope
 from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
+from reachjax.sets.polyhedra import is_empty
 from reachjax.tubes.reach import ReachTube
-
-Region = PolyhedralSet | Ellipsoid
-
-AvoidSets = Sequence[Region] | Mapping[int, Sequence[Region]]
-
-Timed = Region | Mapping[int | range, Region]
-"""A set, or sets by the times, or the spans of times, at which they are meant."""
+from reachjax.tubes.times import AvoidSets, Region, Timed, timed_goals, timed_sets_to_avoid
 
 
 class Compared(NamedTuple):
@@ -135,23 +130,14 @@ def requirements(
     """A specification's requirements, one for each set and time.
 
     Raises:
-        TypeError: a set is no Box, Polytope or Ellipsoid.
-        ValueError: nothing is required, dimensions disagree, or a time is beyond the horizon.
+        TypeError: a set is no Box, Polytope or Ellipsoid, or a time no whole number.
+        ValueError: nothing is required, a set is empty, dimensions disagree, or a time is beyond
+            the horizon.
     """
     everywhere = range(horizon + 1)
-    avoid = {} if avoid is None else avoid
-    timed = avoid if isinstance(avoid, Mapping) else dict.fromkeys(everywhere, avoid)
-    for regions in timed.values():
-        if not isinstance(regions, Sequence):
-            raise TypeError(
-                "avoid must be a sequence of sets, avoid=[A, ...], or a mapping from a time to "
-                f"one, avoid={{t: [A, ...]}}, but {described(regions)} arrived"
-            )
-    found = [Requirement("goal", t, G, True) for t, G in _goals(goal, horizon)]
+    found = [Requirement("goal", t, G, True) for t, G in timed_goals(goal, horizon)]
     found += [Requirement("safe", t, safe, True) for t in everywhere if safe is not None]  # type: ignore[arg-type]
-    for t, regions in timed.items():
-        if isinstance(t, bool) or t not in everywhere:
-            raise ValueError(f"avoid names time {t!r}, but the tube is for t = 0 .. {horizon}")
+    for t, regions in timed_sets_to_avoid(avoid, horizon):
         found += [Requirement(f"avoid[{i}]", t, A, False) for i, A in enumerate(regions)]  # type: ignore[arg-type]
     if not found:
         raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")
@@ -167,40 +153,13 @@ def requirements(
     ]
 
 
-def _goals(goal: Timed | None, horizon: int) -> list[tuple[int, Any]]:
-    """The goals, with their times.
-
-    Raises:
-        ValueError: a time is beyond the horizon, or named twice; or none is named.
-    """
-    if goal is None:
-        return []
-    if not isinstance(goal, Mapping):
-        return [(horizon, goal)]
-    found: dict[int, Any] = {}
-    for when, region in goal.items():
-        times = when if isinstance(when, range) else [when]
-        for t in times:
-            if isinstance(t, bool) or not isinstance(t, int | np.integer):
-                raise TypeError(
-                    f"goal must name times or ranges of them, but {described(t)} arrived"
-                )
-            if not 0 <= t <= horizon:
-                raise ValueError(f"goal names time {t!r}, but the tube is for t = 0 .. {horizon}")
-            if t in found:
-                raise ValueError(f"goal names time {t} twice: give the intersection of both sets")
-            found[int(t)] = region
-    if not found:
-        raise ValueError("goal must name a time, goal={t: G}, but none arrived")
-    return sorted(found.items(), key=lambda one: one[0])
-
-
 def _checked(item: Requirement, states: int) -> Requirement:
     """A requirement of a set that can be decided.
 
     Raises:
         TypeError: it is of another kind.
-        ValueError: its dimension is another one, or it is an ellipsoid that cannot be decided.
+        ValueError: its dimension is another one, it is empty, or it is an ellipsoid that cannot be
+            decided.
     """
     region, kinds = item.region, (PolyhedralSet, Ellipsoid)
     require_kind(item.name, region, kinds, "a Box, a Polytope or an Ellipsoid")
@@ -210,6 +169,10 @@ def _checked(item: Requirement, states: int) -> Requirement:
         raise ValueError(
             f"{item.name} has dimension {region.dimension}, but the loop has {states} states"
         )
+    if isinstance(region, Polytope) and is_concrete(region):
+        A, b = (np.asarray(part, float) for part in region.facets)
+        if _empty(A.tobytes(), b.tobytes()):
+            raise ValueError(f"{item.name} is empty: no point satisfies all facets of its polytope")
     if not isinstance(region, Ellipsoid):
         return item
     if not is_concrete(region):
@@ -218,6 +181,13 @@ def _checked(item: Requirement, states: int) -> Requirement:
         )
     polytope = (inner_polytope if item.inside else outer_polytope)(region, item.name)
     return dataclasses.replace(item, region=polytope, ball=region)
+
+
+@lru_cache(maxsize=256)
+def _empty(normals: bytes, offsets: bytes) -> bool:
+    """Whether a polytope has no point: one linear program, whoever asks how often."""
+    b = np.frombuffer(offsets)
+    return is_empty(np.frombuffer(normals).reshape(len(b), -1), b)
 
 
 def _depths(ball: Ellipsoid, points: np.ndarray) -> Float[np.ndarray, " c"]:
@@ -247,8 +217,8 @@ def shortfall(
         tube: certified sets for `t = 0 .. horizon`.
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
-        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
-            time to a sequence.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
+            times, or from ranges of times, to sequences.
         safe: where every state must be at all times.
         margin: how far the sets should be from breaking a requirement, in the units of the state.
 

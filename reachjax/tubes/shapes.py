@@ -17,7 +17,8 @@ class Shape(NamedTuple):
 
     Attributes:
         center: `(n,)`.
-        axes: `(n,)`, half-widths of a box; `(n, n)`, a factor of an ellipsoid's shape.
+        axes: `(n,)`, half-widths of a box, of which some may be zero: such sides are flat, and
+            stay where they are; `(n, n)`, a factor of an ellipsoid's shape.
     """
 
     center: Float[Array, " n"]
@@ -31,9 +32,14 @@ class Shape(NamedTuple):
         return cls(jnp.asarray(X.center), jnp.linalg.cholesky(jnp.asarray(X.shape)))
 
     @property
-    def sides(self) -> int:
-        """How many there are to be extended: of an ellipsoid, ends of axes."""
-        return 2 * len(self.center)
+    def sides(self) -> list[int]:
+        """Those to be extended, which are not flat: of an ellipsoid, ends of axes."""
+        return [side for side in range(2 * len(self.center)) if self.lengths[side // 2] > 0]
+
+    @property
+    def lengths(self) -> Float[Array, " n"]:
+        """How far it reaches from its center along each coordinate."""
+        return self.axes if self.axes.ndim == 1 else jnp.linalg.norm(self.axes, axis=1)
 
     def set(self) -> Kind:
         """The set.
@@ -53,20 +59,21 @@ class Shape(NamedTuple):
         return directions @ self.center + size
 
     def log_volume(self) -> Float[Array, ""]:
-        """The logarithm of the volume, but for a constant."""
+        """The logarithm of the volume, but for a constant; flat sides do not count."""
         if self.axes.ndim == 1:
-            return jnp.sum(jnp.log(self.axes))
+            return jnp.sum(jnp.log(jnp.where(self.axes > 0, self.axes, 1.0)))
         return jnp.linalg.slogdet(self.axes)[1]
 
     def volume(self) -> float:
-        """Its volume, in the units of the state; of an ellipsoid, that of the box of its axes."""
-        return float(2.0 ** len(self.center) * jnp.exp(self.log_volume()))
+        """Its volume, flat sides aside; of an ellipsoid, that of the box of its axes."""
+        return float(2.0 ** (len(self.sides) // 2) * jnp.exp(self.log_volume()))
 
     def preconditioned(self, shape: Shape) -> Shape:
         """A gradient at some shape as a direction, in units of its axes."""
         if shape.axes.ndim == 1:
             center, axes = shape.axes**2 * self.center, shape.axes**2 * self.axes
-            size = jnp.max(jnp.stack([abs(center), abs(axes)]) / shape.axes)
+            units = jnp.where(shape.axes > 0, shape.axes, 1.0)
+            size = jnp.max(jnp.stack([abs(center), abs(axes)]) / units)
         else:
             Q = shape.axes @ shape.axes.T
             center, axes = Q @ self.center, Q @ self.axes

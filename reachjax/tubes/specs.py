@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from reachjax.loops.scenarios import Runs, Scenarios
-from reachjax.numerics.checks import is_concrete, whole_number
+from reachjax.numerics.checks import is_concrete, require_kind, whole_number
 from reachjax.numerics.rounding import TINY
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import initial_states
@@ -43,8 +43,8 @@ def verify(
         tube: certified sets for `t = 0 .. horizon`; of a partitioned tube, those of every cell.
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
-        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
-            time to a sequence.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
+            times, or from ranges of times, to sequences.
         safe: where every state must be at all times (its complement is avoided).
         samples: how many trajectories are simulated in search of a counterexample, besides those
             from corners and witnesses; so many from each cell.
@@ -75,6 +75,7 @@ def verify(
     """
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
+    require_kind("forever", forever, (bool, np.bool_), "True or False")
     if isinstance(tube, PartitionedTube):
         tube.require_sealed()
         tubes, X0 = tube.tubes, tube.X0

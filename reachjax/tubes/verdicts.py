@@ -57,12 +57,13 @@ class Counterexample:
 
 
 class DecidedCell(NamedTuple):
-    """What is known of one cell of an initial set.
+    """What is known of one cell of an initial set, or of a domain.
 
     Attributes:
         lower: `(n_x,)`, of its box.
         upper: `(n_x,)`.
-        status: of the cell alone: refuted is one in which a counterexample begins.
+        status: of the cell alone. Refuted is, in a verdict, one in which a counterexample begins;
+            in a winning set, one from every state of which the specification fails.
         margin: the smallest certified one.
     """
 
@@ -164,14 +165,15 @@ class Verdict:
     def __str__(self) -> str:
         lines = [self.status.name]
         for name, margins in self.margins.items():
-            simulated = float(np.nanmin(self.simulated[name]))
+            least, _ = _least_at(self.simulated[name])
+            simulated = "unknown" if np.isnan(least) else f"{least:+.4g}"
             if np.isnan(margins).all():  # refuted before anything was bounded
-                lines.append(f"  {name}: simulated margin {simulated:+.4g}")
+                lines.append(f"  {name}: simulated margin {simulated}")
                 continue
             t = int(np.nanargmin(margins))
             lines.append(
                 f"  {name}: certified margin {margins[t]:+.4g} (smallest, at t = {t}), "
-                f"simulated margin {simulated:+.4g}"
+                f"simulated margin {simulated}"
             )
         if self.counterexample is not None:
             e = self.counterexample

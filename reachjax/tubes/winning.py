@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import heapq
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import closing
 from typing import Any, NamedTuple
 
 import jax
@@ -21,8 +22,8 @@ from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
+from reachjax.loops.units import UnboundedError
 from reachjax.numerics.checks import (
-    owned,
     require_bar,
     require_double_precision,
     require_executor,
@@ -33,17 +34,21 @@ from reachjax.numerics.checks import (
 )
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.sets import Box
-from reachjax.tubes.cell_decisions import CellTask, bounded, fails_everywhere
+from reachjax.tubes.cell_jobs import CellJobs
+from reachjax.tubes.cell_tasks import CellTask, bounded, fails_everywhere
 from reachjax.tubes.ladder import WORK, Ladder
-from reachjax.tubes.propagation import deadline_of
+from reachjax.tubes.propagation import deadline_of, known_numbers
 from reachjax.tubes.requirements import AvoidSets, Region, Timed, requirements
 from reachjax.tubes.seals import seal_of
-from reachjax.tubes.sieve import TOGETHER, Ends, Sieve, Sifted
+from reachjax.tubes.sieve import TOGETHER, Ends, Margins, Sieve, Sifted
 from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
 from reachjax.tubes.winning_sets import WinningSet
 
-FEW = 10
+LAST_PROGRAMS = 10
 """Linear programs that a bound may take in a cell that is not halved any more."""
+
+AHEAD = 2
+"""How many batches an executor is given for each of its workers: more are halved out of order."""
 
 ROOM = 0.2
 """Linear programs are tried where the least room of trajectories is at least this part of what is
@@ -87,7 +92,7 @@ def winning_set(
     avoid: AvoidSets | None = None,
     *,
     cells: int = 10_000,
-    relaxation: BranchAndCut = BranchAndCut(nodes=FEW),  # noqa: B008  (immutable)
+    relaxation: BranchAndCut = BranchAndCut(nodes=LAST_PROGRAMS),  # noqa: B008  (immutable)
     start: int = 0,
     time_limit: float | None = None,
     known: WinningSet | None = None,
@@ -103,8 +108,8 @@ def winning_set(
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
         safe: where every state must be at all times.
-        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from a
-            time to a sequence.
+        avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
+            times, or from ranges of times, to sequences.
         cells: how many there may be. The largest that are undecided are halved.
         relaxation: how many linear programs a bound may take, once there are as many cells.
         start: the time of the initial states.
@@ -148,7 +153,7 @@ def winning_set(
     require_executor(executor)
     require_bar(progress)
     required = requirements(loop.states, horizon, goal, avoid, safe)
-    loop, domain = jax.device_get(owned((loop, domain)))
+    loop, domain = jax.device_get(known_numbers("winning_set", loop, domain, "domain"))
     task = CellTask(loop, horizon, start, tuple(required), relaxation.nodes)
     asked = {
         f"{number}: {item.name}, {item.time}, {item.inside}": (item.region, item.ball)
@@ -164,8 +169,9 @@ def winning_set(
             )
         cells_so_far = list(known.cells)
     run = _Run(task, domain, cells_so_far, most, deadline_of(time_limit))
-    for _ in wrapped(progress, run.results(executor)):
-        pass
+    with closing(run.results(executor)) as results:  # a bar may end before they do
+        for _ in wrapped(progress, results):
+            pass
     return WinningSet(domain, tuple(run.done), seal)
 
 
@@ -201,10 +207,13 @@ class _Run:
         volume = float(np.prod((cell.upper - cell.lower) / self._scale))
         heapq.heappush(cells, (-volume, self._number, cell))
 
-    def results(self, executor: Executor | None) -> Iterator[int]:
+    def results(self, executor: Executor | None) -> Generator[int, None, None]:
         """How many cells are decided, after each batch."""
-        yield from self._decided(executor, self._open, TOGETHER, self._task._replace(nodes=0))
-        yield from self._decided(executor, self._left, 1, self._task)
+        try:
+            yield from self._decided(executor, self._open, TOGETHER, self._task._replace(nodes=0))
+            yield from self._decided(executor, self._left, 1, self._task)
+        finally:
+            self.done += [cell for _, _, cell in self._open + self._left]
 
     def _decided(
         self,
@@ -214,25 +223,19 @@ class _Run:
         task: CellTask,
     ) -> Iterator[int]:
         """How many cells are decided, after each batch of some, the largest first."""
-        running: dict[Future, list[DecidedCell]] = {}
-        workers = 1 if executor is None else 2 * getattr(executor, "_max_workers", 2)
+        jobs = CellJobs[list[DecidedCell]](executor, AHEAD)
         try:
-            while (cells and not self._late) or running:
-                while cells and len(running) < workers and not self._late:
-                    count = min(together, len(cells))
-                    batch = [heapq.heappop(cells)[2] for _ in range(count)]
-                    running[_submitted(executor, task, batch, self._scale)] = batch
-                finished, _ = wait(running, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    for cell, found in zip(running.pop(future), future.result(), strict=True):
+            while (cells and not self._late) or jobs:
+                while cells and len(jobs) < jobs.most and not self._late:
+                    batch = [heapq.heappop(cells)[2] for _ in range(min(together, len(cells)))]
+                    boxes = [(cell.lower, cell.upper) for cell in batch]
+                    jobs.submit(batch, sorted_cells, task, boxes, self._scale)
+                for batch, results in jobs.finished():
+                    for cell, found in zip(batch, results, strict=True):
                         self._judged(cell, found, task.by_programs)
                     yield len(self.done)
         finally:
-            for future, batch in running.items():
-                future.cancel()
-                self.done += batch
-            self.done += [cell for _, _, cell in cells]
-            cells.clear()
+            self.done += [cell for batch in jobs.cancelled() for cell in batch]
 
     @property
     def _late(self) -> bool:
@@ -251,15 +254,6 @@ class _Run:
             self._push(self._left, cell._replace(margin=found.margin))
         else:
             self.done.append(cell._replace(status=found.status, margin=found.margin))
-
-
-def _submitted(executor: Executor | None, task: CellTask, batch: list[DecidedCell], scale: Any):
-    boxes = [(cell.lower, cell.upper) for cell in batch]
-    if executor is not None:
-        return executor.submit(sorted_cells, task, boxes, scale)
-    future: Future = Future()
-    future.set_result(sorted_cells(task, boxes, scale))
-    return future
 
 
 def sorted_cells(
@@ -351,11 +345,26 @@ def _promising(least: Float[np.ndarray, " c"], margin: float) -> bool:
 
 def _bounded(task: CellTask, box: Box, rooms: Float[np.ndarray, "r c"]) -> Sifted:
     """What forms and programs say of one box, given how trajectories from it fare."""
-    box = jax.device_get(box)
+    margins = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
+    try:
+        proved, refuted = _climbed(task, jax.device_get(box), rooms, margins)
+    except UnboundedError:  # of halves there may be bounds
+        proved = refuted = False
+    return Sifted(proved, refuted, margins)
+
+
+def _climbed(
+    task: CellTask, box: Box, rooms: Float[np.ndarray, "r c"], margins: Margins
+) -> tuple[bool, bool]:
+    """Whether a box is proved, or refuted; margins are noted as they are found.
+
+    Raises:
+        UnboundedError: a unit has no bounds over it.
+    """
     scenarios = Scenarios.of(task.loop, box, task.horizon, task.start)
     ladder = Ladder(task.loop, box, box, scenarios, task.start, task.nodes, np.inf, WORK)
-    margins = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
-    middle, broken, proved = scenarios.middle(np.asarray(box.center)), (rooms < 0).all(axis=1), True
+    broken = [bool(np.all(row < 0)) for row in rooms]
+    middle, proved = scenarios.middle(np.asarray(box.center)), not any(broken)
     for k in range(task.horizon + 1):
         if k:
             ladder.advance(tighten=False)
@@ -363,9 +372,9 @@ def _bounded(task: CellTask, box: Box, rooms: Float[np.ndarray, "r c"]) -> Sifte
             if item.time != k:
                 continue
             if fails and fails_everywhere(item, ladder):
-                return Sifted(False, True, margins)
-            if proved and not broken.any():
+                return False, True
+            if proved:
                 proved, margins[item.name][k] = bounded(item, ladder, box, middle)
-        if not proved:
+        if not (proved or any(broken)):
             break
-    return Sifted(proved and not broken.any(), False, margins)
+    return proved, False

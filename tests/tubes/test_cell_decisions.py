@@ -1,5 +1,6 @@
 """Decisions by cells: what is proved holds, what is refuted does not, and cells cover the set."""
 
+import itertools
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.loops.units import UnboundedError
 from tests.networks import he_network
 
 HORIZON = 4
@@ -144,3 +146,64 @@ def test_cells_are_drawn_by_what_is_known_of_them(smooth):
 def test_what_is_no_number_of_cells_is_named(smooth, given, error, message):
     with pytest.raises(error, match=message):
         rj.decide(smooth, X0, 1, safe=X0, **given)
+
+
+def test_what_overflows_in_every_cell_is_unknown():
+    net = rj.MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant([[1e60]], [[1.0]]), net)
+    verdict = rj.decide(loop, rj.Box([1.0], [2.0]), 8, goal=rj.Box([-1.0], [1.0]), cells=4)
+    assert verdict.status is rj.VerdictStatus.UNKNOWN
+    assert len(verdict.cells) == 4
+
+
+def test_a_bar_that_ends_early_proves_nothing_of_the_rest():
+    net = rj.MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+    loop, domain = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net), rj.Box([-5.0], [5.0])
+
+    def short(items):
+        return itertools.islice(items, 1)
+
+    verdict = rj.decide(loop, domain, 3, safe=domain, cells=(64,), progress=short)
+    assert verdict.status is rj.VerdictStatus.UNKNOWN
+    assert covered(verdict, domain)
+    assert np.nanmin(verdict.margins["safe"]) == -np.inf
+    found = rj.winning_set(loop, domain, 2, safe=rj.Box([-4], [4]), cells=99, progress=short)
+    assert sum(map(found.volume, rj.VerdictStatus)) == pytest.approx(10.0)
+
+
+def rooted(f):
+    law = rj.Network(lambda x: -x, inputs=1, outputs=1)
+    return rj.ClosedLoop(rj.NonlinearPlant(lambda x, u: f(x) + 0 * u, states=1, inputs=1), law)
+
+
+def test_a_cell_over_which_a_unit_has_no_bounds_is_halved():
+    waves = rooted(lambda x: jnp.sqrt(0.3 + jnp.sin(5 * x) * jnp.sin(5 * x + 0.2)))
+    domain, goal = rj.Box([0.0], [2.0]), rj.Box([0.4], [1.3])
+    with pytest.raises(UnboundedError, match="Sqrt"):
+        rj.decide(waves, domain, 1, goal=goal)
+    verdict = rj.decide(waves, domain, 1, goal=goal, cells=100)
+    assert verdict.status is rj.VerdictStatus.PROVED
+    found = rj.winning_set(waves, domain, 1, goal=goal, cells=100)
+    assert found.volume(rj.VerdictStatus.PROVED) == pytest.approx(2.0)
+
+
+def test_where_units_have_no_bounds_nothing_is_known():
+    loop, goal = rooted(jnp.sqrt), rj.Box([-1.0], [3.0])
+    verdict = rj.decide(loop, rj.Box([-1.0], [2.0]), 2, goal=goal, cells=8)
+    assert verdict.status is rj.VerdictStatus.UNKNOWN
+    assert {cell.status for cell in verdict.cells} == {*rj.VerdictStatus} - {
+        rj.VerdictStatus.REFUTED
+    }
+    with pytest.raises(UnboundedError, match="Sqrt"):
+        rj.decide(loop, rj.Box([-2.0], [-1.0]), 2, goal=goal, cells=8)
+    found = rj.winning_set(loop, rj.Box([-1.0], [2.0]), 2, goal=goal, cells=8)
+    assert found.contains([[1.0], [-0.5]]).tolist() == [True, False]
+    assert not found.of(rj.VerdictStatus.REFUTED)
+
+
+def test_trajectories_that_are_no_numbers_say_nothing():
+    loop, X0 = rooted(jnp.sqrt), rj.Box([-1.0], [2.0])
+    for cells in (None, 4):
+        verdict = rj.decide(loop, X0, 2, goal=rj.Box([-1.0], [1.0]), cells=cells)
+        assert verdict.status is rj.VerdictStatus.REFUTED
+        assert np.nanmin(verdict.simulated["goal"]) == pytest.approx(1 - 2**0.25)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.tubes.by_cells import _Node
 
 PERIOD = 0.1
 
@@ -126,3 +127,66 @@ def test_derivatives_are_those_of_what_is_proved():
         np.testing.assert_allclose(slopes[0][i], along, rtol=1e-5, atol=1e-8)
     along = (size(at[0], at[1] + h) - size(at[0], at[1] - h)) / (2 * h)
     np.testing.assert_allclose(slopes[1], along, rtol=1e-5)
+
+
+def test_what_disturbances_leave_open_is_not_halved_for_ever():
+    net = rj.MLP.from_layers([([[1.0, 0.5]], [0.0]), ([[-0.5]], [0.0])], activation=rj.Tanh())
+    plant = rj.AffinePlant([[1.0, 0.2], [0.0, 1.0]], [[0.0], [0.3]], E=[[1.0], [1.0]])
+    loop = rj.ClosedLoop(plant, net, disturbance=rj.Box([-0.1], [0.1]))
+    tube = rj.reach(loop, rj.Box([-0.1, -0.2], [0.3, 0.2]), 2, rj.Template.box(2))
+    proof = tube.proof(2)
+    assert proof.cells < 60
+    assert proof.gaps[:3].max() < 1e-4
+    assert (proof.recheck() == proof.bounds).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_facet_that_never_moves_is_done():
+    def f(x, u):
+        return jnp.array([x[0] * x[1] + 0 * u[0], 0.0])
+
+    law = rj.Network(lambda x: -jnp.tanh(x[:1]), inputs=2, outputs=1)
+    loop = rj.ClosedLoop(rj.NonlinearPlant(f, 2, 1), law)
+    tube = rj.reach(loop, rj.Box([100.0, 0.01], [101.0, 0.0101]), 2, rj.Template.box(2))
+    assert tube.proof(2).cells < 40
+    np.testing.assert_allclose(tube.sets[1].b, [1.0201, -1.0, 0.0, 0.0], rtol=1e-6)
+
+
+def test_a_tree_may_be_deep():
+    axes = [0, -1] * 2000 + [-1]
+    root = node = _Node(None, [])
+    for _ in range(2000):
+        node.axis, node.halves = 0, [_Node(None, [], node), _Node(None, [], node)]
+        node = node.halves[1]
+    assert root.axes == axes
+
+
+DIAMOND = np.array([[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+
+
+@pytest.mark.parametrize(
+    ("kind", "tolerance"), [("polytope", 3e-3), ("intersection", 2e-2)], ids=["polytope", "both"]
+)
+def test_derivatives_in_polytopes_are_those_of_their_facets(kind, tolerance):
+    plant = rj.NonlinearPlant(
+        lambda x, u: jnp.array([x[0] + 0.2 * x[1], x[1] + 0.1 * jnp.sin(x[0]) + 0.2 * u[0]]), 2, 1
+    )
+    net = rj.MLP.from_layers([([[1.0, 1.2]], [0.0]), ([[-1.0]], [0.0])], activation=rj.Tanh())
+    loop, template = rj.ClosedLoop(plant, net), rj.Template([[1.0, 1.0], [-1.0, -0.8], [0.0, -1.0]])
+
+    def offset(normals, offsets):
+        X0 = rj.Polytope(normals, offsets)
+        if kind == "intersection":
+            X0 = rj.Intersection(X0, rj.Ellipsoid([0.01, 0.02], [[0.015, 0.0], [0.0, 0.01]]))
+        return rj.reach(loop, X0, 1, template, gap=1e-3, samples=200).sets[1].b[0]
+
+    at, h = (jnp.asarray(DIAMOND), jnp.array([0.1, 0.12, 0.09, 0.1])), 1e-4
+    slopes = jax.grad(offset, argnums=(0, 1))(*at)
+    for i, j in [(0, 0), (0, 1), (1, 1), (2, 0)]:
+        step = jnp.zeros((4, 2)).at[i, j].set(h)
+        along = (offset(at[0] + step, at[1]) - offset(at[0] - step, at[1])) / (2 * h)
+        np.testing.assert_allclose(slopes[0][i, j], along, atol=tolerance)
+    for i in range(4):
+        step = h * jnp.eye(4)[i]
+        along = (offset(at[0], at[1] + step) - offset(at[0], at[1] - step)) / (2 * h)
+        np.testing.assert_allclose(slopes[1][i], along, atol=tolerance)

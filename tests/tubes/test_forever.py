@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.tubes.recurrent_sets import _safe_part
 
 LATER = 2000
 """Steps of simulation, beyond what any proof looks at."""
@@ -143,3 +144,28 @@ def test_what_cannot_be_asked_for_is_named():
     tube = rj.reach(varying, X0, 2, rj.Template.box(1))
     with pytest.raises(ValueError, match="do not vary in time"):
         rj.verify(tube, safe=safe, forever=True)
+
+
+def test_a_set_to_return_into_of_which_nothing_is_safe_is_none():
+    """Trajectories end beside what is safe, later than anything proved: that is unknown."""
+    modes = np.array([[1.0, 1.0], [1.0, 0.3]])
+    A = modes @ np.diag([0.995, -0.9]) @ np.linalg.inv(modes)
+    end = 10 * modes[:, 0]
+    net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant(A, np.zeros((2, 1)), end - A @ end), net)
+    X0, safe = rj.Box([-0.01, -0.01], [0.01, 0.01]), rj.Polytope([[1.0, 0.0]], [6.0])
+    tube = rj.reach(loop, X0, 125, rj.Template.box(2), rj.LinearBounds())
+    verdict = rj.verify(tube, safe=safe, samples=20, forever=True, time_limit=1.0)
+    assert verdict.status is rj.VerdictStatus.UNKNOWN
+
+
+@pytest.mark.parametrize("kind", ["box", "polytope"])
+def test_what_is_left_of_a_set_is_safe(kind):
+    region, far = rj.Box([0.0, 0.0], [1.0, 1.0]), rj.Box([1.5, 0.0], [2.0, 1.0])
+    near = rj.Box([0.5, -1.0], [2.0, 2.0])
+    if kind == "polytope":
+        region = rj.Polytope(*region.facets)
+    assert _safe_part(region, far) is None
+    part = _safe_part(region, near)
+    np.testing.assert_allclose(part.bounding_box().lower, [0.5, 0.0], atol=1e-12)
+    assert _safe_part(region, None) is region

@@ -78,3 +78,23 @@ def test_what_begins_where_nothing_is_proved_is_named(loop):
         rj.largest_set(loop, rj.Box([3.6, 0.0], [3.8, 0.1]), HORIZON, rounds=1, **WANTED)
     with pytest.raises(TypeError, match="X0 must be a Box or an Ellipsoid"):
         rj.largest_set(loop, rj.Polytope(np.eye(2), [1.0, 1.0]), HORIZON, **WANTED)
+
+
+def test_flat_sides_stay_flat(loop):
+    point = rj.largest_set(scalar(0.9), rj.Box([1.0], [1.0]), 2, goal=rj.Box([-1.0], [2.0]))
+    assert (point.region.lower, point.region.upper) == (1.0, 1.0)
+    given = rj.Box([0.5, 0.1], [0.6, 0.1])
+    found = rj.largest_set(loop, given, HORIZON, rounds=5, relaxation=QUICK, **WANTED)
+    assert found.region.lower[1] == found.region.upper[1] == 0.1
+    assert found.region.widths[0] > 10 * given.widths[0]
+    assert wins(loop, found.region)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_side_that_nothing_limits_ends():
+    net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant(0.5 * np.eye(2), np.zeros((2, 1))), net)
+    goal = rj.Polytope.between([-1.0, -np.inf], [1.0, np.inf])
+    found = rj.largest_set(loop, rj.Box([-0.1, -0.1], [0.1, 0.1]), 1, goal=goal, rounds=2)
+    assert found.region.upper[0] == pytest.approx(2.0, rel=0.01)
+    assert 1e4 < found.region.widths[1] < 1e6

@@ -194,3 +194,78 @@ def test_infinite_sides(tube):
 def test_sides_that_are_none(ends, said):
     with pytest.raises(ValueError, match=said):
         rj.Polytope.between(*ends)
+
+
+def away(end):
+    return rj.Box([end, end], [end + 1, end + 1])
+
+
+def test_sets_to_avoid_at_times_and_over_spans(tube):
+    assert statuses(tube, avoid={range(2, 5): [away(0.51)]}) == {"PROVED"}
+    assert statuses(tube, avoid={range(1, 5): [away(0.51)]}) == {"REFUTED"}
+    both = {range(1, 3): [away(1.1)], np.int64(2): [away(0.4)]}
+    named = [(item.time, item.name) for item in requirements(2, 4, None, both, None)]
+    assert named == [(1, "avoid[0]"), (2, "avoid[0]"), (2, "avoid[1]")]
+    assert statuses(tube, avoid={range(1, 3): [away(1.1)], 2: [away(0.4)]}) == {"REFUTED"}
+
+
+NOWHERE = rj.Polytope([[1.0, 0.0], [-1.0, 0.0]], [0.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("asked", "error", "said"),
+    [
+        ({"avoid": {1.0: [away(5.0)]}}, TypeError, r"avoid must name times or ranges of them, but"),
+        ({"avoid": {5: [away(5.0)]}}, ValueError, r"avoid names time 5, but the tube is for"),
+        ({"avoid": {True: [away(5.0)]}}, TypeError, r"avoid must name times"),
+        ({"avoid": {1: away(5.0)}}, TypeError, r"avoid must be a sequence of sets"),
+        ({"avoid": {range(5, 2): [away(5.0)]}}, ValueError, r"avoid names the span range\(5, 2\)"),
+        ({"goal": {range(5, 2): box(1.0), 4: box(1.0)}}, ValueError, r"goal names the span"),
+        ({"goal": NOWHERE}, ValueError, r"goal is empty"),
+        ({"safe": NOWHERE}, ValueError, r"safe is empty"),
+        ({"avoid": [away(5.0), NOWHERE]}, ValueError, r"avoid\[1\] is empty"),
+    ],
+)
+def test_what_cannot_be_required_is_named(asked, error, said, tube):
+    with pytest.raises(error, match=said):
+        rj.verify(tube, **asked)
+    with pytest.raises(error, match=said):
+        rj.decide(HALVES, X0, 4, **asked)
+
+
+def test_thin_and_unbounded_sets_are_not_empty(tube):
+    plane = rj.Polytope([[1.0, 0.0], [-1.0, 0.0]], [3.0, -3.0])
+    assert statuses(tube, avoid=[plane, rj.Polytope([[-1.0, -1.0]], [-9.0])]) == {"PROVED"}
+
+
+@pytest.mark.parametrize("ends", [([INFINITE, 0.0], [INFINITE, 1.0]), ([-INFINITE], [-INFINITE])])
+def test_a_box_with_infinite_sides_has_points(ends):
+    with pytest.raises(ValueError, match="lower must be below infinity"):
+        rj.Polytope.between(*ends)
+
+
+@pytest.mark.parametrize("call", [rj.winning_set, rj.largest_set, rj.decide])
+def test_numbers_must_be_known(call):
+    def traced(end):
+        call(HALVES, rj.Box([0.0, 0.0], end), 2, safe=box(4.0))
+
+    with pytest.raises(ValueError, match=f"holds traced numbers.* call {call.__name__} outside of"):
+        jax.jit(traced)(np.ones(2))
+    moving = rj.Box([[0.0, 0.0], [1.0, 1.0]], [[1.0, 1.0], [2.0, 2.0]])
+    with pytest.raises(ValueError, match="must be one box, but a time-varying one arrived"):
+        call(HALVES, moving, 2, safe=box(4.0))
+
+
+def test_for_ever_is_yes_or_no(tube):
+    with pytest.raises(TypeError, match="forever must be True or False, but 'no' arrived"):
+        rj.verify(tube, safe=box(4.0), forever="no")
+
+
+@pytest.mark.filterwarnings("error")
+def test_of_trajectories_that_overflow_no_margin_is_said():
+    net = rj.MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant([[1e60]], [[1.0]]), net)
+    for cells in (None, 4):
+        verdict = rj.decide(loop, rj.Box([1.0], [2.0]), 8, goal=rj.Box([-1.0], [1.0]), cells=cells)
+        assert "simulated margin unknown" in str(verdict)
+        assert "nan" not in str(verdict)

@@ -1,0 +1,102 @@
+"""Derivatives of what cells of an initial set prove, the tree of cells held as it is.
+
+A bound is that of a form over the cell that decides it. Ends of cells move with the box around the
+initial set; where facets of the set itself decide, they have the multipliers of a linear program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.programs.horizon import Horizon
+from reachjax.programs.unrolled import FactWeights, weighed_at_once
+from reachjax.sets import AbstractSet, Box, Polytope
+from reachjax.sets.cells import Cell
+from reachjax.sets.polyhedra import support
+from reachjax.tubes.steps import Setting
+
+LOOSE = 1e-6
+"""By which part of its longest side a cell is larger for the programs of its multipliers."""
+
+
+def moving_offsets(
+    setting: Setting,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[Array, "N f n_x"],
+    deciding: Sequence[Cell],
+    k: int,
+) -> Float[Array, " f"]:
+    """Numbers with the derivatives of what the deciding cells prove after `k + 1` steps.
+
+    Args:
+        setting: what all steps have in common.
+        X0: the initial set, a box or a polytope.
+        box: around it.
+        directions: of the facets of all steps.
+        deciding: for each facet of the step, the cell in which its bound is largest.
+        k: the number of the step.
+    """
+    offsets: list[Array] = []
+    known: dict[int, Array] = {}
+    lower, upper = (np.asarray(jax.lax.stop_gradient(end)) for end in (box.lower, box.upper))
+    sides = np.where(upper > lower, upper - lower, 1.0)
+    fixed = jax.lax.stop_gradient((setting.loop, X0, directions))
+    loop, region, rows = jax.device_get(fixed)
+    for facet, cell in enumerate(deciding):
+        if id(cell) not in known:
+            ends = (np.asarray(end) for end in (cell.box.lower, cell.box.upper))
+            shares = ((end - lower) / sides for end in ends)
+            around = Box(*(box.lower + share * (box.upper - box.lower) for share in shares))
+            part = X0.cut(around) if isinstance(X0, Polytope) else around
+            held = _held(loop, region, rows, cell, k, setting.start)
+            given = setting.loop, part, around, directions[k], held, setting.start
+            known[id(cell)] = weighed_at_once(*given)[k]
+        offsets.append(known[id(cell)][facet])
+    return jnp.stack(offsets)
+
+
+def _held(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    directions: Float[np.ndarray, "N f n_x"],
+    cell: Cell,
+    k: int,
+    start: int,
+) -> FactWeights:
+    """Multipliers of facets of the initial set and of a cell's box that decide bounds there.
+
+    What a box is cut by decides where programs bound a form better than its norms do. The box is a
+    little larger for them, so that where the initial set has a corner, its own facets decide.
+    """
+    loop, part, box = jax.device_get((loop, cell.part, cell.box))
+    horizon = Horizon(loop, part, box, start)
+    forms = horizon.state
+    for step in range(len(directions)):
+        horizon.advance()
+        forms = directions[k] @ horizon.state if step == k else forms
+    begun, count = horizon.start, len(directions[k])
+    weights = horizon.weights(np.zeros((count, len(horizon.facts.rows))), len(directions))
+    if not isinstance(X0, Polytope):
+        return weights
+    room = LOOSE * np.max(box.upper - box.lower)
+    A, b = (np.asarray(each) for each in X0.cut(Box(box.lower - room, box.upper + room)).facets)
+    weights = weights._replace(of_set=np.zeros((count, len(b))))
+    first, products = np.split(forms.columns[:, : begun.count], [len(begun.spread)], axis=1)
+    by_cut = np.flatnonzero(forms.ends(begun, cut=True)[1] < forms.ends(begun)[1])
+    if not len(by_cut):
+        return weights
+    try:
+        _, Y, points = support(A, b, first[by_cut] @ begun.back)
+    except (ValueError, RuntimeError):  # too thin for programs
+        return weights
+    weights.of_set[by_cut] = Y
+    there = np.concatenate([(points - begun.center) @ begun.back.T, np.sign(products[by_cut])], 1)
+    weights.attained[by_cut] = there
+    return weights

@@ -1,0 +1,194 @@
+"""What is proved of one cell of an initial set, wherever it runs.
+
+By forms, and where rectifiers switch by linear programs, left at the first requirement that is not
+proved: what comes later would only be worse. A cell on which a unit has no bounds, as a square root
+over negative numbers, is not proved; its halves may be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.loops.scenarios import Scenarios
+from reachjax.loops.units import SmoothUnit, UnboundedError
+from reachjax.sets import AbstractSet, Box
+from reachjax.sets.balance import balanced
+from reachjax.tubes.ladder import WORK, Ladder
+from reachjax.tubes.requirements import Requirement
+from reachjax.tubes.sieve import Margins
+from reachjax.tubes.steps import boxed
+from reachjax.tubes.targets import target_of, values_of
+
+PROGRAMS = 50
+"""Linear programs that a bound may take in a cell: halving it is the other way."""
+
+
+class CellTask(NamedTuple):
+    """What is decided of every cell.
+
+    Attributes:
+        loop: of numpy arrays.
+        horizon: the number of steps.
+        start: the time of the initial set.
+        required: the requirements.
+        nodes: how many linear programs a bound may take.
+    """
+
+    loop: ClosedLoop
+    horizon: int
+    start: int
+    required: tuple[Requirement, ...]
+    nodes: int
+
+    @property
+    def by_programs(self) -> bool:
+        """Whether linear programs may prove what forms do not."""
+        layers = self.loop.unit_layers
+        return self.nodes > 0 and not all(isinstance(each.unit, SmoothUnit) for each in layers)
+
+
+class Unbounded(NamedTuple):
+    """An `UnboundedError` as other processes can send it.
+
+    Attributes:
+        given: what it was made of.
+        message: what it says.
+    """
+
+    given: tuple[Any, ...]
+    message: str
+
+    @classmethod
+    def of(cls, error: UnboundedError) -> Unbounded:
+        """That of an error."""
+        return cls(error.given, str(error))
+
+    @property
+    def error(self) -> UnboundedError:
+        """The error, to be raised."""
+        found = UnboundedError(*self.given)
+        found.args = (self.message,)
+        return found
+
+
+class Outcome(NamedTuple):
+    """What is found of a cell.
+
+    Attributes:
+        proved: whether all requirements are.
+        margins: of those that were looked at; NaN of the others.
+        axis: along which it should be halved; -1 where nothing says that.
+        unbounded: the unit that has no bounds over it, if there is one.
+    """
+
+    proved: bool
+    margins: Margins
+    axis: int
+    unbounded: Unbounded | None = None
+
+    @property
+    def margin(self) -> float:
+        """The smallest."""
+        known = [np.nanmin(row) for row in self.margins.values() if not np.isnan(row).all()]
+        return float(min(known, default=-np.inf))
+
+
+def outcome_of(
+    task: CellTask, part: AbstractSet, deadline: float, known: Margins | None = None
+) -> Outcome:
+    """What is found of one cell, wherever it runs.
+
+    Args:
+        task: what is decided.
+        part: of the initial set, of numpy arrays.
+        deadline: when to stop, as `time.monotonic` says it.
+        known: the margins by forms over the cell's box, which do not prove all; None if unknown.
+    """
+    blank = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
+    margins = {name: row.copy() for name, row in (known or blank).items()}
+    with jax.enable_x64(True):
+        try:
+            return _climbed(task, part, deadline, margins, known is not None)
+        except UnboundedError as error:
+            return Outcome(False, margins, -1, Unbounded.of(error))
+
+
+def _climbed(
+    task: CellTask, part: AbstractSet, deadline: float, margins: Margins, by_forms: bool
+) -> Outcome:
+    """What is found of a cell, step after step; margins are noted as they are found.
+
+    Raises:
+        UnboundedError: a unit has no bounds over it.
+    """
+    around = jax.device_get(boxed(jax.device_put(part), "X0"))
+    scenarios = Scenarios.of(task.loop, part, task.horizon, task.start)
+    limits = min(PROGRAMS, task.nodes), deadline, WORK
+    ladder = Ladder(task.loop, part, around, scenarios, task.start, *limits)
+    if by_forms and isinstance(part, Box) and not task.by_programs:
+        ladder.advance(tighten=False)  # nothing but forms could be tried again
+        return Outcome(False, margins, _axis(ladder, _least(task.required, margins)))
+    middle = scenarios.middle(np.asarray(around.center))
+    for k in range(task.horizon + 1):
+        if k:
+            ladder.advance(tighten=False)
+        for item in task.required:
+            if item.time == k:
+                proved, margin = bounded(item, ladder, part, middle)
+                margins[item.name][k] = np.fmax(margins[item.name][k], margin)
+                if not proved:
+                    return Outcome(False, margins, _axis(ladder, item))
+    return Outcome(True, margins, 0)
+
+
+def _least(required: Sequence[Requirement], margins: Margins) -> Requirement:
+    """The first requirement that is not proved, in time."""
+    broken = [item for item in required if not margins[item.name][item.time] > 0]
+    return min(broken or required, key=lambda item: item.time)
+
+
+def bounded(
+    item: Requirement, ladder: Ladder, part: AbstractSet, middle: Float[np.ndarray, " s"]
+) -> tuple[bool, float]:
+    """Whether a requirement surely holds where the ladder has come to, and its margin."""
+    if item.time == 0:
+        compared = item.compared_with(jax.device_put(part))
+        return item.proved(compared), float(compared.margins.min())
+    rows, units = values_of(item, ladder)
+    uppers = rows.ends(ladder.horizon.start)[1]
+    bounds = uppers if item.inside else uppers.min(keepdims=True)
+    if not _all_right(item, bounds) and len(ladder.horizon.zero):
+        bounds = ladder.climbed(target_of(item, ladder, None, middle)[0]).bounds
+    return _all_right(item, bounds), float(np.min(-bounds / units))
+
+
+def fails_everywhere(item: Requirement, ladder: Ladder) -> bool:
+    """Whether every state surely breaks a requirement at the time that the ladder has come to."""
+    facets = (np.asarray(part) for part in item.looser.facets)
+    C, d = balanced(*facets, inner=not item.inside)
+    lower, upper = (C @ ladder.horizon.state + (-d)).ends(ladder.horizon.start)
+    return bool((lower > 0).any() if item.inside else (upper <= 0).all())
+
+
+def _all_right(item: Requirement, bounds: Float[np.ndarray, " g"]) -> bool:
+    return bool(np.all(bounds <= 0 if item.inside else bounds < 0))
+
+
+def _axis(ladder: Ladder, item: Requirement) -> int:
+    """The coordinate that moves the inputs of the first step's units most, or what is required."""
+    horizon = ladder.horizon
+    n = len(horizon.start.center)
+    size = np.zeros(n)
+    for layer in horizon.steps[0] if horizon.steps else ():
+        bent = isinstance(layer.unit, SmoothUnit) | (layer.places >= 0)
+        size += abs(layer.inputs.columns[:, :n])[np.broadcast_to(bent, layer.places.shape)].sum(0)
+    if not size.any():
+        C = np.asarray(item.region.facets[0])
+        size = abs(C @ horizon.start.spread).sum(axis=0)
+    return int(size.argmax())

@@ -41,9 +41,8 @@ def load(
 
     Args:
         path: of the file.
-        loop: needed if the loop has functions that a user wrote, which no file can keep: all bounds
-            are then proved anew for this one. It must have the numbers and the trajectories of the
-            one that was left out.
+        loop: needed if the loop has functions that a user wrote, which no file can keep. It must be
+            the one that was left out, in every equation that JAX traces of it and in every number.
         recheck: whether all bounds are proved anew from their certificates.
         progress: wraps the iteration over steps that are rechecked, such as `tqdm.tqdm`.
 
@@ -67,14 +66,17 @@ def load(
     require_bar(progress)
     if loop is not None:
         require_kind("loop", loop, ClosedLoop, "a ClosedLoop")
-    kept, left_out = read(existing_file("path", path), owned(loop), MISSING)
+    kept = read(existing_file("path", path), owned(loop), MISSING)
     if not isinstance(kept, Kept) or not isinstance(kept.tube, ReachTube | PartitionedTube):
         raise ValueError(f"{path} must hold a tube, but something else arrived")
     tube = _sealed(kept.tube)
     tubes = tube.tubes if isinstance(tube, PartitionedTube) else (tube,)
-    if loop is not None and not kept.is_of(loop, tubes[0].start):
-        raise ValueError(f"loop must be that of the tube in {path}, but another one arrived")
-    if recheck or left_out:
+    if loop is not None and not kept.is_of(loop):
+        raise ValueError(
+            f"loop must be that of the tube in {path}, with the same equations and numbers, but "
+            "another one arrived (or another version of JAX, which writes its equations otherwise)"
+        )
+    if recheck:
         steps = [(each, t) for each in tubes for t in range(1, each.horizon + 1)]
         for each, t in wrapped(progress, steps):
             _require_proved(each, t)

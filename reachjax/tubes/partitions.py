@@ -98,8 +98,7 @@ class PartitionedTube(Replaceable):
     def save(self, path: str | os.PathLike[str]) -> None:
         """Keep the tubes of all cells in one file, as `ReachTube.save` does."""
         self.require_sealed()
-        first = self.tubes[0]
-        keep(writable("path", path), self, first.loop, self.X0, first.horizon, first.start)
+        keep(writable("path", path), self, self.tubes[0].loop)
 
     def __len__(self) -> int:
         """The number of cells."""

@@ -171,7 +171,7 @@ class ReachTube(Replaceable):
             ValueError: a part of the tube was changed.
         """
         self.require_sealed()
-        keep(writable("path", path), self, self.loop, self.sets[0], self.horizon, self.start)
+        keep(writable("path", path), self, self.loop)
 
     def simulate(self, samples: int = SAMPLES, seed: int = 0) -> Float[Array, "c h+1 n_x"]:
         """Trajectories from corners of the initial set and `samples` points drawn from it.

@@ -52,6 +52,10 @@ def sine(p, x, u):
     return jnp.stack([x[0] + 0.1 * x[1], x[1] + p * jnp.sin(x[0]) + 0.1 * u[0]])
 
 
+def nearly_sine(p, x, u):
+    return sine(p, x, u) + jnp.array([0.0, 1e-3]) * jnp.maximum(x[1] - 5.0, 0.0)
+
+
 def cosine(p, x, u):
     return jnp.stack([x[0] + 0.1 * x[1], x[1] + p * jnp.cos(x[0]) + 0.1 * u[0]])
 
@@ -134,12 +138,24 @@ def test_a_function_is_given_again(path):
     with pytest.raises(ValueError, match=r"written without its loop.*load\(path, loop=\.\.\.\)"):
         rj.load(path)
     seen = []
-    again = rj.load(path, curved(), progress=lambda steps: [seen.append(1) or s for s in steps])
-    assert len(seen) == 2  # it is rechecked unasked
+    again = rj.load(path, curved(), recheck=True, progress=lambda s: [seen.append(1) or x for x in s])
+    assert len(seen) == 2
     equal(tube.sets, again.sets)
-    for other in (curved(p=0.5000001), curved(cosine), closed_loop(random_loop(2))):
+    others = curved(p=0.5000001), curved(cosine), curved(nearly_sine), closed_loop(random_loop(2))
+    for other in others:
         with pytest.raises(ValueError, match="loop must be that of the tube"):
             rj.load(path, other)
+
+
+def test_a_seal_is_of_what_functions_compute():
+    def made(c):
+        law = rj.Network(lambda x: -0.4 * jax.nn.relu(x) + c, inputs=1, outputs=1)
+        return rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), law)
+
+    tube = rj.reach(made(0.0), rj.Box([1.0], [2.0]), 1, rj.Template.box(1))
+    tube.replace(loop=made(0.0))  # the same function, written again
+    with pytest.raises(ValueError, match="not those that were computed together"):
+        tube.replace(loop=made(5e-10))
 
 
 def test_what_does_not_prove_the_bounds_is_refused(path, loop, X0):

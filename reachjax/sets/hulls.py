@@ -21,6 +21,12 @@ FLAT = 1e-9
 ROUNDED = 1e-13
 """A polytope that varies by no more of its coordinates' sizes is a point: facets are rounded."""
 
+TRIANGULATED = 4
+"""In more dimensions a triangulation of hundreds of corners takes long, and Qhull fails at many."""
+
+STRIDES = 10
+"""So many steps in each dimension a walk takes, until it has forgotten where it began."""
+
 
 def vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The corners of a bounded polytope `(v, n)`; a flat one is treated in its affine hull.
@@ -159,13 +165,15 @@ def _swept(region: Balanced, corners: np.ndarray) -> tuple[float, np.ndarray, np
 
 
 def uniform(A: np.ndarray, b: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
-    """`count` points drawn uniformly, by a triangulation of the corners `(count, n)`."""
+    """Points drawn uniformly `(count, n)`, by a triangulation of the corners or by walks."""
     region, corners = _extreme_points(A, b)
-    return np.ldexp(_drawn(corners, rng, count), region.columns)
+    return np.ldexp(_drawn(region, corners, rng, count), region.columns)
 
 
-def _drawn(corners: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
-    """Points drawn uniformly from the convex hull of some."""
+def _drawn(
+    region: Balanced, corners: np.ndarray, rng: np.random.Generator, count: int
+) -> np.ndarray:
+    """Points drawn uniformly from a polytope of these corners."""
     center = corners.mean(axis=0)
     _, values, rows = np.linalg.svd(corners - center, full_matrices=False)
     spanned = rows[values > FLAT * max(values.max(initial=0.0), np.finfo(float).tiny)]
@@ -176,8 +184,47 @@ def _drawn(corners: np.ndarray, rng: np.random.Generator, count: int) -> np.ndar
     if flat.shape[1] == 1:
         ends = np.array([flat.min(), flat.max()])
         return center + rng.uniform(*ends, size=(count, 1)) @ spanned
-    simplices = flat[Delaunay(flat).simplices]
+    try:
+        if flat.shape[1] > TRIANGULATED:
+            raise QhullError
+        simplices = flat[Delaunay(flat).simplices]
+    except QhullError:
+        sides = (corners - center) @ spanned.T
+        return _walked(region, center, np.ptp(sides, axis=0)[:, None] * spanned, rng, count)
     volumes = np.abs(np.linalg.det(simplices[:, 1:] - simplices[:, :1]))
     chosen = rng.choice(len(simplices), size=count, p=volumes / volumes.sum())
     weights = rng.dirichlet(np.ones(flat.shape[1] + 1), size=count)
     return center + np.einsum("cv,cvk->ck", weights, simplices[chosen]) @ spanned
+
+
+def _walked(
+    region: Balanced,
+    center: np.ndarray,
+    axes: np.ndarray,
+    rng: np.random.Generator,
+    count: int,
+) -> np.ndarray:
+    """Where so many random walks end that begin in the middle: hit and run.
+
+    Source: Smith, Efficient Monte Carlo procedures for generating points uniformly distributed
+    over bounded regions, Operations Research (1984).
+
+    Args:
+        region: the polytope.
+        center: a point of its interior.
+        axes: `(d, n)`, its principal axes, as long as it is along them.
+        rng: of the walks.
+        count: how many.
+    """
+    A, b = region.A[region.near], region.b[region.near]
+    points = np.repeat(center[None], count, axis=0)
+    for _ in range(STRIDES * len(axes)):
+        ways = rng.normal(size=(count, len(axes))) @ axes
+        along, room = ways @ A.T, np.maximum(b - points @ A.T, 0.0)
+        along = np.where(abs(along) > FLAT * abs(ways).max(), along, 0.0)  # facets it lies in
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = room / along
+        most = np.where(along > 0, ends, np.inf).min(axis=1)
+        least = np.where(along < 0, ends, -np.inf).max(axis=1)
+        points = points + rng.uniform(least, most)[:, None] * ways
+    return points

@@ -34,8 +34,8 @@ from reachjax.tubes.verdicts import Counterexample, Recurrence, Verdict, Verdict
 LONG = 500
 """So many steps are simulated to see where trajectories end, and whether they break anything."""
 
-QUICK = 10
-"""Linear programs that a bound may take at first: there are other sets to try."""
+PROGRAMS = 0, 10, 10_000
+"""How many linear programs a bound may take, by turns: there are other sets to try."""
 
 
 class Wanted(NamedTuple):
@@ -160,12 +160,12 @@ def recurrence(
     loop, candidates = tubes[0].loop, list(candidate_sets(tubes, runs, _flat(wanted.safe)))
     tries = [(each, period) for each in candidates for period in periods(loop, each)]
     tries.sort(key=lambda each: each[0].step + each[1])  # what takes fewer steps is cheaper
-    for relaxation in (BranchAndCut(nodes=QUICK), BranchAndCut()):
+    for nodes in PROGRAMS:
         for candidate, period in tries:
             left = deadline - time.monotonic()
             if left <= 0:
                 return nearest
-            limits = relaxation, None if np.isinf(left) else left
+            limits = BranchAndCut(nodes=nodes), None if np.isinf(left) else left
             found = _tried(tubes, candidate, period, wanted, *limits)
             if found.proved:
                 return found
@@ -189,8 +189,7 @@ def _tried(
     seconds: float | None,
 ) -> Recurrence:
     """What is proved of a set that shall be entered, and left only to come back."""
-    loop, horizon = tubes[0].loop, tubes[0].horizon
-    step, region = candidate.step, candidate.region
+    loop, step, region = tubes[0].loop, candidate.step, candidate.region
 
     def arrives(begun: AbstractSet, steps: int) -> tuple[bool, float]:
         required = {"goal": region, "safe": wanted.safe, "avoid": wanted.avoid or None}
@@ -201,8 +200,8 @@ def _tried(
 
     proved, margin = arrives(region, period)
     if proved:
-        if step > horizon:
-            ways = [arrives(tube.sets[-1], step - horizon) for tube in tubes]
+        if step > tubes[0].horizon:
+            ways = [arrives(tube.sets[0], step) for tube in tubes]
         else:
             ways = [within([tube.sets[-1] for tube in tubes], region)]
         proved, margin = all(way for way, _ in ways), min(margin, *(room for _, room in ways))

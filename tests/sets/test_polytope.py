@@ -194,3 +194,18 @@ def test_a_half_space_is_a_set_until_something_finite_is_asked_of_it(ask):
     np.testing.assert_array_equal(half_space.facts(), [[-1.0, -1.0, 1.0]])
     with pytest.raises(ValueError, match="is unbounded in direction"):
         ask(half_space)
+
+
+def test_samples_in_six_dimensions_are_uniform():
+    rng = np.random.default_rng(0)
+    sides, turn = (
+        np.array([1.0, 1.0, 1e-3, 1.0, 1.0, 100.0]),
+        np.linalg.qr(rng.normal(size=(6, 6)))[0],
+    )
+    A, center = np.vstack([turn.T, -turn.T]), rng.normal(size=6)
+    polytope = rj.Polytope(A, A @ center + np.tile(sides, 2))
+    samples = np.asarray(polytope.sample(jax.random.key(0), 4000))
+    along = (samples - center) @ turn / sides
+    assert polytope.contains(samples, tolerance=1e-9).all()
+    np.testing.assert_allclose(along.mean(axis=0), 0.0, atol=0.06)  # 1/sqrt(3 * 4000) is 0.009
+    np.testing.assert_allclose(np.cov(along.T), np.eye(6) / 3, atol=0.04)

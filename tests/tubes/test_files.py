@@ -138,7 +138,9 @@ def test_a_function_is_given_again(path):
     with pytest.raises(ValueError, match=r"written without its loop.*load\(path, loop=\.\.\.\)"):
         rj.load(path)
     seen = []
-    again = rj.load(path, curved(), recheck=True, progress=lambda s: [seen.append(1) or x for x in s])
+    again = rj.load(
+        path, curved(), recheck=True, progress=lambda s: [seen.append(1) or x for x in s]
+    )
     assert len(seen) == 2
     equal(tube.sets, again.sets)
     others = curved(p=0.5000001), curved(cosine), curved(nearly_sine), closed_loop(random_loop(2))

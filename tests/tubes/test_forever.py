@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from experiments.quadrotor import model
 from reachjax.tubes.recurrent_sets import _safe_part
 
 LATER = 2000
@@ -58,6 +59,19 @@ def test_the_double_integrator_is_safe_for_ever(with_margin):
     assert f"for ever: in a set at t = {verdict.recurrence.step}" in str(verdict)
     cells = rj.reach_partitioned(with_margin, X0, 6, rj.Template.box(2), cells=(2, 1))
     stays(rj.verify(cells, safe=safe, forever=True), with_margin, X0, safe)
+
+
+@pytest.mark.long
+def test_a_quadrotor_is_safe_for_ever():
+    plant, aim, g = model.plant(), np.array([3.9, 3.0, 2.0, 0.0, 0.0, 0.0]), model.GRAVITY
+    gain = np.array([[0.16, 0, 0, 0.18, 0, 0], [0, -0.16, 0, 0, -0.18, 0], [0, 0, 1.2, 0, 0, 1.6]])
+    parts = [(np.vstack([np.eye(6), -np.eye(6)]), np.concatenate([-aim, aim]))]
+    net = rj.MLP.from_layers([*parts, (np.hstack([-gain, gain]), [0.0, 0.0, g])])
+    loop = rj.ClosedLoop(plant, net, rj.Box(*model.INPUT_LIMITS))
+    X0, safe = model.initial_set().bounding_box(), model.safe_set(False)
+    tube = rj.reach(loop, X0, 10, rj.Template.box(6))
+    verdict = rj.verify(tube, safe=safe, forever=True)
+    stays(verdict, loop, X0, safe)
 
 
 def test_a_tube_that_comes_back_to_where_it_began_is_closed():

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from reachjax.sets.balance import exponents, lengths
 
-FLAT = 1e-6
+LEAST_SPREAD = 1e-6
 """Points are taken to spread by at least this part of their widest spread in every direction."""
 
 
@@ -103,7 +103,7 @@ def _whitening(points: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "n n"]:
     _, spreads, rows = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     if not spreads[0] > 0:
         return np.eye(points.shape[1])
-    return rows / np.maximum(spreads, FLAT * spreads[0])[:, None]
+    return rows / np.maximum(spreads, LEAST_SPREAD * spreads[0])[:, None]
 
 
 def _about_one(points: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n"]:

@@ -160,7 +160,10 @@ def _weighed(
     """
     by_form = climbed.rungs == Rung.AFFINE_FORM
     multipliers = np.where(by_form[:, None], 0.0, climbed.multipliers)
-    held = ladder.horizon.weights(multipliers, horizon)
+    held, begun = ladder.horizon.weights(multipliers, horizon), ladder.horizon.start
+    if not begun.round:  # of a program's solution, whose reduced costs are zero but for rounding
+        there = np.where(by_form[:, None], np.nan, climbed.columns[:, : begun.count])
+        held = held._replace(attained=there)
     return weighed_at_once(setting.loop, X0, box, directions, held, setting.start)[k - 1]
 
 

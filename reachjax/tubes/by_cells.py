@@ -26,10 +26,10 @@ from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet, Box, Polytope, Template
 from reachjax.sets.cells import Cell, halves_along
 from reachjax.tubes.cell_slopes import moving_offsets
-from reachjax.tubes.ladder import FLAT, ROUNDED
+from reachjax.tubes.ladder import LEAST_RANGE, ROUNDED
 from reachjax.tubes.steps import Reached, Setting
 
-WORK = 1.5e11
+MULTIPLICATIONS = 1.5e11
 """Products of all cells together, of which one core does some ten to the tenth in a second."""
 
 OVERHEAD = 2.5e7
@@ -176,7 +176,11 @@ class _Search:
                 f"the loop's states at t = {setting.start + k} overflow or are not numbers: check "
                 "the weights of loop.controller and the entries of loop.plant"
             )
-        budget = WORK / _work(self._loop, len(directions)) if np.isinf(setting.deadline) else np.inf
+        budget = (
+            MULTIPLICATIONS / _work(self._loop, len(directions))
+            if np.isinf(setting.deadline)
+            else np.inf
+        )
         self._left = min(2 * most - 2, budget)
 
     def _made(self, cell: Cell, parent: _Node | None = None) -> _Node:
@@ -236,7 +240,7 @@ class _Search:
     ) -> Float[np.ndarray, "N f"]:
         """What half a facet's range counts as, at least: of one that is flat, by states' sizes."""
         gap, simulations = self._setting.gap, self._setting.simulations
-        floor = FLAT * (self.bounds - least) / 2
+        floor = LEAST_RANGE * (self.bounds - least) / 2
         if not gap or simulations is None:
             return floor
         largest = np.maximum.accumulate(abs(simulations.runs.states).max(axis=0, initial=0.0))

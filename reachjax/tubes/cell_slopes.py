@@ -83,6 +83,9 @@ def _held(
         forms = directions[k] @ horizon.state if step == k else forms
     begun, count = horizon.start, len(directions[k])
     weights = horizon.weights(np.zeros((count, len(horizon.facts.rows))), len(directions))
+    weights = weights._replace(
+        of_units=weights.of_units[:, :, :0]
+    )  # forms alone, no facts of units
     if not isinstance(X0, Polytope):
         return weights
     room = LOOSE * np.max(box.upper - box.lower)

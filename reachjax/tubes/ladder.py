@@ -25,7 +25,7 @@ from reachjax.solvers.branching import Found, Tree, affine_leaf, settled
 from reachjax.solvers.conic_programs import ConicPrograms
 from reachjax.solvers.linear_programs import LinearPrograms
 
-FLAT = 1e-6
+LEAST_RANGE = 1e-6
 """A facet's range counts as this part of what affine forms say, at least."""
 
 TURN = 200
@@ -190,7 +190,7 @@ class Ladder:
         """
         forms = directions @ self.horizon.state
         lower, upper = forms.ends(self.horizon.start)
-        floor = FLAT * (upper - lower) / 2
+        floor = LEAST_RANGE * (upper - lower) / 2
         if gap:
             floor = np.fmax(floor, ROUNDED / gap * np.fmax(abs(lower), abs(upper)))
         ranges = np.fmax((simulated.most - simulated.least) / 2, floor)

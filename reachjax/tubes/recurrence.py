@@ -26,7 +26,7 @@ from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope
 from reachjax.tubes.decisions import decide
 from reachjax.tubes.reach import ReachTube
-from reachjax.tubes.recurrent_sets import SAMPLES, Candidate, candidate_sets, periods, within
+from reachjax.tubes.recurrent_sets import TRAJECTORIES, Candidate, candidate_sets, periods, within
 from reachjax.tubes.refutations import SUSPECTS, counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Region, requirements
 from reachjax.tubes.verdicts import Counterexample, Recurrence, Verdict, VerdictStatus
@@ -101,7 +101,7 @@ def for_ever(
 def _long_runs(loop: ClosedLoop, X0: AbstractSet, start: int, seed: int) -> Runs:
     """Many steps of trajectories from corners of a set and from points of it."""
     scenarios = Scenarios.of(loop, X0, LONG, start)
-    drawn = scenarios.drawn(initial_states(X0, SAMPLES, seed), seed)
+    drawn = scenarios.drawn(initial_states(X0, TRAJECTORIES, seed), seed)
     return Runs(drawn, scenarios.runs(jax.device_get(loop), drawn, LONG, start))
 
 
@@ -193,7 +193,7 @@ def _tried(
 
     def arrives(begun: AbstractSet, steps: int) -> tuple[bool, float]:
         required = {"goal": region, "safe": wanted.safe, "avoid": wanted.avoid or None}
-        limits = {"relaxation": relaxation, "samples": SAMPLES, "time_limit": seconds}
+        limits = {"relaxation": relaxation, "samples": TRAJECTORIES, "time_limit": seconds}
         found = decide(loop, begun, steps, **required, **limits)
         margin = np.nan_to_num(found.margins["goal"][-1], nan=-np.inf)
         return found.status is VerdictStatus.PROVED, float(margin)

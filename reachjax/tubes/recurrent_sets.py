@@ -17,7 +17,7 @@ from reachjax.sets import AbstractSet, Box, PolyhedralSet, Polytope, Template
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.requirements import Requirement
 
-SAMPLES = 300
+TRAJECTORIES = 300
 """How many trajectories are simulated from a set that may return into itself."""
 
 PERIODS = 60
@@ -142,7 +142,7 @@ def _directions(
 
 def periods(loop: ClosedLoop, candidate: Candidate) -> list[int]:
     """After how many steps simulated states of a set are inside it again, well inside and more."""
-    states = initial_states(candidate.region, SAMPLES, 0)
+    states = initial_states(candidate.region, TRAJECTORIES, 0)
     scenarios = Scenarios.of(loop, candidate.region, PERIODS)
     drawn = scenarios.drawn(states, 0)
     runs = scenarios.runs(jax.device_get(loop), drawn, PERIODS, 0)

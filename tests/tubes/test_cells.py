@@ -165,20 +165,23 @@ DIAMOND = np.array([[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
 
 
 @pytest.mark.parametrize(
-    ("kind", "tolerance"), [("polytope", 3e-3), ("intersection", 2e-2)], ids=["polytope", "both"]
+    ("kind", "cells", "tolerance"),
+    [("polytope", 1000, 3e-3), ("polytope", 1, 3e-3), ("intersection", 1, 2e-2)],
+    ids=["cells", "programs", "both"],
 )
-def test_derivatives_in_polytopes_are_those_of_their_facets(kind, tolerance):
+def test_derivatives_in_polytopes_are_those_of_their_facets(kind, cells, tolerance):
     plant = rj.NonlinearPlant(
         lambda x, u: jnp.array([x[0] + 0.2 * x[1], x[1] + 0.1 * jnp.sin(x[0]) + 0.2 * u[0]]), 2, 1
     )
     net = rj.MLP.from_layers([([[1.0, 1.2]], [0.0]), ([[-1.0]], [0.0])], activation=rj.Tanh())
-    loop, template = rj.ClosedLoop(plant, net), rj.Template([[1.0, 1.0], [-1.0, -0.8], [0.0, -1.0]])
+    loop, template = rj.ClosedLoop(plant, net), rj.Template([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.1]])
 
     def offset(normals, offsets):
         X0 = rj.Polytope(normals, offsets)
         if kind == "intersection":
             X0 = rj.Intersection(X0, rj.Ellipsoid([0.01, 0.02], [[0.015, 0.0], [0.0, 0.01]]))
-        return rj.reach(loop, X0, 1, template, gap=1e-3, samples=200).sets[1].b[0]
+        limits = {"relaxation": rj.BranchAndCut(cells=cells), "gap": 1e-3, "samples": 200}
+        return jnp.sum(rj.reach(loop, X0, 1, template, **limits).sets[1].b)
 
     at, h = (jnp.asarray(DIAMOND), jnp.array([0.1, 0.12, 0.09, 0.1])), 1e-4
     slopes = jax.grad(offset, argnums=(0, 1))(*at)

@@ -38,7 +38,7 @@ class Batch:
         return (-self) + other
 
     def __mul__(self, factor: Any) -> Batch:
-        return Batch(self.values * factor)
+        return Batch(self.values * getattr(factor, "values", factor))
 
     __rmul__ = __mul__
 

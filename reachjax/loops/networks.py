@@ -226,12 +226,20 @@ class Network(AbstractNetwork):
             >>> Network.from_file(path)([-3.0]).tolist()  # |x|
             [3.0]
         """
-        from reachjax.loops.formats.chains import read_chain
+        from reachjax.loops.formats.chains import ENDINGS, read_chain
 
         path = existing_file("path", path)
         if path.suffix == ".onnx":
             return cls.from_onnx(path)
-        chain = read_chain(path)
+        try:
+            chain = read_chain(path)
+        except ValueError as error:
+            if path.suffix in ENDINGS:
+                raise
+            raise ValueError(
+                f"{error}. It was read as plain text, since its ending is none of "
+                f"{', '.join(ENDINGS)}"
+            ) from error
         return cls(chain, *chain.sizes)
 
     @classmethod

@@ -7,58 +7,17 @@ step is affine (a choice of entries, a matrix, a factor, a sum) or a layer of un
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Int
 
-from reachjax.loops.units import AbstractUnit, AtUnit, ReLU, UnboundedError
-from reachjax.loops.units.powers import Square
-from reachjax.numerics.checks import is_concrete
-from reachjax.numerics.rounding import Ball, namespace
-
-Shape = tuple[int, ...]
-
-
-class Value:
-    """Numbers that depend on the inputs.
-
-    Attributes:
-        place: where they stand among all values.
-        shape: of the array that they are, flattened.
-        link: a value of which they are `scale * value + offset`, entry by entry, if there is one.
-    """
-
-    def __init__(self, place: int, shape: Shape, link: Link | None = None):
-        self.place, self.shape, self.link = place, shape, link
-
-    @property
-    def size(self) -> int:
-        """How many numbers they are."""
-        return math.prod(self.shape)
-
-
-class Link(NamedTuple):
-    """That a value is `scale * ancestor + offset`, entry by entry, in flat arrays or numbers."""
-
-    ancestor: Value | None
-    scale: Any
-    offset: Any
-
-
-class Comparison(NamedTuple):
-    """Whether numbers are above zero; at zero it must not matter."""
-
-    value: Value
-
-
-Operand = Any
-"""A `Value`, a `Comparison`, or a plain array that depends on no input."""
-
-Step = Callable[[list[Any], AtUnit], Any]
-"""What a value is, given those before and what is done at a unit."""
+from reachjax.loops.rationals import Rationals
+from reachjax.loops.units import AbstractUnit, AtUnit, ReLU, SmoothUnit, Square, UnboundedError
+from reachjax.loops.values import Operand, Shape, Step, Term, Value, is_known
+from reachjax.numerics.rounding import UNIT, Ball, larger, namespace
 
 
 class Recorder:
@@ -69,35 +28,56 @@ class Recorder:
 
     Attributes:
         inputs: their values.
+        values: all of them, by their places.
+        steps: that make them, the same; None for the inputs.
         known: results of equations, and their operands, which are so kept alive.
         line: where a user wrote the equation at hand.
     """
 
     def __init__(self, shapes: Sequence[Shape]):
-        self._steps: list[Step] = []
-        self._count = len(shapes)
+        self.steps: list[Step | None] = [None] * len(shapes)
         self.line = ""
         self.known: dict[Any, tuple[list[Operand], Sequence[Operand]]] = {}
         self.inputs = [Value(place, shape) for place, shape in enumerate(shapes)]
+        self.values = [*self.inputs]
 
     def run(self, numbers: Sequence[Any], unit: AtUnit, wanted: Value) -> Any:
-        """The numbers of a value, from those of the inputs, of any one kind."""
-        found = list(numbers)
-        for step in self._steps:
-            found.append(step(found, unit))
+        """The numbers of a value, from those of the inputs, of any one kind.
+
+        What it does not depend on is left out: units there add no columns and need no bounds.
+        """
+        found = dict(enumerate(numbers))
+        for place in self.between(wanted):
+            step = self.steps[place]
+            if step is not None:
+                found[place] = step.apply(unit, *(found[parent] for parent in step.parents))
         return found[wanted.place]
 
-    def _added(self, shape: Shape, step: Step, link: Link | None = None) -> Value:
-        self._steps.append(step)
-        self._count += 1
-        return Value(self._count - 1, shape, link)
+    def between(self, wanted: Value, first: Value | None = None) -> list[int]:
+        """Places of all that a value depends on, itself the last; back to another one, if given."""
+        needed, todo = set(), [wanted.place]
+        while todo:
+            place = todo.pop()
+            if place not in needed:
+                needed.add(place)
+                step = None if first is not None and place == first.place else self.steps[place]
+                todo += step.parents if step is not None else ()
+        return sorted(needed)
+
+    def layer(self, shape: Shape, step: Step, **facts: Any) -> Value:
+        """What a step makes of the values before; the rest is what is known of it."""
+        made = Value(len(self.steps), shape, **facts)
+        self.steps.append(step)
+        self.values.append(made)
+        return made
 
     def picked(self, value: Value, index: Int[np.ndarray, ...]) -> Value:
         """Entries of a value, by their numbers in the flat vector, as an array of that shape."""
-        place, flat = value.place, np.asarray(index).ravel()
+        flat, known = np.asarray(index).ravel(), value.nonnegative
         if np.array_equal(flat, np.arange(value.size)):
-            return Value(place, np.shape(index), value.link)
-        return self._added(np.shape(index), lambda found, unit: found[place][flat])
+            return Value(value.place, np.shape(index), value.terms, value.offset, known)
+        step = Step(lambda unit, y: y[flat], (value.place,), entrywise=False)
+        return self.layer(np.shape(index), step, nonnegative=known)
 
     def broadcast(self, value: Value, shape: Shape) -> Value:
         """The same entries in a larger array."""
@@ -106,15 +86,45 @@ class Recorder:
 
     def scaled(self, value: Value, factor: Any) -> Value:
         """Each entry times a plain number."""
-        factor, place = _flat(factor, value), value.place
-        link = Link(value, factor, 0.0)
-        return self._added(value.shape, lambda found, unit: factor * found[place], link)
+        factor = _flat(factor, value)
+        known = value.nonnegative and is_known(factor) and bool(np.all(np.asarray(factor) >= 0))
+        step = Step(lambda unit, y: factor * y, (value.place,))
+        return self.layer(value.shape, step, terms=(Term(value, factor),), nonnegative=known)
+
+    def divided(self, value: Value, divisor: Any) -> Value:
+        """Each entry over a plain number: times its inverse, which is rounded.
+
+        That is one rounding of the eight that `gamma` has to spare in a product with a number.
+        """
+        divisor = _flat(divisor, value)
+        inverse = 1.0 / divisor
+        known = value.nonnegative and is_known(divisor) and bool(np.all(np.asarray(divisor) > 0))
+
+        def apply(unit: AtUnit, y: Any) -> Any:
+            return y.over(divisor) if isinstance(y, Rationals) else inverse * y
+
+        step, terms = Step(apply, (value.place,)), (Term(value, 1.0, divisor),)
+        return self.layer(value.shape, step, terms=terms, nonnegative=known)
+
+    def nearly_scaled(self, value: Value, factor: Any) -> Value:
+        """Each entry times a number that this factor is off by a few roundings, three at most.
+
+        As in `divided`; factors 1 and -1, which products take to be exact, are moved by one more.
+        """
+        factor = _flat(factor, value)
+        factor = namespace(factor).where(abs(factor) == 1, factor * (1 - UNIT), factor)
+
+        def apply(unit: AtUnit, y: Any) -> Any:
+            return y.times_unknown() if isinstance(y, Rationals) else factor * y
+
+        return self.layer(value.shape, Step(apply, (value.place,)))
 
     def shifted(self, value: Value, by: Any) -> Value:
         """Each entry plus a plain number."""
-        by, place = _flat(by, value), value.place
-        link = Link(value, 1.0, by)
-        return self._added(value.shape, lambda found, unit: found[place] + by, link)
+        by = _flat(by, value)
+        known = value.nonnegative and is_known(by) and bool(np.all(np.asarray(by) >= 0))
+        step = Step(lambda unit, y: y + by, (value.place,))
+        return self.layer(value.shape, step, terms=(Term(value),), offset=by, nonnegative=known)
 
     def added(self, one: Operand, other: Operand, sign: int = 1) -> Any:
         """`one + sign other`, both of one shape."""
@@ -122,19 +132,19 @@ class Recorder:
             return self.shifted(one, sign * other) if isinstance(one, Value) else one + sign * other
         if not isinstance(one, Value):
             return self.shifted(other if sign > 0 else self.scaled(other, np.array(-1.0)), one)
-        link, first, second = None, one.place, other.place
-        if shared := common(one, other):
-            by_one, by_other = shared
-            scale = by_one.scale + sign * by_other.scale
-            link = Link(by_one.ancestor, scale, by_one.offset + sign * by_other.offset)
-        if sign > 0:
-            return self._added(one.shape, lambda found, unit: found[first] + found[second], link)
-        return self._added(one.shape, lambda found, unit: found[first] - found[second], link)
+        known = sign > 0 and one.nonnegative and other.nonnegative
+        step = Step(
+            (lambda unit, y, z: y + z) if sign > 0 else (lambda unit, y, z: y - z),
+            (one.place, other.place),
+        )
+        terms = Term(one), Term(other, float(sign))
+        return self.layer(one.shape, step, terms=terms, nonnegative=known)
 
     def mapped(self, value: Value, matrix: Any, shape: Shape) -> Value:
         """A plain matrix times a value."""
-        place = value.place
-        return self._added(shape, lambda found, unit: matrix @ found[place])
+        known = value.nonnegative and is_known(matrix) and bool(np.all(np.asarray(matrix) >= 0))
+        step = Step(lambda unit, y: matrix @ y, (value.place,), entrywise=False)
+        return self.layer(shape, step, nonnegative=known)
 
     def joined(self, operands: Sequence[Operand]) -> Value:
         """All of these, one behind the other, as one vector; one of them at least is a value."""
@@ -155,77 +165,100 @@ class Recorder:
 
     def unit(self, unit: AbstractUnit, value: Value) -> Value:
         """A layer of units."""
-        place, line = value.place, self.line
+        line = self.line
 
-        def applied(found: list[Any], at: AtUnit) -> Any:
+        def applied(at: AtUnit, y: Any) -> Any:
             try:
-                return at(unit, found[place])
+                return at(unit, y)
             except UnboundedError as error:
                 raise UnboundedError(*error.given, line=line) from None
 
-        return self._added(value.shape, applied)
+        known = isinstance(unit, SmoothUnit) and unit.image[0] >= 0
+        step = Step(applied, (value.place,), unit=unit)
+        return self.layer(value.shape, step, nonnegative=known)
 
     def rectified(self, value: Value) -> Value:
         """`max(value, 0)`."""
-        return self.unit(ReLU(), value)
+        if value.nonnegative:
+            return value
+        found = self.unit(ReLU(), value)
+        found.nonnegative = True
+        return found
+
+    def loosened(self, value: Value, by: np.ndarray) -> Value:
+        """The same, up to an error of so much.
+
+        `0 y + c - c` is zero, which no kind of number knows: it takes the first sum to be off by
+        `gamma(1) c`, of which nothing is rounding. That is above `by` for `c = 2^51 by`.
+        """
+        large = by.reshape(-1) * 2.0**51
+
+        def apply(unit: AtUnit, y: Any) -> Any:
+            return y.unknown() if isinstance(y, Rationals) else y + ((0.0 * y + large) - large)
+
+        return self.layer(value.shape, Step(apply, (value.place,)))
+
+    def absolute(self, value: Value) -> Value:
+        """`|value| = 2 max(value, 0) - value`."""
+        if value.nonnegative:
+            return value
+        found = self.added(self.scaled(self.rectified(value), np.array(2.0)), value, -1)
+        step = Step(_sized, (found.place, value.place))
+        return self.layer(value.shape, step, terms=(Term(found),), nonnegative=True)
 
     def product(self, one: Value, other: Value) -> Value:
         """`one * other = ((one + other)^2 - (one - other)^2) / 4`, entry by entry."""
         if one.place == other.place:
             return self.unit(Square(), one)
-        total, difference = self.added(one, other), self.added(one, other, -1)
-        squares = [self.unit(Square(), part) for part in (total, difference)]
-        found = self.scaled(self.added(squares[0], squares[1], -1), np.array(0.25))
-        first, second, third = one.place, other.place, found.place
+        parts = self.added(one, other), self.added(one, other, -1)
+        more, less = (self.unit(Square(), part) for part in parts)
+        places = more.place, less.place, one.place, other.place
+        known = one.nonnegative and other.nonnegative
+        return self.layer(one.shape, Step(_multiplied, places), nonnegative=known)
 
-        def met(numbers: list[Any], unit: AtUnit) -> Any:
-            squares, factors = numbers[third], (numbers[first], numbers[second])
-            # the difference of two squares forgets what a product of intervals knows
-            known = type(squares) is Ball and all(type(each) is Ball for each in factors)
-            return squares.meeting(factors[0].times(factors[1])) if known else squares
+    def replaced(self, wanted: Value, old: Value, new: Value, passing: dict[int, bool]) -> Value:
+        """A value as it is where another one, of which alone it is made, is changed.
 
-        return self._added(one.shape, met)
+        Args:
+            wanted: which one.
+            old: the value that it is of, entry by entry.
+            new: what takes its place.
+            passing: rectifiers, by their places, that are now known to be their inputs, or zero.
+        """
+        found = {old.place: new}
+        for place in self.between(wanted, old):
+            step = self.steps[place]
+            if place == old.place or step is None:
+                continue
+            parents = [found[parent] for parent in step.parents]
+            if place in passing:
+                found[place] = parents[0] if passing[place] else self.scaled(new, np.array(0.0))
+                continue
+            changed = step._replace(parents=tuple(parent.place for parent in parents))
+            found[place] = self.layer(wanted.shape, changed)
+        return found[wanted.place]
+
+
+def _multiplied(unit: AtUnit, more: Any, less: Any, one: Any, other: Any) -> Any:
+    """Products, from the squares of sums and of differences, and from the factors.
+
+    Where factors are numbers, their product is: squares lose what is small beside them. Where they
+    are intervals, theirs is met with it: a difference of two squares forgets what that knows.
+    """
+    if isinstance(one, np.ndarray | jax.Array | Rationals) or hasattr(one, "values"):
+        return one * other
+    squares = 0.25 * (more - less)
+    known = type(squares) is Ball and all(type(each) is Ball for each in (one, other))
+    return squares.meeting(one.times(other)) if known else squares
+
+
+def _sized(unit: AtUnit, size: Any, y: Any) -> Any:
+    """Sizes `|y|`; of intervals, met with what these know of them."""
+    if type(size) is not Ball:
+        return size
+    least = larger(larger(y.lower, -y.upper), 0.0)
+    return size.meeting(Ball.between(least, larger(larger(-y.lower, y.upper), least)))
 
 
 def _flat(plain: Any, value: Value) -> Any:
     return namespace(plain).broadcast_to(plain, value.shape).reshape(-1)
-
-
-def _ancestors(operand: Operand) -> Iterator[Link]:
-    """What an operand is an affine function of, entry by entry, the nearest first: itself."""
-    if not isinstance(operand, Value):
-        yield Link(None, 0.0, operand.reshape(-1))
-        return
-    found = Link(operand, 1.0, 0.0)
-    while found.ancestor is not None:
-        yield found
-        up = found.ancestor.link
-        if up is None:
-            return
-        offset = found.scale * up.offset + found.offset
-        found = Link(up.ancestor, found.scale * up.scale, offset)
-
-
-def common(*operands: Operand) -> list[Link] | None:
-    """Each of them as an affine function of the nearest value that they have in common.
-
-    None if there is no such value.
-    """
-    lines = [list(_ancestors(operand)) for operand in operands]
-    first = next(line for line in lines if line[0].ancestor is not None)
-    for candidate in first:
-        found = []
-        for line in lines:
-            if line[0].ancestor is None:  # constants are of all
-                found.append(line[0])
-                continue
-            place = candidate.ancestor and candidate.ancestor.place
-            found += [link for link in line if link.ancestor and link.ancestor.place == place][:1]
-        if len(found) == len(lines):
-            return found
-    return None
-
-
-def is_known(*plain: Any) -> bool:
-    """Whether plain arrays are concrete numbers."""
-    return is_concrete(plain)

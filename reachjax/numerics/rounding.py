@@ -67,7 +67,10 @@ def constant(numbers: Any) -> Any:
 
 
 def gamma(operations: int) -> float:
-    """Relative error bound of `operations` rounded operations, with some to spare."""
+    """Relative error bound of `operations` rounded operations, with eight to spare.
+
+    Recordings of functions use these up where a constant is rounded, as that of `x / 3`.
+    """
     count = (operations + 8) * UNIT
     return count / (1.0 - count)
 

@@ -1,7 +1,9 @@
 """The package's own objects as files: arrays, and a description of what they are part of.
 
 A file is a zip of numpy's arrays (`.npz`) with a document in JSON that says how they make up
-objects. Nothing in it is executed: classes are looked up by name, and in this package only.
+objects. Nothing in it is executed: classes are looked up by name, in this package only, and each is
+made in the one way in which such classes are written. A digest finds what was changed by accident;
+it is no signature.
 """
 
 from __future__ import annotations
@@ -107,6 +109,7 @@ def _name(kind: type) -> str:
 
 
 def _class(name: str) -> Any:
+    """A class that this package defines, by name; what it merely imports is none of its own."""
     module, _, path = name.partition(":")
     if module.partition(".")[0] != PACKAGE:
         raise ValueError(f"it names {name}, which is not of {PACKAGE}")
@@ -118,6 +121,29 @@ def _class(name: str) -> Any:
         raise ValueError(f"it names {name}, which this {PACKAGE} does not have") from None
     if not isinstance(found, type):
         raise ValueError(f"it names {name}, which is no class")
+    if found.__module__.partition(".")[0] != PACKAGE or found.__qualname__ != path:
+        raise ValueError(f"it names {name}, which is not of {PACKAGE}")
+    return found
+
+
+def _enumeration(name: str) -> type[enum.Enum]:
+    found = _class(name)
+    if not issubclass(found, enum.Enum):
+        raise ValueError(f"it names {name}, which is no enumeration")
+    return found
+
+
+def _named_tuple(name: str) -> Any:
+    found = _class(name)
+    if not (issubclass(found, tuple) and hasattr(found, "_fields")):
+        raise ValueError(f"it names {name}, which is no named tuple")
+    return found
+
+
+def _restorable(name: str) -> Any:
+    found = _class(name)
+    if not (hasattr(found, "stored") and hasattr(found, "restored")):
+        raise ValueError(f"it names {name}, which is not stored so")
     return found
 
 
@@ -131,7 +157,7 @@ def _read(described: Any, arrays: list[np.ndarray], outside: Any) -> Any:
 
     match described:
         case {"enum": name, "member": member}:
-            return _class(name)[member]
+            return _enumeration(name)[member]
         case {"bytes": text}:
             return base64.b64decode(text)
         case {"array": number, "on": where}:
@@ -139,7 +165,7 @@ def _read(described: Any, arrays: list[np.ndarray], outside: Any) -> Any:
         case {"outside": _}:
             return outside
         case {"named": name, "parts": parts}:
-            return _class(name)(*map(read, parts))
+            return _named_tuple(name)(*map(read, parts))
         case {"tuple": parts}:
             return tuple(map(read, parts))
         case {"list": parts}:
@@ -147,7 +173,7 @@ def _read(described: Any, arrays: list[np.ndarray], outside: Any) -> Any:
         case {"mapping": items}:
             return {read(key): read(each) for key, each in items}
         case {"stored": name, "as": parts}:
-            return _class(name).restored(read(parts))
+            return _restorable(name).restored(read(parts))
         case {"object": name, "fields": fields}:
             return _rebuilt(_class(name), {key: read(each) for key, each in fields.items()})
     raise ValueError(f"it describes {described!r:.60}, which is unknown")

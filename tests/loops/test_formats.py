@@ -18,14 +18,17 @@ EXPORTED = sorted((Path(__file__).parent.parent / "data" / "networks").glob("*.o
 FLOAT = TensorProto.FLOAT
 
 
-def model(nodes, arrays, shape=(None, 3), domains=()):
+def model(nodes, arrays, shape=(None, 3), domains=(), version=18):
     """A graph from `x` to `y`, in 32-bit floats."""
     ends = [
         helper.make_tensor_value_info(name, FLOAT, s) for name, s in (("x", shape), ("y", None))
     ]
     held = [numpy_helper.from_array(np.asarray(value), name) for name, value in arrays.items()]
     graph = helper.make_graph(nodes, "network", ends[:1], ends[1:], held)
-    versions = [helper.make_opsetid("", 18), *(helper.make_opsetid(each, 1) for each in domains)]
+    versions = [
+        helper.make_opsetid("", version),
+        *(helper.make_opsetid(each, 1) for each in domains),
+    ]
     return helper.make_model(graph, opset_imports=versions, ir_version=9)
 
 
@@ -152,6 +155,43 @@ def test_a_graph_computes_what_onnxruntime_does(name, tmp_path):
     assert net.outputs == expected.shape[1]
     found = jax.vmap(net)(points.astype(float))
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+
+
+PARTS = [f"part{k}" for k in range(4)]
+AXES = {"axes": np.array([], np.int64)}
+TURNS = {
+    "parts of seven": ([helper.make_node("Split", ["x"], PARTS[:3], axis=1, num_outputs=3)], 18, 7),
+    "equal parts": ([helper.make_node("Split", ["x"], PARTS[:3], axis=1)], 13, 6),
+    "sum over no axes": ([helper.make_node("ReduceSum", ["x", "axes"], PARTS[:1])], 18, 3),
+    "mean over no axes": ([helper.make_node("ReduceMean", ["x", "axes"], PARTS[:1])], 18, 3),
+    "no sum over no axes": (
+        [helper.make_node("ReduceSum", ["x", "axes"], PARTS[:1], noop_with_empty_axes=1)],
+        18,
+        3,
+    ),
+    "elu": ([helper.make_node("Elu", ["x"], PARTS[:1], alpha=0.5)], 18, 3),
+    "softplus": ([helper.make_node("Softplus", ["x"], PARTS[:1])], 18, 3),
+    "softsign": ([helper.make_node("Softsign", ["x"], PARTS[:1])], 18, 3),
+    "hyperbolic": (
+        [helper.make_node("Sinh", ["x"], PARTS[:1]), helper.make_node("Cosh", ["x"], PARTS[1:2])],
+        18,
+        3,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TURNS)
+def test_every_result_of_an_operator_is_that_of_onnxruntime(name, tmp_path):
+    nodes, version, inputs = TURNS[name]
+    held = AXES if "axes" in name else {}
+    for part in (each for node in nodes for each in node.output):
+        wanted = helper.make_node("Identity", [part], ["y"])
+        path = written(
+            tmp_path / "net.onnx", [*nodes, wanted], held, shape=(None, inputs), version=version
+        )
+        x = floats(1, inputs)
+        expected = np.ravel(runtime(path)(x))
+        np.testing.assert_allclose(rj.Network.from_onnx(path)(x[0]), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("path", EXPORTED, ids=lambda path: path.stem)
@@ -359,4 +399,11 @@ def test_a_matlab_file_without_a_network(layers, tmp_path):
     held = {"W": cells([np.ones((2, 3)), np.ones((2, 3))]), "b": cells([[1], [1]])}
     scipy.io.savemat(path, held | {"act_fcns": ["relu", "relu"]})
     with pytest.raises(ValueError, match="do not chain"):
+        rj.Network.from_file(path)
+
+
+def test_an_ending_that_is_not_known_names_those_that_are(tmp_path):
+    path = tmp_path / "net.pt"
+    path.write_bytes(b"PK\x03\x04\x80\xff")
+    with pytest.raises(ValueError, match=r"net\.pt cannot be read.*none of \.onnx, \.mat, \.nnet"):
         rj.Network.from_file(path)

@@ -270,6 +270,9 @@ def test_foreign_files(tube, path):
         {"object": "reachjax.numerics.storage:importlib", "fields": {}},
         {"object": "reachjax.loops:ClosedLoop", "fields": {}},
         {"named": "subprocess:Popen", "parts": ["true"]},
+        {"named": "reachjax.loops:ReLU", "parts": []},
+        {"enum": "reachjax.loops:ReLU", "member": "x"},
+        {"stored": "reachjax.loops:ReLU", "as": None},
         {"stored": "reachjax.none:Nothing", "as": None},
         {"array": 999, "on": ""},
         {"what": 1},
@@ -283,3 +286,20 @@ def test_a_document_names_classes_of_the_package_only(value, tube, path):
     changed(path, value=value, digest=storage._digest(value, arrays))
     with pytest.raises(ValueError, match=r"tube\.reach (cannot be read|must hold a tube)"):
         rj.load(path)
+
+
+@pytest.mark.parametrize("kind", ["named", "enum", "stored", "object"])
+def test_a_crafted_file_runs_nothing(kind, tmp_path):
+    """Classes of others can be reached through what modules of the package import."""
+    made = tmp_path / "made"
+    name = "reachjax.numerics.pytrees:jax.version.subprocess.Popen"
+    command = {"list": ["touch", str(made)]}
+    value = {kind: name, "parts": [command], "member": "x", "as": command, "fields": {}}
+    path = tmp_path / "crafted.reach"
+    head = {"format": storage.PACKAGE, "version": storage.VERSION, "release": "x", "value": value}
+    head |= {"left_out": False, "digest": storage._digest(value, [])}
+    with path.open("wb") as file:
+        np.savez(file, **{storage.DOCUMENT: np.frombuffer(json.dumps(head).encode(), np.uint8)})
+    with pytest.raises(ValueError, match="which is not of reachjax"):
+        rj.load(path)
+    assert not made.exists()

@@ -48,6 +48,9 @@ NAMES = {
 }
 """What files call activations, in small letters."""
 
+ENDINGS = (".onnx", ".mat", ".nnet", ".txt")
+"""Of files that say what they are; any other is taken for plain text."""
+
 
 @pytree
 class Chain:

@@ -140,6 +140,8 @@ def read_graph(path: Path) -> tuple[Graph, int, int]:
                 f"{path} contains the operator {each.op_type!r} (node {each.name!r}), which is not "
                 f"known: {', '.join(sorted(OPERATORS))} are"
             )
+        if each.op_type == "Split":  # of old: into equal parts, as many as have names
+            attributes.setdefault("num_outputs", len(each.output))
         nodes.append(
             Node(each.op_type, tuple(each.input), tuple(each.output), tuple(attributes.items()))
         )

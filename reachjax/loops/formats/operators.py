@@ -91,8 +91,10 @@ def _concatenated(attributes: Attributes, *parts: Any) -> Any:
 
 def _split(attributes: Attributes, x: Any, sizes: Any = None) -> Any:
     axis, sizes = attributes.get("axis", 0), attributes.get("split") if sizes is None else sizes
-    if sizes is None:
-        return _over(x).array_split(x, attributes["num_outputs"], axis)
+    if sizes is None:  # all but the last ones have one size
+        count, total = attributes["num_outputs"], np.shape(x)[axis]
+        size = -(-total // count)
+        sizes = [min(size, max(total - k * size, 0)) for k in range(count)]
     return _over(x).split(x, np.cumsum(_whole(sizes))[:-1].tolist(), axis)
 
 
@@ -129,7 +131,7 @@ def _clip(attributes: Attributes, x: Any, low: Any = None, high: Any = None) -> 
 
 def _reduced(name: str) -> Operator:
     def operator(attributes: Attributes, x: Any, axes: Any = None) -> Any:
-        found = _axes(attributes, axes)
+        found = _axes(attributes, axes) or None
         if found is None and attributes.get("noop_with_empty_axes", 0):
             return x
         keep = bool(attributes.get("keepdims", 1))
@@ -169,8 +171,10 @@ OPERATORS: dict[str, Operator] = {
     "Concat": _concatenated,
     "ConstantOfShape": _constant_of_shape,
     "Cos": _entrywise("cos"),
+    "Cosh": _entrywise("cosh"),
     "Div": _entrywise("divide"),
     "Dropout": lambda attributes, x, *others: x,
+    "Elu": lambda attributes, x: jax.nn.elu(x, attributes.get("alpha", 1.0)),
     "Exp": _entrywise("exp"),
     "Flatten": _flatten,
     "Gather": _gathered,
@@ -194,7 +198,10 @@ OPERATORS: dict[str, Operator] = {
     "Shape": lambda attributes, x: np.array(np.shape(x), np.int64),
     "Sigmoid": lambda attributes, x: jax.nn.sigmoid(x),
     "Sin": _entrywise("sin"),
+    "Sinh": _entrywise("sinh"),
     "Slice": _sliced,
+    "Softplus": lambda attributes, x: jax.nn.softplus(x),
+    "Softsign": lambda attributes, x: jax.nn.soft_sign(x),
     "Split": _split,
     "Sqrt": _entrywise("sqrt"),
     "Squeeze": _squeeze,

@@ -123,8 +123,8 @@ class AbstractUnit(AbstractActivation):
 
     Attributes:
         separable: whether each value is of its own input alone.
-        nonexpansive: whether `|f(y) - f(y')| <= |y - y'|`. `loop_bounds` relies on it where inputs
-            are rounded, and holds for such units only.
+        nonexpansive: whether `|f(y) - f(y')| <= |y - y'|`. Where inputs are rounded, `loop_bounds`
+            adds that to the values of such units, and widens the inputs of others.
         free: whether any value between its two lines, which are parallel, is possible, whatever
             the input is: then all that there is to know of it is that.
         stated: whether its facts are known of its inputs, so that they count where it is affine.

@@ -8,6 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from reachjax.loops.units.base import Lines
 from reachjax.loops.units.smooth import POLE, SLACK, Quadratic, SmoothUnit, nearest
 from reachjax.numerics.rounding import TINY, constant, gamma, larger, namespace, settled, smaller
 
@@ -56,11 +57,17 @@ class Square(SmoothUnit):
 class Sqrt(SmoothUnit):
     """`sqrt y` where `y >= 0`.
 
+    Args:
+        nonnegative: whether its inputs are known never to be negative, as sums of squares are; what
+            bounds of them say below zero then says nothing.
+
     Example:
         >>> import numpy as np
         >>> [end.round(3).tolist() for end in Sqrt().interval(np.array([0.0]), np.array([4.0]))]
         [[0.0], [2.0]]
     """
+
+    nonnegative: bool = False
 
     nonexpansive = False
     image = (0.0, math.inf)
@@ -74,6 +81,24 @@ class Sqrt(SmoothUnit):
     def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
         """Where no input is negative."""
         return (lower >= 0) & (upper < math.inf)
+
+    def _met(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """What inputs can be, of those between bounds."""
+        if not self.nonnegative:
+            return lower, upper
+        return larger(lower, 0.0), larger(upper, 0.0)
+
+    def remainder(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """As of any smooth unit, of what inputs can be."""
+        return super().remainder(slope, *self._met(lower, upper))
+
+    def lines(self, lower: Array, upper: Array) -> Lines:
+        """The same."""
+        return super().lines(*self._met(lower, upper))
+
+    def quadratic(self, lower: Array, upper: Array) -> Quadratic:
+        """The same."""
+        return super().quadratic(*self._met(lower, upper))
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`1 / (2 sqrt y)`."""
@@ -96,12 +121,17 @@ class Sqrt(SmoothUnit):
 class Reciprocal(SmoothUnit):
     """`1 / y`, on intervals on either side of 0.
 
+    Args:
+        positive: whether it is asked for positive inputs only: of others it has no bounds.
+
     Example:
         >>> import numpy as np
         >>> lower, upper = np.array([-2.0, -1.0]), np.array([-1.0, 1.0])
         >>> [end.round(3).tolist() for end in Reciprocal().interval(lower, upper)]
         [[-1.0, -inf], [-0.5, inf]]
     """
+
+    positive: bool = False
 
     nonexpansive = False
 
@@ -111,7 +141,8 @@ class Reciprocal(SmoothUnit):
 
     def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
         """Where all inputs are positive, or all are negative."""
-        return (nearest(lower, upper) >= TINY) & super().defined(lower, upper)
+        size = lower if self.positive else nearest(lower, upper)
+        return (size >= TINY) & super().defined(lower, upper)
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`-1 / y^2`."""

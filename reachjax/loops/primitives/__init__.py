@@ -1,0 +1,95 @@
+"""What each primitive of a jaxpr is as steps of a recording.
+
+Affine ones and those that move entries become matrices and choices of entries; the others are units
+and what is made of them. Choices between numbers are continuous ones in disguise, or errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from reachjax.loops.primitives import affine, bends, folds, moving, powers
+from reachjax.loops.primitives.equations import JUMPS, Equation, Rule, UnsupportedError, on_host
+from reachjax.loops.recording import Recorder
+from reachjax.loops.values import Comparison, Operand, Value, is_known
+
+__all__ = ["Equation", "UnsupportedError", "recorded"]
+
+# fmt: off
+DISCONTINUOUS = (
+    "sign", "round", "floor", "ceil", "argmax", "argmin", "rem", "and", "or", "xor",
+    "nextafter", "shift_left", "reduce_and", "reduce_or",
+)
+"""Primitives that jump."""
+
+SOLVERS = ("custom_linear_solve", "triangular_solve", "lu", "cholesky", "lu_solve")
+"""Primitives whose results are known up to rounding that is not bounded."""
+
+INFINITE = (
+    "max", "min", "clamp", "select_n", "gt", "ge", "lt", "le", "eq", "ne", *moving.RULES,
+)
+"""Primitives that may take numbers that are not finite."""
+# fmt: on
+
+RULES: dict[str, Rule] = {
+    **moving.RULES,
+    **affine.RULES,
+    **powers.RULES,
+    **bends.RULES,
+    **folds.RULES,
+}
+
+
+def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
+    """The value, or a list of them, of one equation, of which one operand at least is a value.
+
+    Raises:
+        UnsupportedError: there is no rule for it.
+    """
+    if jnp.issubdtype(equation.kind, jnp.inexact) and equation.kind != jnp.result_type(float):
+        raise UnsupportedError(
+            f"it rounds to {equation.kind}: compute in 64-bit floats, for example by not giving "
+            "layers a dtype"
+            if jnp.issubdtype(equation.kind, jnp.floating)
+            else "it computes in complex numbers"
+        )
+    rule = RULES.get(equation.name)
+    first = operands[0]
+    if isinstance(first, Comparison) and equation.name in moving.ALONE:
+        return Comparison(recorded(recorder, equation, [first.value, *operands[1:]]))
+    compared = any(isinstance(each, Comparison) for each in operands)
+    if compared and equation.name not in ("select_n", "not"):
+        raise UnsupportedError(
+            "a comparison of numbers may only choose between two of them that agree where it "
+            "changes, as jnp.where(y > 0, y, 0.1 * y) does"
+        )
+    if rule is None or (equation.name == "convert_element_type" and not _is_float(equation)):
+        raise UnsupportedError(_why(equation))
+    plain = [each for each in operands if not isinstance(each, Value | Comparison)]
+    if equation.name not in INFINITE and not all(map(_is_finite, plain)):
+        raise UnsupportedError("one of its operands is a constant that is not finite")
+    return rule(recorder, equation, operands)
+
+
+def _why(equation: Equation) -> str:
+    if equation.name in DISCONTINUOUS or equation.name == "convert_element_type":
+        return JUMPS
+    if equation.name in SOLVERS:
+        return (
+            "what a solver's rounding may add is not known: multiply by jnp.linalg.inv(A), which "
+            "is taken as it is computed"
+        )
+    return "there are no bounds for it: write it with primitives that have some"
+
+
+def _is_float(equation: Equation) -> bool:
+    return jnp.issubdtype(equation.kind, jnp.floating)
+
+
+def _is_finite(plain: Any) -> bool:
+    is_number = on_host(plain) or jnp.issubdtype(plain.dtype, jnp.number)
+    return not (is_number and is_known(plain)) or bool(np.all(np.isfinite(np.asarray(plain))))

@@ -1,0 +1,120 @@
+"""Primitives that are affine in what depends on the inputs, and products and quotients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from reachjax.loops.primitives.equations import Equation, Rule, UnsupportedError, entrywise, on_host
+from reachjax.loops.recording import Recorder
+from reachjax.loops.units import Reciprocal
+from reachjax.loops.values import Operand, Value, is_known
+from reachjax.numerics.rounding import TINY
+
+
+def _linear(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    """Any primitive that is linear in its one operand that is no plain array: as a matrix."""
+    where, *others = (k for k, each in enumerate(operands) if isinstance(each, Value))
+    if others:
+        raise UnsupportedError("of its operands only one may depend on inputs")
+    value = operands[where]
+
+    def of(flat: Any) -> Any:
+        given = [*operands]
+        given[where] = flat.reshape(value.shape)
+        return equation.evaluate(*given).reshape(-1)
+
+    matrix = jax.vmap(of)(jnp.eye(value.size)).T
+    if is_known(matrix) and all(on_host(each) for each in operands if each is not value):
+        matrix = np.asarray(matrix)
+    return recorder.mapped(value, matrix, equation.shape)
+
+
+def _contracted(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    left, right = operands
+    (over_left, over_right), (batch_left, batch_right) = equation.params["dimension_numbers"]
+    if not (isinstance(left, Value) and isinstance(right, Value)):
+        plain, value = (right, left) if isinstance(left, Value) else (left, right)
+        if np.ndim(plain) == 2 and len(value.shape) == 1 and len(over_left) == 1:
+            axis = over_right[0] if isinstance(left, Value) else over_left[0]
+            return recorder.mapped(value, plain if axis == 1 else plain.T, equation.shape)
+        return _linear(recorder, equation, operands)
+
+    def arranged(value: Value, batch: Sequence[int], over: Sequence[int]) -> np.ndarray:
+        """Numbers of entries as `(batch, free, contracted)`."""
+        index = np.arange(value.size).reshape(value.shape)
+        free = [k for k in range(index.ndim) if k not in (*batch, *over)]
+        sizes = [math.prod(value.shape[k] for k in axes) for axes in (batch, free, over)]
+        return index.transpose(*batch, *free, *over).reshape(sizes)
+
+    one, other = (
+        arranged(left, batch_left, over_left)[:, :, None],
+        arranged(right, batch_right, over_right)[:, None],
+    )
+    one, other = np.broadcast_arrays(one, other)
+    products = recorder.product(recorder.picked(left, one), recorder.picked(right, other))
+    count = math.prod(equation.shape)
+    sums = np.kron(np.eye(count), np.ones((1, one.shape[-1])))
+    return recorder.mapped(products, sums, equation.shape)
+
+
+@entrywise
+def _sum(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    return recorder.added(operands[0], operands[1])
+
+
+@entrywise
+def _difference(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    return recorder.added(operands[0], operands[1], -1)
+
+
+def _negated(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    return recorder.scaled(operands[0], np.array(-1.0))
+
+
+@entrywise
+def _product(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    one, other = operands
+    if not isinstance(other, Value):
+        return recorder.scaled(one, other)
+    return recorder.product(one, other) if isinstance(one, Value) else recorder.scaled(other, one)
+
+
+@entrywise
+def _quotient(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    one, other = operands
+    if not isinstance(other, Value):
+        if is_known(other):
+            size = abs(np.asarray(other))
+            if not np.all((size >= TINY) & (size <= 1 / TINY)):
+                raise UnsupportedError("it divides by zero, or by what has no inverse in 64 bits")
+        return recorder.divided(one, other)
+    inverse = recorder.unit(Reciprocal(), other)
+    inverse.nonnegative = other.nonnegative
+    if isinstance(one, Value):
+        return recorder.product(one, inverse)
+    return recorder.scaled(inverse, one)
+
+
+def _itself(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Operand:
+    return operands[0]
+
+
+RULES: dict[str, Rule] = {
+    **dict.fromkeys(["reduce_sum", "cumsum", "conv_general_dilated", "reduce_window_sum"], _linear),
+    **dict.fromkeys(
+        ["copy", "copy_p", "stop_gradient", "optimization_barrier", "convert_element_type"], _itself
+    ),
+    "dot_general": _contracted,
+    "add": _sum,
+    "add_any": _sum,
+    "sub": _difference,
+    "neg": _negated,
+    "mul": _product,
+    "div": _quotient,
+}

@@ -1,0 +1,211 @@
+"""Primitives that move entries: what they do is done to numbers of entries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from reachjax.loops.primitives.equations import (
+    Equation,
+    Rule,
+    UnsupportedError,
+    shape_of,
+)
+from reachjax.loops.recording import Recorder
+from reachjax.loops.values import Operand, Value, is_known
+
+NONE = -1
+"""The number of an entry that there is not."""
+
+
+def _numbers(operands: Sequence[Operand]) -> list[np.ndarray]:
+    """Numbers of the entries of operands, one behind the other."""
+    found, end = [], 0
+    for each in operands:
+        shape = shape_of(each)
+        found.append(np.arange(end, end + math.prod(shape)).reshape(shape))
+        end += math.prod(shape)
+    return found
+
+
+def _evaluated(equation: Equation, *operands: Any, **changes: Any) -> Any:
+    with jax.ensure_compile_time_eval():
+        return equation.evaluate(*map(jnp.asarray, operands), **changes)
+
+
+def _require_known(places: Sequence[Operand]) -> None:
+    if any(isinstance(each, Value) for each in places) or not is_known(*places):
+        raise UnsupportedError(
+            "which entries it takes must not depend on inputs or traced parameters"
+        )
+
+
+def _require_inside(index: np.ndarray, size: int) -> None:
+    if index.size and not (index.min() >= 0 and index.max() < size):
+        raise UnsupportedError(
+            "it takes entries that there are not: an index is out of range, where JAX fills in NaN"
+        )
+
+
+def _taken(recorder: Recorder, operands: Sequence[Operand], index: Any) -> Value:
+    """Entries of several operands, by their numbers; constants among them must be finite."""
+    index = np.asarray(index)
+    parts = []
+    for each, numbers in zip(operands, _numbers(operands), strict=True):
+        if not isinstance(each, Value) and is_known(each):
+            finite = np.isfinite(np.asarray(each))
+            if np.any(np.isin(numbers[~finite], index)):
+                raise UnsupportedError("one of its operands is a constant that is not finite")
+            each = each if np.all(finite) else np.where(finite, np.asarray(each), 0.0)
+        parts.append(each)
+    return recorder.picked(recorder.joined(parts), index)
+
+
+def _moved(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
+    """Of one operand, by others that are known."""
+    value, *places = operands
+    _require_known(places)
+    if not isinstance(value, Value):
+        raise UnsupportedError("what it moves must depend on inputs")
+    moved = _evaluated(equation, *_numbers([value]), *places)
+    if isinstance(moved, list | tuple):
+        return [recorder.picked(value, np.asarray(part)) for part in moved]
+    _require_inside(np.asarray(moved), value.size)
+    return recorder.picked(value, np.asarray(moved))
+
+
+def _gathered(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
+    """Entries by their places, which are known; out of range it may fill in a number."""
+    value, places = operands
+    _require_known([places])
+    fills = equation.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
+    changes = {"fill_value": NONE} if fills else {}
+    index = np.asarray(_evaluated(equation, *_numbers([value]), places, **changes))
+    filled = equation.params["fill_value"]
+    if fills and np.any(index == NONE) and filled is not None and np.isfinite(filled):
+        parts = [value, np.full(1, float(filled))]
+        return _taken(recorder, parts, np.where(index == NONE, value.size, index))
+    _require_inside(index, value.size)
+    return recorder.picked(value, index)
+
+
+def _joined(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    """Concatenation and stacking."""
+    index = _evaluated(equation, *_numbers(operands))
+    return _taken(recorder, operands, index)
+
+
+def _padded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    """By one number, of any kind."""
+    index = _evaluated(equation, *_numbers(operands))
+    return _taken(recorder, operands, index)
+
+
+def _updated(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    """A slice, whose place is known, by other entries."""
+    whole, part, *places = operands
+    _require_known(places)
+    index = _evaluated(equation, *_numbers([whole, part]), *places)
+    return _taken(recorder, [whole, part], index)
+
+
+def _require_once(equation: Equation, whole: Operand, places: Operand, part: Operand) -> None:
+    """Raise an error if an entry is set twice: which one counts is not said."""
+    zeros, ones = np.zeros(shape_of(whole)), np.ones(shape_of(part))
+    if np.any(np.asarray(_scattered(equation, zeros, places, ones, adding=True)) > 1):
+        raise UnsupportedError("it sets an entry more than once")
+
+
+def _scattered(equation: Equation, whole: Any, places: Any, part: Any, adding: bool = False) -> Any:
+    """What a scattering of any kind sets, or adds."""
+    params = equation.params
+    apply = jax.lax.scatter_add if adding else jax.lax.scatter
+    with jax.ensure_compile_time_eval():
+        return apply(
+            jnp.asarray(whole),
+            jnp.asarray(places),
+            jnp.asarray(part),
+            params["dimension_numbers"],
+            indices_are_sorted=params["indices_are_sorted"],
+            unique_indices=False,
+            mode=params["mode"],
+        )
+
+
+def _set(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
+    """`x.at[i].set(y)` with known places."""
+    whole, places, part = operands
+    _require_known([places])
+    if equation.params.get("update_jaxpr") is not None and equation.name == "scatter":
+        raise UnsupportedError("it applies a function of its own to entries")
+    _require_once(equation, whole, places, part)
+    before, new = _numbers([whole, part])
+    index = _scattered(equation, before, places, new)
+    return _taken(recorder, [whole, part], index)
+
+
+def _added(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
+    """`x.at[i].add(y)` with known places: what is added is a sum of entries of `y`."""
+    whole, places, part = operands
+    _require_known([places])
+    zeros = np.zeros(shape_of(whole))
+    if not isinstance(part, Value):
+        return recorder.added(whole, equation.evaluate(zeros, places, part))
+    ones = np.eye(part.size).reshape(part.size, *part.shape)
+    columns = [_scattered(equation, zeros, places, one, adding=True).reshape(-1) for one in ones]
+    matrix = np.stack([np.asarray(column) for column in columns], axis=1)
+    return recorder.added(recorder.mapped(part, matrix, equation.shape), whole)
+
+
+def _multiplied(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
+    """`x.at[i].multiply(y)` with known places."""
+    whole, places, part = operands
+    _require_known([places])
+    ones = np.ones(shape_of(whole))
+    if not isinstance(part, Value):
+        return recorder.scaled(whole, equation.evaluate(ones, places, part))
+    factor = _set(recorder, equation, [ones, places, part])
+    if not isinstance(whole, Value):
+        return recorder.scaled(factor, whole)
+    return recorder.product(whole, factor)
+
+
+def chosen(recorder: Recorder, which: Any, cases: Sequence[Operand]) -> Operand:
+    """Entries of several operands, by known numbers; or weighed, by traced ones."""
+    if is_known(which):
+        which = np.broadcast_to(np.asarray(which, int), shape_of(cases[0]))
+        if which.size and np.all(which == which.flat[0]):
+            return cases[int(which.flat[0])]
+        index = which * which.size + np.arange(which.size).reshape(which.shape)
+        return _taken(recorder, cases, index)
+    parts: list[Any] = []
+    for number, each in enumerate(cases):
+        weight = jnp.broadcast_to(which == number, each.shape).astype(float)
+        parts.append(recorder.scaled(each, weight) if isinstance(each, Value) else weight * each)
+    return reduce(recorder.added, parts)
+
+
+# fmt: off
+ALONE = (
+    "reshape", "squeeze", "expand_dims", "transpose", "broadcast_in_dim", "slice", "rev",
+    "dynamic_slice", "tile",
+)
+"""Primitives that move the entries of one operand, and have one result."""
+# fmt: on
+
+RULES: dict[str, Rule] = {
+    **dict.fromkeys((*ALONE, "split"), _moved),
+    **dict.fromkeys(["concatenate", "stack"], _joined),
+    "gather": _gathered,
+    "pad": _padded,
+    "dynamic_update_slice": _updated,
+    "scatter": _set,
+    "scatter-add": _added,
+    "scatter-mul": _multiplied,
+}

@@ -1,0 +1,179 @@
+"""Powers, exponentials and angles: units, and what is made of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from reachjax.loops.primitives.equations import Equation, Rule, UnsupportedError, entrywise
+from reachjax.loops.recording import Recorder
+from reachjax.loops.units import (
+    AbstractUnit,
+    Atan,
+    Cos,
+    Exp,
+    Log,
+    Reciprocal,
+    Sin,
+    Sqrt,
+    Tanh,
+)
+from reachjax.loops.values import Operand, Value, is_known
+
+
+def _by(unit: AbstractUnit) -> Rule:
+    return lambda recorder, equation, operands: recorder.unit(unit, operands[0])
+
+
+def _raised(recorder: Recorder, value: Value, power: int) -> Any:
+    """A whole power, by squares and products."""
+    if power < 0:
+        inverse = recorder.unit(Reciprocal(), value)
+        inverse.nonnegative = value.nonnegative
+        return _raised(recorder, inverse, -power)
+    if power == 0:
+        return np.ones(value.shape)
+    half = value if power < 2 else _raised(recorder, value, power // 2)
+    if power < 2:
+        return half
+    square = recorder.product(half, half)
+    return square if power % 2 == 0 else recorder.product(square, value)
+
+
+def _rooted(recorder: Recorder, value: Value) -> Value:
+    return recorder.unit(Sqrt(nonnegative=value.nonnegative), value)
+
+
+def _to_the(recorder: Recorder, value: Value, exponent: float) -> Any:
+    """A real power."""
+    if exponent.is_integer():
+        return _raised(recorder, value, int(exponent))
+    if (2 * exponent).is_integer():
+        return _raised(recorder, _rooted(recorder, value), int(2 * exponent))
+    return recorder.unit(Exp(), recorder.scaled(recorder.unit(Log(), value), np.array(exponent)))
+
+
+def _integer_power(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
+    return _raised(recorder, operands[0], equation.params["y"])
+
+
+@entrywise
+def _power(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
+    value, power = operands
+    if not isinstance(value, Value):
+        return _exponential(recorder, value, power)
+    if isinstance(power, Value) or not is_known(power):
+        raise UnsupportedError("the exponent must be known: no input, and no traced parameter")
+    flat = np.asarray(power, float).ravel()
+    exponents, which = np.unique(flat, return_inverse=True)
+    if not np.all(np.isfinite(exponents)):
+        raise UnsupportedError("the exponent must be finite")
+    if len(exponents) == 1:
+        return _to_the(recorder, value, float(exponents[0]))
+    places = [np.flatnonzero(which == k) for k in range(len(exponents))]
+    parts = [
+        _to_the(recorder, recorder.picked(value, here), float(exponent))
+        for here, exponent in zip(places, exponents, strict=True)
+    ]
+    order = np.argsort(np.concatenate(places)).reshape(equation.shape)
+    return recorder.picked(recorder.joined(parts), order)
+
+
+def _exponential(recorder: Recorder, base: Any, power: Value) -> Any:
+    """`b^y = exp(y log b)` for known `b`."""
+    if not is_known(base) or not np.all((np.asarray(base) > 0) & np.isfinite(np.asarray(base))):
+        raise UnsupportedError("its base must be known and positive")
+    flat = np.asarray(base, float).ravel()
+    logarithms = np.array([math.log(each) for each in flat]).reshape(np.shape(base))
+    return recorder.unit(Exp(), recorder.nearly_scaled(power, logarithms))
+
+
+def _power_of_two(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    return _exponential(recorder, np.full(equation.shape, 2.0), operands[0])
+
+
+def _square(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    return recorder.product(operands[0], operands[0])
+
+
+def _root(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    return _rooted(recorder, operands[0])
+
+
+def _inverse_root(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    return recorder.unit(Reciprocal(), _rooted(recorder, operands[0]))
+
+
+def _logistic(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    half = recorder.unit(Tanh(), recorder.scaled(operands[0], np.array(0.5)))
+    return recorder.shifted(recorder.scaled(half, np.array(0.5)), np.array(0.5))
+
+
+def _tangent(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    sine, cosine = (recorder.unit(unit, operands[0]) for unit in (Sin(), Cos()))
+    return recorder.product(sine, recorder.unit(Reciprocal(), cosine))
+
+
+@entrywise
+def _angle(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    """`atan2(y, x) = arctan(y / x)` where `x > 0`: elsewhere it has no bounds."""
+    y, x = operands
+    if not isinstance(x, Value):
+        if not is_known(x) or not np.all(np.asarray(x) > 0):
+            raise UnsupportedError("its second operand must be positive: elsewhere angles jump")
+        return recorder.unit(Atan(), recorder.divided(y, x))
+    inverse = recorder.unit(Reciprocal(positive=True), x)
+    slope = recorder.product(y, inverse) if isinstance(y, Value) else recorder.scaled(inverse, y)
+    return recorder.unit(Atan(), slope)
+
+
+def _log_of_more(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    return recorder.unit(Log(), recorder.shifted(operands[0], np.array(1.0)))
+
+
+def _exp_less_one(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    return recorder.shifted(recorder.unit(Exp(), operands[0]), np.array(-1.0))
+
+
+def _hyperbolic(sign: int) -> Rule:
+    """`(e^y + e^-y) / 2`, or the difference."""
+
+    def rule(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+        (value,) = operands
+        up, down = value, recorder.scaled(value, np.array(-1.0))
+        parts = [recorder.unit(Exp(), each) for each in (up, down)]
+        return recorder.scaled(recorder.added(parts[0], parts[1], sign), np.array(0.5))
+
+    return rule
+
+
+def multiplied(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    """The product of two values."""
+    return reduce(recorder.product, operands)
+
+
+RULES: dict[str, Rule] = {
+    "tanh": _by(Tanh()),
+    "sin": _by(Sin()),
+    "cos": _by(Cos()),
+    "atan": _by(Atan()),
+    "exp": _by(Exp()),
+    "log": _by(Log()),
+    "sqrt": _root,
+    "rsqrt": _inverse_root,
+    "square": _square,
+    "integer_pow": _integer_power,
+    "pow": _power,
+    "exp2": _power_of_two,
+    "expm1": _exp_less_one,
+    "log1p": _log_of_more,
+    "logistic": _logistic,
+    "tan": _tangent,
+    "atan2": _angle,
+    "cosh": _hyperbolic(1),
+    "sinh": _hyperbolic(-1),
+}

@@ -1,0 +1,156 @@
+"""Rational numbers: what a function is at a point, without any rounding.
+
+Two branches of a function that meet at a point are one continuous function only if their values
+there are the same numbers: floats that agree do not prove it. So they are computed as fractions,
+with units at those points where their values are rational; elsewhere nothing is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from reachjax.loops.units import (
+    AbstractUnit,
+    Atan,
+    Cos,
+    Exp,
+    Log,
+    Reciprocal,
+    ReLU,
+    Sin,
+    Sqrt,
+    Square,
+    Tanh,
+)
+from reachjax.numerics.checks import is_concrete
+
+Rational = Fraction | None
+"""A number, or None where it is not known."""
+
+
+def _root(y: Fraction) -> Rational:
+    if y < 0:
+        return None
+    root = Fraction(math.isqrt(y.numerator), math.isqrt(y.denominator))
+    return root if root * root == y else None
+
+
+def _at(point: int, value: int) -> Callable[[Fraction], Rational]:
+    return lambda y: Fraction(value) if y == point else None
+
+
+VALUES: dict[type[AbstractUnit], Callable[[Fraction], Rational]] = {
+    ReLU: lambda y: max(y, Fraction(0)),
+    Square: lambda y: y * y,
+    Reciprocal: lambda y: 1 / y if y else None,
+    Sqrt: _root,
+    Exp: _at(0, 1),
+    Log: _at(1, 0),
+    Tanh: _at(0, 0),
+    Sin: _at(0, 0),
+    Cos: _at(0, 1),
+    Atan: _at(0, 0),
+}
+"""Rational values of units at rational points."""
+
+
+class Rationals:
+    """A vector of rational numbers: a kind of number. One number stands for many that are the same.
+
+    Example:
+        >>> third = Rationals.of(np.ones(1)).over(np.full(1, 3.0))
+        >>> (third + third + third).numbers
+        [Fraction(1, 1)]
+    """
+
+    # numpy arrays on the left leave `array * rationals` to this class
+    __array_ufunc__ = None
+
+    def __init__(self, numbers: list[Rational]):
+        self.numbers = numbers
+
+    @classmethod
+    def of(cls, plain: Any) -> Rationals:
+        """Floats as they are; of what is traced or not finite nothing is known."""
+        if not is_concrete(plain):
+            return cls([None])
+        flat = np.asarray(plain, float).reshape(-1)
+        if flat.size and np.all(flat == flat[0]):
+            flat = flat[:1]
+        return cls([Fraction(each) if math.isfinite(each) else None for each in flat.tolist()])
+
+    def _pairs(self, other: Any) -> list[tuple[Rational, Rational]]:
+        other = other if isinstance(other, Rationals) else self.of(other)
+        return [*aligned(self.numbers, other.numbers)]
+
+    def _with(self, other: Any, made: Callable[[Fraction, Fraction], Rational]) -> Rationals:
+        pairs = self._pairs(other)
+        return Rationals([None if a is None or b is None else made(a, b) for a, b in pairs])
+
+    def __add__(self, other: Any) -> Rationals:
+        return self._with(other, lambda a, b: a + b)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Rationals:
+        return Rationals([None if each is None else -each for each in self.numbers])
+
+    def __sub__(self, other: Any) -> Rationals:
+        return self._with(other, lambda a, b: a - b)
+
+    def __mul__(self, other: Any) -> Rationals:
+        """Products; that of zero and what is not known is zero."""
+        return Rationals(
+            [
+                Fraction(0) if a == 0 or b == 0 else None if a is None or b is None else a * b
+                for a, b in self._pairs(other)
+            ]
+        )
+
+    __rmul__ = __mul__
+
+    def over(self, other: Any) -> Rationals:
+        """Quotients; that of zero and what is not known is zero."""
+        return Rationals(
+            [
+                Fraction(0) if a == 0 else None if a is None or not b else a / b
+                for a, b in self._pairs(other)
+            ]
+        )
+
+    def times_unknown(self) -> Rationals:
+        """Products with a number that is not rational."""
+        return Rationals([Fraction(0) if each == 0 else None for each in self.numbers])
+
+    def unknown(self) -> Rationals:
+        """Numbers of which nothing is known."""
+        return Rationals([None])
+
+    def floats(self) -> np.ndarray | None:
+        """The same as floats; None unless all of them are known, and are floats."""
+        if any(each is None for each in self.numbers):
+            return None
+        try:
+            found = [float(each) for each in self.numbers]  # type: ignore[arg-type]
+        except OverflowError:
+            return None
+        same = all(Fraction(a) == b for a, b in zip(found, self.numbers, strict=True))
+        return np.array(found) if same else None
+
+
+def aligned(*columns: list[Rational]) -> Iterator[Any]:
+    """The entries of several vectors, side by side."""
+    size = max((len(each) for each in columns if len(each) != 1), default=1)
+    size = 0 if any(not each for each in columns) else size
+    return zip(*(each * size if len(each) == 1 else each for each in columns), strict=True)
+
+
+def evaluated(unit: AbstractUnit, y: Rationals) -> Rationals:
+    """What is done at a unit."""
+    value = VALUES.get(type(unit), lambda number: None)
+    return Rationals([None if each is None else value(each) for each in y.numbers])

@@ -1,0 +1,79 @@
+"""What a recording is made of: values that depend on the inputs, and the steps that make them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from reachjax.loops.units import AbstractUnit
+from reachjax.numerics.checks import is_concrete
+
+Shape = tuple[int, ...]
+
+
+class Value:
+    """Numbers that depend on the inputs.
+
+    Attributes:
+        place: where they stand among all values.
+        shape: of the array that they are, flattened.
+        terms: the sum that they are, entry by entry, of values nearer to the inputs, and
+        offset: what is added to it; None where they are no such sum.
+        nonnegative: whether they are squares, say, or sums of them: never below zero.
+    """
+
+    def __init__(
+        self,
+        place: int,
+        shape: Shape,
+        terms: tuple[Term, ...] | None = None,
+        offset: Any = 0.0,
+        nonnegative: bool = False,
+    ):
+        self.place, self.shape, self.terms, self.offset = place, shape, terms, offset
+        self.nonnegative = nonnegative
+
+    @property
+    def size(self) -> int:
+        """How many numbers they are."""
+        return math.prod(self.shape)
+
+
+class Term(NamedTuple):
+    """`factor value / divisor`, entry by entry: flat arrays, or numbers."""
+
+    value: Value
+    factor: Any = 1.0
+    divisor: Any = 1.0
+
+
+class Comparison(NamedTuple):
+    """Whether numbers are above zero; at zero it must not matter."""
+
+    value: Value
+
+
+Operand = Any
+"""A `Value`, a `Comparison`, or a plain array that depends on no input."""
+
+
+class Step(NamedTuple):
+    """How a value comes about.
+
+    Attributes:
+        apply: from what is done at a unit, and the numbers of other values, to its own.
+        parents: the places of these.
+        entrywise: whether each entry is of the same entries of these alone.
+        unit: that of a layer of units.
+    """
+
+    apply: Callable[..., Any]
+    parents: tuple[int, ...]
+    entrywise: bool = True
+    unit: AbstractUnit | None = None
+
+
+def is_known(*plain: Any) -> bool:
+    """Whether plain arrays are concrete numbers."""
+    return is_concrete(plain)

@@ -1,0 +1,166 @@
+"""Primitives of JAX as steps and units: their values, their intervals, and what has neither."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from jax import lax
+
+import reachjax as rj
+from tests.loops.traced import LOWER, UPPER, assert_sound, interval, network
+
+A = jnp.array([[2.0, -1.0], [0.5, 3.0]])
+Partial = jax.tree_util.Partial
+
+
+def counted(x):
+    return lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, 0.5 * jnp.sin(c[1])), (0, x))[1]
+
+
+def compared_on_the_way(x):
+    return lax.scan(lambda c, w: (c * 0.5, c > 0), x, jnp.arange(3.0))[0]
+
+
+def printing(x):
+    jax.debug.print("{}", x)
+    return 2 * x
+
+
+FUNCTIONS = {
+    "gather that fills": lambda x: x.at[jnp.array([5, 0])].get(mode="fill", fill_value=7.0),
+    "set": lambda x: jnp.ones(3).at[jnp.array([2, 0])].set(2 * x),
+    "set to a constant": lambda x: x.at[0].set(3.0),
+    "add": lambda x: x.at[jnp.array([1, 1])].add(jnp.array([x[0], 2.0])),
+    "add constants": lambda x: x.at[1].add(3.0),
+    "multiply": lambda x: x.at[1].multiply(2.0),
+    "multiply values": lambda x: x.at[1].multiply(x[0]),
+    "update": lambda x: lax.dynamic_update_slice(x, 2 * x[1:], (0,)),
+    "tile": lambda x: jnp.tile(x, 2),
+    "pad": lambda x: jnp.pad(x, (0, 1), constant_values=1.5),
+    "softmax": jax.nn.softmax,
+    "log softmax": jax.nn.log_softmax,
+    "log sum exp": lambda x: jax.nn.logsumexp(x)[None],
+    "largest from below": lambda x: jnp.max(x, initial=-jnp.inf)[None],
+    "clip without end": lambda x: jnp.clip(x, 0.0, jnp.inf),
+    "clip without beginning": lambda x: lax.clamp(-jnp.inf, x, 1.0),
+    "limits of some": lambda x: jnp.maximum(x, jnp.array([-jnp.inf, 0.25])),
+    "relu of a constant": lambda x: jax.nn.relu(A) @ x,
+    "relu of a parameter": Partial(lambda p, x: jax.nn.relu(p) @ x, A),
+    "norm": lambda x: jnp.linalg.norm(x)[None],
+    "root of a size": lambda x: jnp.sqrt(jnp.abs(x)),
+    "root of a square": lambda x: jnp.sqrt(x[:1] ** 2),
+    "deviation": lambda x: jnp.std(x)[None],
+    "power of a size": lambda x: jnp.abs(x) ** 1.5,
+    "negative power": lambda x: (x + 3) ** -3,
+    "known base": lambda x: 2.0**x + jnp.array([3.0, 0.5]) ** x,
+    "powers by entry": lambda x: (x + 2) ** jnp.array([2.0, 3.0]),
+    "hyperbolic": lambda x: jnp.concatenate([jnp.sinh(x), jnp.cosh(x)]),
+    "angle": lambda x: jnp.arctan2(x[:1], x[1:] + 3),
+    "product": lambda x: jnp.prod(x + 1)[None],
+    "products so far": lambda x: jnp.cumprod(jnp.append(x, 2.0)),
+    "largest so far": lambda x: lax.cummax(jnp.append(x, 0.25)),
+    "smallest so far": lambda x: lax.cummin(x, reverse=True),
+    "windows": lambda x: lax.reduce_window(x, -jnp.inf, lax.max, (2,), (1,), "SAME"),
+    "while": counted,
+    "no steps": lambda x: lax.scan(lambda c, w: (c * w, c), x, jnp.zeros(0))[0],
+    "comparisons on the way": compared_on_the_way,
+    "printing": printing,
+    "no comparison": lambda x: jnp.where(jnp.isfinite(x), jnp.nan_to_num(x), 0.0),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_primitives_are_sound(name):
+    assert_sound(FUNCTIONS[name])
+
+
+# fmt: off
+ACTIVATIONS = [
+    "relu", "relu6", "elu", "selu", "celu", "silu", "swish", "softplus", "soft_sign", "hard_tanh",
+    "hard_sigmoid", "hard_swish", "leaky_relu", "log_sigmoid", "mish", "sigmoid", "squareplus",
+    "sparse_plus", "sparse_sigmoid", "tanh", "glu", "gelu",
+]
+# fmt: on
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_activations_are_sound(name):
+    assert_sound(getattr(jax.nn, name), 2 * LOWER, 2 * UPPER)
+
+
+def test_tight_bounds_of_what_is_never_negative():
+    low, high = interval(network(lambda x: jnp.linalg.norm(x)[None]))
+    np.testing.assert_allclose([low[0], high[0]], [0.0, np.hypot(1.0, 1.5)], atol=1e-13)
+
+
+def test_a_product_of_numbers_far_apart_is_their_product():
+    net = jax.device_get(network(lambda x: x[:1] * x[1:]))
+    x = np.array([2.81153617e08, 3.01778787e-08])
+    assert net.propagate(x, lambda unit, y: unit(y))[0] == x[0] * x[1]
+
+
+def dropping(x):
+    return nnx.Dropout(0.5, rngs=nnx.Rngs(0))(x)
+
+
+def branching(x):
+    return x if x[0] > 0 else -x
+
+
+REFUSED = {
+    "entries there are not": (lambda x: jnp.take(x, jnp.array([5, 0])), "'gather'.* out of range"),
+    "narrow products": (
+        lambda x: jnp.dot(A, x, preferred_element_type=jnp.float32),
+        "'dot_general'.* rounds to float32",
+    ),
+    "numbers drawn": (
+        lambda x: x + jax.random.normal(jax.random.key(0), (2,)),
+        r"'random_seed' \(in .*test_primitives.*draws random numbers",
+    ),
+    "dropout": (dropping, "draws random numbers.* evaluation mode"),
+    "callbacks": (
+        lambda x: jax.pure_callback(lambda x: x, jax.ShapeDtypeStruct((2,), float), x),
+        "'pure_callback'.* outside of JAX",
+    ),
+    "a reduction of one's own": (
+        lambda x: lax.reduce(x, 0.0, lambda a, b: a + b * b, (0,))[None],
+        "'reduce'.* no bounds for it",
+    ),
+    "a solver": (lambda x: jnp.linalg.solve(A, x), r"multiply by jnp\.linalg\.inv"),
+    "order": (jnp.sort, "'sort'.* no bounds for it"),
+    "an endless loop": (
+        lambda x: lax.while_loop(lambda c: c[0] >= 0, lambda c: (c[0] * 1, 0.5 * c[1]), (0, x))[1],
+        "not ended after",
+    ),
+    "infinity": (lambda x: x + jnp.inf, "'add'.* not finite"),
+    "the wrong infinity": (lambda x: jnp.maximum(x, jnp.inf), "'max'.* one of its operands is inf"),
+    "division by zero": (lambda x: x / 0.0, "'div'.* divides by zero"),
+    "entries set twice": (
+        lambda x: jnp.ones(2).at[jnp.array([0, 0])].set(2 * x),
+        "'scatter'.* more than once",
+    ),
+    "angles all around": (lambda x: jnp.arctan2(x, 0.0), "'atan2'.* must be positive"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_has_no_bounds_is_named(name):
+    function, message = REFUSED[name]
+    with pytest.raises(TypeError, match=message):
+        network(function)
+
+
+def test_an_angle_has_bounds_in_front_only():
+    net = network(lambda x: jnp.arctan2(x[:1], x[1:]))
+    low, high = interval(net, np.array([-1.0, -2.0]), np.array([1.0, -1.0]))
+    assert not np.isfinite([low, high]).any()
+
+
+def test_results_are_real_numbers_and_parameters_finite():
+    with pytest.raises(ValueError, match=r"Network\.f must return real numbers, but bool arrived"):
+        rj.Network(lambda x: x > 0, 2, 2)
+    with pytest.raises(ValueError, match=r"must not branch on values.*use jnp\.where"):
+        rj.Network(branching, 2, 2)
+    with pytest.raises(ValueError, match=r"must be finite, but entry \(1,\) of array 0 is nan"):
+        rj.Network(Partial(lambda p, x: p * x, jnp.array([1.0, jnp.nan])), 2, 2)

@@ -235,8 +235,8 @@ def _digest(described: Any, arrays: list[np.ndarray]) -> str:
     return found.hexdigest()
 
 
-def read(path: Path, outside: Any, missing: str) -> tuple[Any, bool]:
-    """What a file holds, and whether objects were left out of it.
+def read(path: Path, outside: Any, missing: str) -> Any:
+    """What a file holds.
 
     Args:
         path: of the file.
@@ -251,7 +251,7 @@ def read(path: Path, outside: Any, missing: str) -> tuple[Any, bool]:
     if head["left_out"] and outside is None:
         raise ValueError(f"{path} {missing}")
     try:
-        return _read(head["value"], arrays, outside), bool(head["left_out"])
+        return _read(head["value"], arrays, outside)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
 

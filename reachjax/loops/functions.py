@@ -16,11 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.interpreter import require_traced, walked
-from reachjax.loops.primitives import UnsupportedError
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import Sizes, Trace
 from reachjax.loops.units import AtUnit, evaluate
-from reachjax.loops.values import Comparison, Operand, Value
+from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value
 from reachjax.numerics.checks import described, is_concrete
 from reachjax.numerics.pytrees import pytree, static
 

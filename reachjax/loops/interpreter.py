@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from reachjax.loops.primitives import Equation, UnsupportedError, recorded
+from reachjax.loops.primitives import Equation, recorded
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import equations
-from reachjax.loops.values import Comparison, Operand, Value, is_known
+from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value, is_known
 
 CALLS = (
     "jit",

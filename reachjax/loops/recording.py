@@ -16,8 +16,8 @@ from jaxtyping import Int
 
 from reachjax.loops.rationals import Rationals
 from reachjax.loops.units import AbstractUnit, AtUnit, ReLU, SmoothUnit, Square, UnboundedError
-from reachjax.loops.values import Operand, Shape, Step, Term, Value, is_known
-from reachjax.numerics.rounding import UNIT, Ball, larger, namespace
+from reachjax.loops.values import Operand, Shape, Step, Term, UnsupportedError, Value, is_known
+from reachjax.numerics.rounding import TINY, UNIT, Ball, larger, namespace
 
 
 class Recorder:
@@ -94,10 +94,18 @@ class Recorder:
     def divided(self, value: Value, divisor: Any) -> Value:
         """Each entry over a plain number: times its inverse, which is rounded.
 
-        That is one rounding of the eight that `gamma` has to spare in a product with a number.
+        That is one rounding of the eight that `gamma` has to spare in a product with a number. Of
+        traced divisors whose inverses are not normal numbers, nothing is known.
+
+        Raises:
+            UnsupportedError: a divisor is zero, or has no inverse.
         """
         divisor = _flat(divisor, value)
-        inverse = 1.0 / divisor
+        normal = (abs(divisor) >= TINY) & (abs(divisor) <= 1 / TINY)
+        if is_known(divisor) and not np.all(np.asarray(normal)):
+            raise UnsupportedError("it divides by zero, or by what has no inverse in 64 bits")
+        xp = namespace(divisor)
+        inverse = xp.where(normal, 1.0 / xp.where(normal, divisor, 1.0), np.nan)
         known = value.nonnegative and is_known(divisor) and bool(np.all(np.asarray(divisor) > 0))
 
         def apply(unit: AtUnit, y: Any) -> Any:

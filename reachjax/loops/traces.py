@@ -7,6 +7,7 @@ whatever their functions are called: the same equations, and the same bits of ev
 from __future__ import annotations
 
 import hashlib
+import itertools
 import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -67,15 +68,22 @@ class Trace:
         """Of parameters and vectors. Once 64-bit floats are turned on, in these."""
         double = bool(jax.config.read("jax_enable_x64"))
         if double not in self._closed:
-            _, _, shapes, inputs = self._parts
-            parameters = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
-            vectors = [jax.ShapeDtypeStruct((size,), float) for size in inputs]
-
-            def called(parameters: Sequence[Any], *vectors: Any) -> Any:
-                return self.function(parameters)(*vectors)
-
-            self._closed[double] = _owned(jax.make_jaxpr(called)(parameters, *vectors))
+            for other in self._closed:
+                with jax.enable_x64(other):
+                    _require_same(_description(self._traced()), self.described)
+            self._closed[double] = self._traced()
         return self._closed[double]
+
+    def _traced(self) -> core.ClosedJaxpr:
+        """What the function is now."""
+        _, _, shapes, inputs = self._parts
+        parameters = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
+        vectors = [jax.ShapeDtypeStruct((size,), float) for size in inputs]
+
+        def called(parameters: Sequence[Any], *vectors: Any) -> Any:
+            return self.function(parameters)(*vectors)
+
+        return _owned(jax.make_jaxpr(called)(parameters, *vectors))
 
     def function(self, parameters: Sequence[Any]) -> Callable:
         """The function with these parameters, as it is now."""
@@ -119,12 +127,21 @@ def _again(*parts: Any) -> Trace:
     """
     *given, described = parts
     found = Trace(*given)
-    if found.described != described:
+    _require_same(found.described, described)
+    return found
+
+
+def _require_same(now: str | None, before: str | None) -> None:
+    """Raise an error unless two descriptions of a function are one.
+
+    Raises:
+        ValueError: they differ.
+    """
+    if now != before:
         raise ValueError(
             "a function that was given to a network or a plant computes something else than when "
             "it was given: it, or what it closes over, has changed since"
         )
-    return found
 
 
 def _is_float(leaf: Any) -> bool:
@@ -184,10 +201,28 @@ def _description(closed: core.ClosedJaxpr) -> str | None:
     if not is_concrete(list(_constants(closed))):
         return None
     found = hashlib.blake2b(digest_size=SIZE)
-    for part in _told(closed):
+    for part in itertools.chain(_told(closed), _told(_slopes(closed))):
         found.update(part)
         found.update(b"\0")
     return found.hexdigest()
+
+
+def _slopes(closed: core.ClosedJaxpr) -> core.ClosedJaxpr | None:
+    """The derivative, if a function has rules of its own for it."""
+    if not any(each.primitive.name.startswith("custom_") for each in equations(closed.jaxpr)):
+        return None
+
+    def pulled(given: Sequence[Any], slopes: Sequence[Any]) -> Any:
+        return jax.vjp(core.jaxpr_as_fun(closed), *given)[1](slopes)
+
+    given, slopes = (
+        [jax.ShapeDtypeStruct(each.aval.shape, each.aval.dtype) for each in variables]
+        for variables in (closed.jaxpr.invars, closed.jaxpr.outvars)
+    )
+    try:
+        return jax.make_jaxpr(pulled)(given, slopes)
+    except (TypeError, ValueError, NotImplementedError):  # it has none
+        return None
 
 
 def _constants(closed: Any) -> Iterator[Any]:
@@ -229,7 +264,7 @@ def _told(value: Any) -> Iterator[bytes]:
         for each in value:
             yield from _told(each)
     elif callable(value) and not isinstance(value, type):
-        yield b"function"  # a rule for derivatives
+        yield b"function"  # a rule for derivatives: `_slopes` tells what it says
     else:
         yield re.sub(r" at 0x[0-9a-f]+", "", repr(value)).encode()
 

@@ -12,6 +12,17 @@ from reachjax.numerics.checks import is_concrete
 Shape = tuple[int, ...]
 
 
+class UnsupportedError(Exception):
+    """That a primitive cannot be certified, and what to do.
+
+    Attributes:
+        primitive: its name, once it is known.
+        line: where a user wrote it, the same.
+    """
+
+    primitive, line = "", ""
+
+
 class Value:
     """Numbers that depend on the inputs.
 

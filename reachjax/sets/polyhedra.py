@@ -19,6 +19,9 @@ from reachjax.sets.balance import Balanced, balanced, lengths, upwards
 UNEVEN = 10
 """Coordinates whose sizes are further from 1, as powers of two, are scaled anew."""
 
+TOO_LARGE = 1e15
+"""From numbers of this size on linear programs are not believed to have no solution."""
+
 NOTHING = 1e-290
 """Coordinates that are no larger, where facets are about 1 away, are zero but for underflow."""
 
@@ -63,6 +66,8 @@ def maximisers(
 def is_empty(A: np.ndarray, b: np.ndarray) -> bool:
     """Whether a linear program says that no point is in a polytope, which may be unbounded."""
     A, b = balanced(A, b)
+    if not (np.all(abs(A) < TOO_LARGE) and np.all(abs(b) < TOO_LARGE)):
+        return False  # what it says of such numbers is often wrong
     zero = np.zeros(A.shape[1])
     return linprog(zero, A_ub=A, b_ub=b, bounds=(None, None), method="highs").status == 2
 

@@ -45,6 +45,8 @@ FUNCTIONS = {
     "clip without end": lambda x: jnp.clip(x, 0.0, jnp.inf),
     "clip without beginning": lambda x: lax.clamp(-jnp.inf, x, 1.0),
     "limits of some": lambda x: jnp.maximum(x, jnp.array([-jnp.inf, 0.25])),
+    "of no entries": lambda x: x * jnp.prod(x[:0]) + jnp.max(x[:0], initial=2.0),
+    "powers of no entries": lambda x: x + jnp.cumprod(x[:0] ** jnp.zeros(0)).sum(),
     "relu of a constant": lambda x: jax.nn.relu(A) @ x,
     "relu of a parameter": Partial(lambda p, x: jax.nn.relu(p) @ x, A),
     "norm": lambda x: jnp.linalg.norm(x)[None],
@@ -135,6 +137,7 @@ REFUSED = {
     ),
     "infinity": (lambda x: x + jnp.inf, "'add'.* not finite"),
     "the wrong infinity": (lambda x: jnp.maximum(x, jnp.inf), "'max'.* one of its operands is inf"),
+    "an angle too far away": (lambda x: jnp.arctan2(x, 1e308), "'atan2'.* has no inverse"),
     "division by zero": (lambda x: x / 0.0, "'div'.* divides by zero"),
     "entries set twice": (
         lambda x: jnp.ones(2).at[jnp.array([0, 0])].set(2 * x),
@@ -164,3 +167,22 @@ def test_results_are_real_numbers_and_parameters_finite():
         rj.Network(branching, 2, 2)
     with pytest.raises(ValueError, match=r"must be finite, but entry \(1,\) of array 0 is nan"):
         rj.Network(Partial(lambda p, x: p * x, jnp.array([1.0, jnp.nan])), 2, 2)
+
+
+def test_a_root_of_what_rounding_takes_below_zero_is_zero():
+    f = lambda x: jnp.where(x <= 0.3, -jnp.sqrt(abs(x - 0.3)), jnp.sqrt(abs(0.3 - x)))  # noqa: E731
+    loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[1.0]]), rj.Network(f, 1, 1))
+    tube = rj.reach(loop, rj.Box([0.80227], [0.80327]), 1, rj.Template.box(1))
+    assert np.isfinite(tube.proof(1).gaps).all()
+
+
+def test_a_traced_divisor_without_an_inverse_leaves_nothing_known():
+    @jax.jit
+    def upper(p):
+        net = rj.Network(Partial(lambda p, x: (x * 1e300) / p, p), 1, 1)
+        loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[1.0]]), net)
+        tube = rj.reach(loop, rj.Box([1.0], [2.0]), 1, rj.Template.box(1), rj.LinearBounds())
+        return tube.sets[1].b
+
+    assert np.isnan(upper(1e308)).all()
+    assert upper(1e200)[0] >= 2e100

@@ -123,6 +123,33 @@ def test_a_function_is_sent_to_another_process_unless_it_has_changed():
         GAINS["k"] = 2.0
 
 
+def test_a_function_that_changes_before_64_bits_are_on_is_noticed():
+    gains = {"k": 2.0}
+    with jax.enable_x64(False):
+        net = network(lambda x: gains["k"] * x)
+    assert net(jnp.ones(2)).tolist() == [2.0, 2.0]
+    with jax.enable_x64(False):
+        other = network(lambda x: gains["k"] * x)
+    gains["k"] = 9.0
+    assert net(jnp.ones(2)).tolist() == [2.0, 2.0]
+    with pytest.raises(ValueError, match="has changed since"):
+        other(jnp.ones(2))
+
+
+@pytest.mark.parametrize("kind", [jax.custom_jvp, jax.custom_vjp])
+def test_rules_for_derivatives_are_part_of_a_description(kind):
+    def made(slope):
+        bent = kind(jnp.tanh)
+        if kind is jax.custom_jvp:
+            bent.defjvp(lambda x, dx: (jnp.tanh(*x), slope * dx[0]))
+        else:
+            bent.defvjp(lambda x: (jnp.tanh(x), None), lambda _, dz: (slope * dz,))
+        return network(bent).f.described
+
+    assert made(1.0) == made(1.0)
+    assert made(1.0) != made(5.0)
+
+
 def test_traced_numbers_that_are_closed_over_have_no_description_and_yet_derivatives():
     def bound(p):
         net = network(lambda x: p * x)

@@ -385,7 +385,7 @@ def test_an_empty_set_inside_jit_has_no_size(case):
         ({"goal": rj.Box([0.0], [1.0])}, ValueError, "goal has dimension 1, but the loop has 2"),
         ({"goal": None}, ValueError, "nothing to verify"),
         ({"avoid": 0}, TypeError, "avoid must be a sequence of sets, .* but 0 arrived"),
-        ({"avoid": {True: [GOAL]}}, ValueError, "avoid names time True"),
+        ({"avoid": {True: [GOAL]}}, TypeError, "avoid must name times or ranges of them"),
         ({"avoid": {7: [GOAL]}}, ValueError, "avoid names time 7"),
     ],
 )

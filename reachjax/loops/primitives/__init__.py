@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.primitives import affine, bends, folds, moving, powers
-from reachjax.loops.primitives.equations import JUMPS, Equation, Rule, UnsupportedError, on_host
+from reachjax.loops.primitives.equations import JUMPS, Equation, Rule, on_host
 from reachjax.loops.recording import Recorder
-from reachjax.loops.values import Comparison, Operand, Value, is_known
+from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value, is_known
 
-__all__ = ["Equation", "UnsupportedError", "recorded"]
+__all__ = ["Equation", "recorded"]
 
 # fmt: off
 DISCONTINUOUS = (
@@ -72,6 +72,11 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
     plain = [each for each in operands if not isinstance(each, Value | Comparison)]
     if equation.name not in INFINITE and not all(map(_is_finite, plain)):
         raise UnsupportedError("one of its operands is a constant that is not finite")
+    values = [each for each in operands if isinstance(each, Value)]
+    if values and not any(each.size for each in values):  # vectors without entries are all alike
+        return equation.evaluate(
+            *(np.zeros(each.shape) if isinstance(each, Value) else each for each in operands)
+        )
     return rule(recorder, equation, operands)
 
 

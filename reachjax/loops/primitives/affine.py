@@ -10,11 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.primitives.equations import Equation, Rule, UnsupportedError, entrywise, on_host
+from reachjax.loops.primitives.equations import Equation, Rule, entrywise, on_host
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import Reciprocal
-from reachjax.loops.values import Operand, Value, is_known
-from reachjax.numerics.rounding import TINY
+from reachjax.loops.values import Operand, UnsupportedError, Value, is_known
 
 
 def _linear(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
@@ -89,10 +88,6 @@ def _product(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
 def _quotient(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
     one, other = operands
     if not isinstance(other, Value):
-        if is_known(other):
-            size = abs(np.asarray(other))
-            if not np.all((size >= TINY) & (size <= 1 / TINY)):
-                raise UnsupportedError("it divides by zero, or by what has no inverse in 64 bits")
         return recorder.divided(one, other)
     inverse = recorder.unit(Reciprocal(), other)
     inverse.nonnegative = other.nonnegative

@@ -12,14 +12,13 @@ from reachjax.loops.primitives.equations import (
     JUMPS,
     Equation,
     Rule,
-    UnsupportedError,
     entrywise,
     shaped,
 )
 from reachjax.loops.primitives.kinks import bent
 from reachjax.loops.primitives.moving import chosen
 from reachjax.loops.recording import Recorder
-from reachjax.loops.values import Comparison, Operand, Value, is_known
+from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value, is_known
 
 
 def _is_plain(operand: Operand) -> bool:

@@ -42,17 +42,6 @@ class Equation:
         return jax.tree.map(np.asarray, found) if all(map(on_host, operands)) else found
 
 
-class UnsupportedError(Exception):
-    """That a primitive cannot be certified, and what to do.
-
-    Attributes:
-        primitive: its name, once it is known.
-        line: where a user wrote it, the same.
-    """
-
-    primitive, line = "", ""
-
-
 JUMPS = "it is discontinuous: bounds of what follows would be those of its range"
 
 

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from reachjax.loops.primitives.bends import largest, smallest
-from reachjax.loops.primitives.equations import Equation, Rule, UnsupportedError
+from reachjax.loops.primitives.equations import Equation, Rule
 from reachjax.loops.recording import Recorder
-from reachjax.loops.values import Operand, Value
+from reachjax.loops.values import Operand, UnsupportedError, Value
 
 Pair = Callable[[Recorder, Value, Value], Value]
 

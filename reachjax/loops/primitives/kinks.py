@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from reachjax.loops.primitives.equations import UnsupportedError
 from reachjax.loops.rationals import Rationals, aligned, evaluated
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import ReLU
-from reachjax.loops.values import Operand, Value
+from reachjax.loops.values import Operand, UnsupportedError, Value
 from reachjax.numerics.rounding import TINY, gamma
 
 

@@ -14,11 +14,10 @@ import numpy as np
 from reachjax.loops.primitives.equations import (
     Equation,
     Rule,
-    UnsupportedError,
     shape_of,
 )
 from reachjax.loops.recording import Recorder
-from reachjax.loops.values import Operand, Value, is_known
+from reachjax.loops.values import Operand, UnsupportedError, Value, is_known
 
 NONE = -1
 """The number of an entry that there is not."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from reachjax.loops.primitives.equations import Equation, Rule, UnsupportedError, entrywise
+from reachjax.loops.primitives.equations import Equation, Rule, entrywise
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import (
     AbstractUnit,
@@ -22,7 +22,7 @@ from reachjax.loops.units import (
     Sqrt,
     Tanh,
 )
-from reachjax.loops.values import Operand, Value, is_known
+from reachjax.loops.values import Operand, UnsupportedError, Value, is_known
 
 
 def _by(unit: AbstractUnit) -> Rule:

@@ -76,6 +76,7 @@ class Sqrt(SmoothUnit):
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`sqrt y`, with derivative 0 at 0, where it has none."""
         xp = namespace(y)
+        y = larger(y, 0.0) if self.nonnegative else y  # rounding alone takes it below
         return xp.where(y == 0, 0.0, xp.sqrt(xp.where(y == 0, 1.0, y)))
 
     def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:

@@ -218,7 +218,7 @@ def tube():
         ({"avoid": [X0, LINE]}, ValueError, r"avoid\[1\] has dimension 1, but the loop has 2"),
         ({"avoid": {1: X0}}, TypeError, r"avoid=\{t: \[A, ...\]\}, but a Box arrived"),
         ({"safe": rj.Box([[0, 0]], [[1, 1]])}, ValueError, "safe must be one box"),
-        ({"avoid": {3: [X0]}}, ValueError, "avoid names time 3, but the tube is for t = 0 .. 2"),
+        ({"avoid": {3: [X0]}}, ValueError, "avoid names time 3, but the horizon is 2"),
         ({"gaol": STRIP}, TypeError, "gaol"),
     ],
 )

@@ -75,6 +75,11 @@ class Function:
                 f"{name} must not branch on values, nor make Python numbers of them, which cannot "
                 f"be traced: use jnp.where, jnp.maximum or jnp.clip ({str(error).splitlines()[0]})"
             ) from error
+        except jax.errors.TracerArrayConversionError as error:
+            raise ValueError(
+                f"{name} must be made of JAX's functions, so that it can be traced: use jnp.sin in "
+                f"place of np.sin ({str(error).splitlines()[0]})"
+            ) from error
         except (TypeError, ValueError, IndexError) as error:
             raise ValueError(
                 f"{name} cannot be called with vectors of sizes {list(inputs)}: {error}"

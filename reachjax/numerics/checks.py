@@ -319,7 +319,10 @@ def require_double_precision(**arguments: Any) -> None:
         for leaf in jax.tree.leaves(tree):
             kind = getattr(leaf, "dtype", None) or jnp.result_type(leaf)
             if kind != jnp.float64:
-                raise RuntimeError(f"{name} holds {kind}, but float64 is needed: {remedy}")
+                raise RuntimeError(
+                    f"{name} holds {kind}, but float64 is needed: {remedy}, and build it again if "
+                    "it was built before"
+                )
 
 
 def floats_of(tree: Any) -> list[Any]:

@@ -73,15 +73,11 @@ def loop_bounds(
             also = known[done : done + len(y.mid)]
             lower = jnp.maximum(y.lower, also.lower)
             y = Ball.between(lower, jnp.maximum(lower, jnp.minimum(y.upper, also.upper)))
-        # the ends of `y` may be rounded differently where the midpoint and the radius are formed
-        rounding = gamma(8) * (abs(y.mid) + y.rad)
-        if not unit.nonexpansive:
-            y, rounding = Ball(y.mid, y.rad + 2 * rounding), jnp.zeros_like(rounding)
-        z = Ball.between(*unit.interval(y.lower, y.upper))
+        y, z = _image(unit, y)
         lines = unit.lines(y.lower, y.upper)
         constant = lines.affine & (lines.above.slope == 0)
         mid = jnp.where(constant, lines.above.offset, z.mid)
-        z = Ball(mid, jnp.where(constant, 0.0, z.rad + rounding))
+        z = Ball(mid, jnp.where(constant, 0.0, z.rad))
         units.append((y, z, *_settled(unit, y, z, lines)))
         return z
 
@@ -92,6 +88,18 @@ def loop_bounds(
     units.insert(0, (none, none, Lines(line, line), empty > 0, empty))
     y, z, lines, affine, excess = jax.tree.map(_concatenate, *units)
     return LoopBounds(state, y, z, lines, affine, excess, successor)
+
+
+def _image(unit: AbstractUnit, y: Ball) -> tuple[Ball, Ball]:
+    """What inputs may be, and what a unit makes of them.
+
+    Ends of inputs may be rounded differently where the midpoint and the radius are formed.
+    """
+    rounding = gamma(8) * (abs(y.mid) + y.rad)
+    if not unit.nonexpansive:
+        y, rounding = Ball(y.mid, y.rad + 2 * rounding), jnp.zeros_like(rounding)
+    z = Ball.between(*unit.interval(y.lower, y.upper))
+    return y, Ball(z.mid, z.rad + rounding)
 
 
 def _settled(unit: AbstractUnit, y: Ball, z: Ball, lines: Lines) -> tuple[Lines, Array, Array]:
@@ -136,7 +144,9 @@ def successor_box(
         w: the disturbances, where they are known.
         v: the noise, where it is known.
     """
-    successor = loop_bounds(loop, box, t, None, w, v).successor
+    drawn = (None if part is None else Ball.exact(part) for part in (w, v))
+    state = Ball.between(box.lower, box.upper)
+    successor = loop.step(state, t, lambda unit, y: _image(unit, y)[1], *drawn)
     return Box(successor.lower, successor.upper)
 
 

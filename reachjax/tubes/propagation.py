@@ -22,6 +22,7 @@ from reachjax.numerics.checks import (
     whole_number,
     wrapped,
 )
+from reachjax.numerics.derivatives import first_order
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.witnesses import Simulations
@@ -134,6 +135,8 @@ def propagated(
             leaves out steps.
     """
     deadline = deadline_of(options.time_limit)
+    loop, X0, template = first_order((task.loop, task.X0, task.template))
+    task = task._replace(loop=loop, X0=X0, template=template)
     fixed, horizon, simulations = task.fixed, task.horizon, None
     if is_concrete((fixed.loop, fixed.X0)):
         simulations = simulations_from(

@@ -77,5 +77,5 @@ def _by_times(name: str, given: Mapping[Any, Any], horizon: int) -> Iterator[tup
                     f"{name} must name times or ranges of them, but {described(t)} arrived"
                 )
             if not 0 <= t <= horizon:
-                raise ValueError(f"{name} names time {t!r}, but the tube is for t = 0 .. {horizon}")
+                raise ValueError(f"{name} names time {t!r}, but the horizon is {horizon}")
             yield int(t), meant

@@ -138,6 +138,8 @@ REFUSED = {
     "infinity": (lambda x: x + jnp.inf, "'add'.* not finite"),
     "the wrong infinity": (lambda x: jnp.maximum(x, jnp.inf), "'max'.* one of its operands is inf"),
     "an angle too far away": (lambda x: jnp.arctan2(x, 1e308), "'atan2'.* has no inverse"),
+    "an entry there is not": (lambda x: x + x[2], "'dynamic_slice'.* an index is out of range"),
+    "entries there are not, promised": (lambda x: x[jnp.array([0, 2])], "'gather'.* out of range"),
     "division by zero": (lambda x: x / 0.0, "'div'.* divides by zero"),
     "entries set twice": (
         lambda x: jnp.ones(2).at[jnp.array([0, 0])].set(2 * x),

@@ -188,6 +188,22 @@ def test_forward_mode_and_second_derivatives_raise():
         jax.hessian(of)(loop.plant.c)
 
 
+@pytest.mark.parametrize("relaxation", [rj.LinearBounds(), rj.BranchAndCut()], ids=str)
+def test_second_derivatives_of_forms_and_branches_are_refused(relaxation):
+    loop, X0 = planar(0)
+
+    def slope(c):
+        made = loop.replace(plant=loop.plant.replace(c=c))
+        sizes = lambda c: rj.log_volume(  # noqa: E731
+            rj.reach(loop.replace(plant=made.plant.replace(c=c)), X0, 1, TEMPLATE, relaxation)
+        )
+        return jax.grad(sizes)(c).sum()
+
+    assert np.isfinite(slope(loop.plant.c))
+    with pytest.raises(TypeError, match="first derivatives only"):
+        jax.grad(slope)(loop.plant.c)
+
+
 @pytest.mark.parametrize("wrapped", [jax.jit, lambda f: f], ids=["compiled", "eager"])
 @pytest.mark.parametrize(
     "template", [TEMPLATE, rj.EllipsoidTemplate(), rj.EllipsoidTemplate(np.eye(2))], ids=str

@@ -59,7 +59,7 @@ def test_a_goal_at_the_first_time(tube):
 @pytest.mark.parametrize(
     ("goal", "error", "said"),
     [
-        ({5: box(1.0)}, ValueError, "goal names time 5, but the tube is for t = 0 .. 4"),
+        ({5: box(1.0)}, ValueError, "goal names time 5, but the horizon is 4"),
         ({-1: box(1.0)}, ValueError, "goal names time -1"),
         ({1: box(1.0), range(0, 2): box(1.0)}, ValueError, "goal names time 1 twice"),
         ({}, ValueError, "goal must name a time"),
@@ -216,7 +216,7 @@ NOWHERE = rj.Polytope([[1.0, 0.0], [-1.0, 0.0]], [0.0, -1.0])
     ("asked", "error", "said"),
     [
         ({"avoid": {1.0: [away(5.0)]}}, TypeError, r"avoid must name times or ranges of them, but"),
-        ({"avoid": {5: [away(5.0)]}}, ValueError, r"avoid names time 5, but the tube is for"),
+        ({"avoid": {5: [away(5.0)]}}, ValueError, r"avoid names time 5, but the horizon is"),
         ({"avoid": {True: [away(5.0)]}}, TypeError, r"avoid must name times"),
         ({"avoid": {1: away(5.0)}}, TypeError, r"avoid must be a sequence of sets"),
         ({"avoid": {range(5, 2): [away(5.0)]}}, ValueError, r"avoid names the span range\(5, 2\)"),

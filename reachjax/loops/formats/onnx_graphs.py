@@ -146,6 +146,11 @@ def read_graph(path: Path) -> tuple[Graph, int, int]:
             Node(each.op_type, tuple(each.input), tuple(each.output), tuple(attributes.items()))
         )
     shape = _shape(given[0])
+    if len(shape) == 2 and min(shape) > 1:
+        raise ValueError(
+            f"{path} takes {shape[0]} inputs at a time, since {given[0].name!r} has shape {shape}: "
+            "write it with a batch that is open, or 1"
+        )
     kept = _limits(nodes)
     weights = tuple(
         name for name, array in arrays.items() if array.dtype.kind == "f" and name not in kept

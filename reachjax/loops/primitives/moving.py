@@ -48,7 +48,7 @@ def _require_known(places: Sequence[Operand]) -> None:
 def _require_inside(index: np.ndarray, size: int) -> None:
     if index.size and not (index.min() >= 0 and index.max() < size):
         raise UnsupportedError(
-            "it takes entries that there are not: an index is out of range, where JAX fills in NaN"
+            "it takes entries that there are not: an index is out of range, where JAX takes others"
         )
 
 
@@ -72,6 +72,11 @@ def _moved(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) 
     _require_known(places)
     if not isinstance(value, Value):
         raise UnsupportedError("what it moves must depend on inputs")
+    if equation.name == "dynamic_slice":  # JAX would take the nearest entries that there are
+        for first, size, end in zip(
+            places, equation.params["slice_sizes"], value.shape, strict=True
+        ):
+            _require_inside(int(first) + np.arange(size), end)
     moved = _evaluated(equation, *_numbers([value]), *places)
     if isinstance(moved, list | tuple):
         return [recorder.picked(value, np.asarray(part)) for part in moved]
@@ -83,8 +88,9 @@ def _gathered(recorder: Recorder, equation: Equation, operands: Sequence[Operand
     """Entries by their places, which are known; out of range it may fill in a number."""
     value, places = operands
     _require_known([places])
-    fills = equation.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
-    changes = {"fill_value": NONE} if fills else {}
+    modes, mode = jax.lax.GatherScatterMode, equation.params["mode"]
+    fills, clips = mode == modes.FILL_OR_DROP, mode == modes.CLIP
+    changes = {} if clips else {"fill_value": NONE, "mode": modes.FILL_OR_DROP}
     index = np.asarray(_evaluated(equation, *_numbers([value]), places, **changes))
     filled = equation.params["fill_value"]
     if fills and np.any(index == NONE) and filled is not None and np.isfinite(filled):

@@ -59,6 +59,10 @@ class Quadratic(NamedTuple):
     gap: Array
 
 
+ENDLESS = 1e100
+"""Inputs of this size are no matter of a domain."""
+
+
 class UnboundedError(ValueError):
     """That a unit has no bounds on the range of its inputs.
 
@@ -72,10 +76,15 @@ class UnboundedError(ValueError):
 
     def __init__(self, unit: AbstractUnit, t: int, lower: float, upper: float, line: str = ""):
         name = type(unit).__name__
+        advice = (
+            "keep them away from what is outside of its domain, or take smaller cells of X0 "
+            "(reach_partitioned, or decide(..., cells=...))"
+        )
+        if max(-lower, upper) > ENDLESS:
+            advice = "states, or their bounds, grow without end: see whether the loop is stable"
         super().__init__(
             f"{name}{line} at t = {t} has inputs in [{lower:g}, {upper:g}], on which it has no "
-            "bounds: keep them away from what is outside of its domain, or take smaller cells of "
-            "X0 (reach_partitioned, or decide(..., cells=...))"
+            f"bounds: {advice}"
         )
         self.given = unit, t, lower, upper
 

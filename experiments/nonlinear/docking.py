@@ -161,7 +161,7 @@ def draw(verdict: rj.Verdict, states: Float[ndarray, "c t 4"], path: Path) -> No
     ends = np.array([away.min(), away.max()])
     right.plot(ends, REST + SLOPE * ends, color="tab:red", label="limit")
     right.set(xlabel="distance (m)", ylabel="speed (m/s)")
-    right.legend(loc="lower right", markerscale=12)
+    right.legend(loc="upper left", markerscale=12)
     figure.savefig(path, dpi=150)
 
 

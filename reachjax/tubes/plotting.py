@@ -23,6 +23,9 @@ CELL_COLORS = {
     VerdictStatus.UNKNOWN: "tab:gray",
     VerdictStatus.REFUTED: "tab:red",
 }
+ABOVE = {"loc": "lower center", "bbox_to_anchor": (0.5, 1), "ncols": 3, "frameon": False}
+"""A legend that covers nothing."""
+
 SAMPLE_STYLE = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
 
 
@@ -93,7 +96,7 @@ def plot_tube(
 
     Args:
         tube: of a loop with two or more states.
-        ax: where to draw; a new figure by default.
+        ax: where to draw; a new figure with a legend by default.
         samples: how many trajectories to show; of a partitioned tube so many from each cell.
         coordinates: the two states to draw, counted from 0: the horizontal axis, then the vertical
             one.
@@ -107,12 +110,14 @@ def plot_tube(
         require_kind("tube", cell, ReachTube, "a ReachTube, as reach(...) returns it")
     first, *others = cells
     i, j = _two_of(first.loop.states, coordinates)
-    ax = _axes(ax)
+    with_legend, ax = ax is None, _axes(ax)
     _plot_cell(first, ax, samples, i, j, ("simulated", "initial set", "certified"))
     for cell in others:
         _plot_cell(cell, ax, samples, i, j, (None, None, None))
     ax.set_xlabel(f"$x_{{{i + 1}}}$")
     ax.set_ylabel(f"$x_{{{j + 1}}}$")
+    if with_legend:
+        ax.legend(**ABOVE, markerscale=8)
     return ax
 
 
@@ -151,11 +156,13 @@ def plot_cells(
             Rectangle((cell.lower[i], cell.lower[j]), *(cell.upper - cell.lower)[[i, j]])
             for cell in cells
         ]
-        look = {"facecolor": color, "edgecolor": "white", "linewidth": 0.4, "alpha": 0.8}
+        # white edges would hide cells as narrow as those at a boundary
+        edge = color if status is VerdictStatus.UNKNOWN else "white"
+        look = {"facecolor": color, "edgecolor": edge, "linewidth": 0.4, "alpha": 0.8}
         ax.add_collection(PatchCollection(boxes, **look))
         handles.append(Patch(facecolor=color, label=f"{status.value}: {len(cells)}"))
     ax.autoscale_view()
-    ax.legend(handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False)
+    ax.legend(handles=handles, **ABOVE)
     ax.set_xlabel(f"$x_{{{i + 1}}}$")
     ax.set_ylabel(f"$x_{{{j + 1}}}$")
     return ax

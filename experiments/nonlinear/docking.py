@@ -161,7 +161,8 @@ def draw(verdict: rj.Verdict, states: Float[ndarray, "c t 4"], path: Path) -> No
     ends = np.array([away.min(), away.max()])
     right.plot(ends, REST + SLOPE * ends, color="tab:red", label="limit")
     right.set(xlabel="distance (m)", ylabel="speed (m/s)")
-    right.legend(loc="upper left", markerscale=12)
+    above = {"loc": "lower center", "bbox_to_anchor": (0.5, 1), "ncols": 3, "frameon": False}
+    right.legend(**above, markerscale=12)
     figure.savefig(path, dpi=150)
 
 

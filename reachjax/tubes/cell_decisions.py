@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -26,7 +27,7 @@ from reachjax.sets.cells import Cell, grid, halves_along
 from reachjax.tubes.cell_jobs import CellJobs
 from reachjax.tubes.cell_tasks import CellTask, Outcome, Unbounded, outcome_of
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
-from reachjax.tubes.sieve import TOGETHER, Margins, Sieve
+from reachjax.tubes.sieve import TOGETHER, Margins, Sieve, no_margins
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.verdicts import Counterexample, DecidedCell, Verdict, VerdictStatus
 
@@ -105,10 +106,8 @@ class _Run:
         self._scenarios = Scenarios.of(self._loop, X0, task.horizon, task.start)
         self._done: list[DecidedCell] = []
         self._count = 0
-        blank = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
-        self._blank = blank
-        self._margins, self._simulated = (
-            {name: row.copy() for name, row in blank.items()} for _ in range(2)
+        self._blank, self._margins, self._simulated = (
+            no_margins(task.required, task.horizon) for _ in range(3)
         )
         self.example: Counterexample | None = None
         self._tried: dict[int, deque[int]] = {}
@@ -117,7 +116,12 @@ class _Run:
         self._size, self._sides = _size(box), np.where(sides > 0, sides, 1.0)
         self._lost: Unbounded | None = None
         self._bounded = False
-        self._sieve = Sieve(task.loop, task.horizon, task.start, task.required)
+
+    @cached_property
+    def _sieve(self) -> Sieve:
+        """Made once there are enough cells for it."""
+        task = self._task
+        return Sieve(task.loop, task.horizon, task.start, task.required)
 
     def results(
         self, begun: Sequence[Cell], executor: Executor | None

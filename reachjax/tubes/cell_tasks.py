@@ -21,7 +21,7 @@ from reachjax.sets import AbstractSet, Box
 from reachjax.sets.balance import balanced
 from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.requirements import Requirement
-from reachjax.tubes.sieve import Margins
+from reachjax.tubes.sieve import Margins, no_margins, smallest
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.targets import target_of, values_of
 
@@ -95,8 +95,7 @@ class Outcome(NamedTuple):
     @property
     def margin(self) -> float:
         """The smallest."""
-        known = [np.nanmin(row) for row in self.margins.values() if not np.isnan(row).all()]
-        return float(min(known, default=-np.inf))
+        return smallest(self.margins)
 
 
 def outcome_of(
@@ -110,8 +109,8 @@ def outcome_of(
         deadline: when to stop, as `time.monotonic` says it.
         known: the margins by forms over the cell's box, which do not prove all; None if unknown.
     """
-    blank = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
-    margins = {name: row.copy() for name, row in (known or blank).items()}
+    begun = known or no_margins(task.required, task.horizon)
+    margins = {name: row.copy() for name, row in begun.items()}
     with jax.enable_x64(True):
         try:
             return _climbed(task, part, deadline, margins, known is not None)
@@ -133,7 +132,7 @@ def _climbed(
     ladder = Ladder(task.loop, part, around, scenarios, task.start, *limits)
     if by_forms and isinstance(part, Box) and not task.by_programs:
         ladder.advance(tighten=False)  # nothing but forms could be tried again
-        return Outcome(False, margins, _axis(ladder, _least(task.required, margins)))
+        return Outcome(False, margins, _axis(ladder, _first_open(task.required, margins)))
     middle = scenarios.middle(np.asarray(around.center))
     for k in range(task.horizon + 1):
         if k:
@@ -147,7 +146,7 @@ def _climbed(
     return Outcome(True, margins, 0)
 
 
-def _least(required: Sequence[Requirement], margins: Margins) -> Requirement:
+def _first_open(required: Sequence[Requirement], margins: Margins) -> Requirement:
     """The first requirement that is not proved, in time."""
     broken = [item for item in required if not margins[item.name][item.time] > 0]
     return min(broken or required, key=lambda item: item.time)

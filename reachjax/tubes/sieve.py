@@ -6,7 +6,7 @@ do more: linear programs, or halving them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -29,6 +29,17 @@ Ends = tuple[Float[np.ndarray, " n_x"], Float[np.ndarray, " n_x"]]
 """Lower and upper corners of a cell."""
 
 
+def no_margins(required: Iterable[Requirement], horizon: int) -> Margins:
+    """Those of requirements of which nothing is known."""
+    return {item.name: np.full(horizon + 1, np.nan) for item in required}
+
+
+def smallest(margins: Margins) -> float:
+    """The smallest that is known; minus infinity where none is."""
+    known = [np.nanmin(row) for row in margins.values() if not np.isnan(row).all()]
+    return float(min(known, default=-np.inf))
+
+
 class Sifted(NamedTuple):
     """What is found of a cell.
 
@@ -45,8 +56,7 @@ class Sifted(NamedTuple):
     @property
     def margin(self) -> float:
         """The smallest."""
-        known = [np.nanmin(row) for row in self.margins.values() if not np.isnan(row).all()]
-        return float(min(known, default=-np.inf))
+        return smallest(self.margins)
 
 
 class _Rows(NamedTuple):
@@ -76,9 +86,10 @@ class _Rows(NamedTuple):
         facets = (np.asarray(part) for part in item.looser.facets)
         D, e = balanced(*facets, inner=not item.inside)
         sign = 1.0 if item.inside else -1.0
-        directions, limits = np.concatenate([sign * C, -sign * D]), np.concatenate([d, -e])
-        limits[: len(d)] *= sign
-        limits[len(d) :] *= sign
+        directions, limits = (
+            np.concatenate([sign * proving, -sign * refuting])
+            for proving, refuting in ((C, D), (d, e))
+        )
         return cls(item, first, directions, limits, norms)
 
     @property
@@ -123,8 +134,6 @@ class Sieve:
         for rows in self._rows:
             directions[rows.item.time, rows.first : rows.end] = rows.directions
         self._directions = directions
-        blank = np.full(horizon + 1, np.nan)
-        self._blank: Margins = {item.name: blank for item in required}
 
     def sifted(self, cells: Sequence[Ends]) -> list[Sifted]:
         """What is found of each cell, at most `TOGETHER` of them."""
@@ -138,7 +147,8 @@ class Sieve:
 
     def _judged(self, uppers: Float[np.ndarray, "h+1 m"]) -> Sifted:
         """What bounds say of one cell."""
-        margins, proved, refuted = {k: row.copy() for k, row in self._blank.items()}, True, False
+        items, proved, refuted = [rows.item for rows in self._rows], True, False
+        margins = no_margins(items, len(uppers) - 1)
         for rows in self._rows:
             item = rows.item
             holds, fails, margin = rows.judged(uppers[item.time])

@@ -40,7 +40,7 @@ from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.propagation import deadline_of, known_numbers
 from reachjax.tubes.requirements import AvoidSets, Region, Timed, requirements
 from reachjax.tubes.seals import seal_of
-from reachjax.tubes.sieve import TOGETHER, Ends, Margins, Sieve, Sifted
+from reachjax.tubes.sieve import TOGETHER, Ends, Margins, Sieve, Sifted, no_margins
 from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
 from reachjax.tubes.winning_sets import WinningSet
 
@@ -345,7 +345,7 @@ def _promising(least: Float[np.ndarray, " c"], margin: float) -> bool:
 
 def _bounded(task: CellTask, box: Box, rooms: Float[np.ndarray, "r c"]) -> Sifted:
     """What forms and programs say of one box, given how trajectories from it fare."""
-    margins = {item.name: np.full(task.horizon + 1, np.nan) for item in task.required}
+    margins = no_margins(task.required, task.horizon)
     try:
         proved, refuted = _climbed(task, jax.device_get(box), rooms, margins)
     except UnboundedError:  # of halves there may be bounds

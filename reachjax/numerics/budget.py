@@ -103,3 +103,7 @@ class Budget:
     def grant(self, work: float) -> None:
         """Let so much work be left, at least."""
         self._purse[0] = max(self._purse[0], work)
+
+
+ENDLESS = Budget()
+"""A budget that is never spent."""

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon
 from reachjax.solvers.linear_programs import AbstractPrograms, Vertex
@@ -107,7 +107,7 @@ class Tree:
         forms: AffineForms,
         attained: Callable[[list[Float[np.ndarray, " n"]]], float],
         enough: Callable[[float, float], bool],
-        budget: Budget,
+        budget: Budget = ENDLESS,
     ):
         forms = forms.widened(horizon.facts.columns.shape[1])
         self._rows, self._constants = np.asarray(forms.columns), np.asarray(forms.rows[:, 0])
@@ -209,7 +209,7 @@ def settled(
     columns: Float[np.ndarray, " n"],
     leaves: Int[np.ndarray, "l p"],
     bound: float,
-    budget: Budget,
+    budget: Budget = ENDLESS,
 ) -> Float[np.ndarray, " m"] | None:
     """Multipliers of a bound that is attained, with nothing of the lines that hold units.
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.programs.affine import AffineForms
 from reachjax.solvers.linear_programs import AbstractPrograms, Vertex
 
@@ -53,7 +53,7 @@ class ConicPrograms(AbstractPrograms):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
-        budget: Budget,
+        budget: Budget = ENDLESS,
         reach: float | Float[np.ndarray, " n"] = 1.0,
         basis: Any = None,
     ) -> Vertex | None:

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.programs.affine import AffineForms
 
 TOLERANCE = 1e-9
@@ -73,7 +73,7 @@ class AbstractPrograms(abc.ABC):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
-        budget: Budget,
+        budget: Budget = ENDLESS,
         reach: float | Float[np.ndarray, " n"] = 1.0,
         basis: Any = None,
     ) -> Vertex | None:
@@ -142,7 +142,7 @@ class LinearPrograms(AbstractPrograms):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
-        budget: Budget,
+        budget: Budget = ENDLESS,
         reach: float | Float[np.ndarray, " n"] = 1.0,
         basis: Any = None,
     ) -> Vertex | None:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.programs.facts import FactLayout
 from reachjax.programs.relaxations import CuttingPlanes
 from reachjax.solvers.cut_pool import NONE, CutPool
@@ -42,7 +42,7 @@ class Rounds(NamedTuple):
     cuts: CuttingPlanes
     witness: Witness | None = None
     warm_start: Int[np.ndarray, "p 2"] = NONE
-    budget: Budget = Budget()
+    budget: Budget = ENDLESS
 
 
 class Shown(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import Program
 from reachjax.programs.preactivations import first_inputs, first_rows
@@ -80,7 +80,7 @@ class Setting:
     drop_columns: bool
     simulations: Simulations | None
     gap: float = 1e-4
-    budget: Budget = Budget()  # noqa: RUF009  (without limits)
+    budget: Budget = ENDLESS
     note: Callable[[str], None] = lambda note: None
 
     @property

@@ -176,8 +176,13 @@ class _Run:
         jobs.submit((cell, task), outcome_of, task, part, self._budget, known)
 
     def _sifted(self, cells: Sequence[Cell]) -> list[tuple[Cell, Margins | None]]:
-        """Those of some cells that forms do not prove, with the margins that these say."""
+        """Those of some cells that forms do not prove, with the margins that these say.
+
+        All of them, of which nothing is known, while it pays better to bound them one by one.
+        """
         ends = [(np.asarray(cell.box.lower), np.asarray(cell.box.upper)) for cell in cells]
+        if not self._sieve.pays(ends, self._budget):
+            return [(cell, None) for cell in cells]
         found: list[tuple[Cell, Margins | None]] = []
         for cell, sifted in zip(cells, self._sieve.sifted(ends), strict=True):
             if sifted.proved:

@@ -12,6 +12,9 @@ from typing import Self
 
 from reachjax.numerics.checks import real_number
 
+GRACE = 0.4
+"""Seconds that forms, which are solved by nobody, may go on after the end."""
+
 
 class Budget:
     """Seconds until a deadline, and work, of which all parts of a budget spend together.
@@ -31,15 +34,18 @@ class Budget:
 
     def __init__(self, seconds: float = math.inf, work: float = math.inf):
         self._end, self._purse = time.monotonic() + seconds, [work]
+        self._stopped = [False]
 
     @classmethod
-    def of(cls, time_limit: float | None, work: float = math.inf) -> Self:
-        """The budget of a call with this limit, which begins now.
+    def of(cls, time_limit: float | Self | None, work: float = math.inf) -> Self:
+        """The budget of a call with this limit, which begins now; a budget is one already.
 
         Raises:
             TypeError: the limit is no number.
             ValueError: it is negative.
         """
+        if isinstance(time_limit, cls):
+            return time_limit
         if time_limit is None:
             return cls(work=work)
         return cls(real_number("time_limit", time_limit, 0.0), work)
@@ -47,23 +53,37 @@ class Budget:
     def __repr__(self) -> str:
         return f"Budget(seconds={self.left:.3g}, work={self.work:.3g})"
 
-    def __getstate__(self) -> tuple[float, list[float]]:
+    def __getstate__(self) -> tuple[float, list[float], list[bool]]:
         """How it is sent to another process, or machine, whose monotonic clock is another one."""
-        return time.time() + self.left, self._purse
+        return time.time() + self.left, self._purse, self._stopped
 
-    def __setstate__(self, state: tuple[float, list[float]]) -> None:
-        end, self._purse = state
+    def __setstate__(self, state: tuple[float, list[float], list[bool]]) -> None:
+        end, self._purse, self._stopped = state
         self._end = time.monotonic() + end - time.time()
 
     @property
     def left(self) -> float:
         """The seconds that are left; zero when the time is over."""
-        return max(self._end - time.monotonic(), 0.0)
+        return 0.0 if self.stopped else max(self._end - time.monotonic(), 0.0)
 
     @property
     def late(self) -> bool:
         """Whether the time is over."""
-        return time.monotonic() >= self._end
+        return self.stopped or time.monotonic() >= self._end
+
+    @property
+    def overdue(self) -> bool:
+        """Whether the time has been over for so long that what is cheap ends as well."""
+        return self.stopped or time.monotonic() >= self._end + GRACE
+
+    @property
+    def stopped(self) -> bool:
+        """Whether somebody stopped it, or what it is a part of."""
+        return self._stopped[0]
+
+    def stop(self) -> None:
+        """Let its time be over, and that of all parts of it in this process, at once."""
+        self._stopped[0] = True
 
     @property
     def timed(self) -> bool:
@@ -94,6 +114,7 @@ class Budget:
         found = Budget()
         now = time.monotonic()
         found._end, found._purse = now + part * (self._end - now), self._purse
+        found._stopped = self._stopped
         return found
 
     def spend(self, work: float) -> None:

@@ -28,6 +28,7 @@ from reachjax.sets import AbstractSet, Box
 from reachjax.sets.cells import Cell, grid, halves_along
 from reachjax.tubes.cell_jobs import CellJobs
 from reachjax.tubes.cell_tasks import CellTask, Outcome, Unbounded, outcome_of
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.sieve import TOGETHER, Margins, Sieve, no_margins
 from reachjax.tubes.soundness import require_unbroken_cells
@@ -89,10 +90,17 @@ def decided_by_cells(
     if simulations is not None:
         run.seen(simulations.runs)
     if run.example is None:
-        with closing(run.results(begun, executor)) as results:  # a bar may end before they do
-            for _ in wrapped(progress, results):
-                if run.example is not None:
-                    break
+        try:
+            with closing(run.results(begun, executor)) as results:  # a bar may end before they do
+                for _ in wrapped(progress, results):
+                    if run.example is not None:
+                        break
+        except KeyboardInterrupt:
+            message = (
+                "interrupted: this exception's `found` is the verdict so far, whose `cells` that "
+                "are not undecided need not be decided again"
+            )
+            raise Interrupted(message, run.verdict(interrupted=True)) from None
     return run.verdict()
 
 
@@ -139,9 +147,15 @@ class _Run:
         try:
             while open_cells or left_over or self._last or jobs:
                 while (open_cells or left_over) and len(jobs) < jobs.most:
+                    if self._budget.overdue:
+                        return
                     if not left_over and len(open_cells) >= TOGETHER and not self._budget.late:
                         some = [open_cells.popleft() for _ in range(TOGETHER)]
-                        left_over.extend(self._sifted(some))
+                        try:
+                            left_over.extend(self._sifted(some))
+                        except KeyboardInterrupt:
+                            open_cells.extend(some)
+                            raise
                         yield len(self._done)
                         continue
                     cell, known = left_over.popleft() if left_over else (open_cells.popleft(), None)
@@ -152,9 +166,15 @@ class _Run:
                         continue
                     self._submit(jobs, cell, self._first, known)
                 while self._last and not (open_cells or left_over) and len(jobs) < jobs.most:
+                    if self._budget.late:
+                        return
                     self._submit(jobs, self._last.popleft(), self._task)
                 for (cell, task), outcome in jobs.finished():
-                    open_cells.extend(self._judged(cell, outcome, task is self._first))
+                    try:
+                        open_cells.extend(self._judged(cell, outcome, task is self._first))
+                    except KeyboardInterrupt:
+                        open_cells.append(cell)
+                        raise
                     yield len(self._done)
                 if self.example is not None:
                     return
@@ -280,14 +300,17 @@ class _Run:
             found += suspects(item, rooms, runs)
         self.example = counterexample(self._loop, self._X0, found, self._task.start)
 
-    def verdict(self) -> Verdict:
-        """All of it.
+    def verdict(self, interrupted: bool = False) -> Verdict:
+        """The verdict from all cells that were looked at.
+
+        Args:
+            interrupted: whether somebody stopped that.
 
         Raises:
             UnboundedError: there is no cell over which all units have bounds.
             UnsoundError: a trajectory breaks what is proved.
         """
-        if self._lost and not self._bounded and self.example is None:
+        if self._lost and not (self._bounded or self.example or interrupted):
             unbounded, widths = self._lost
             raise unbounded.error.after(len(self._done), widths)
         task = self._task

@@ -134,6 +134,8 @@ def _climbed(
     for k in range(task.horizon + 1):
         if k:
             ladder.advance(tighten=False)
+        if budget.overdue:
+            return Outcome(False, margins, -1)
         for item in task.required:
             if item.time == k:
                 proved, margin = bounded(item, ladder, part, middle)

@@ -38,6 +38,7 @@ from reachjax.sets import AbstractSet
 from reachjax.tubes.by_cells import affordable
 from reachjax.tubes.cell_decisions import decided_by_cells, roots
 from reachjax.tubes.cell_tasks import CellTask
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.ladder import WORK, Climbed, Ladder
 from reachjax.tubes.propagation import (
     Progress,
@@ -113,6 +114,7 @@ def decide(
         with what is known of each cell.
 
     Raises:
+        Interrupted: Ctrl-C; its `found` is the verdict so far.
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind, or a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, `X0` is
@@ -150,6 +152,30 @@ def decide(
         task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
         return decided_by_cells(task, X0, counts, most, simulations, budget, executor, progress)
     decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
+    try:
+        return _by_remedies(decision, loop, X0, horizon, start, required, relaxation, budget)
+    except Interrupted:
+        raise
+    except KeyboardInterrupt:
+        message = "interrupted: this exception's `found` is the verdict so far"
+        raise Interrupted(message, decision.verdict()) from None
+
+
+def _by_remedies(
+    decision: _Decision,
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    horizon: int,
+    start: int,
+    required: list[Requirement],
+    relaxation: BranchAndCut,
+    budget: Budget,
+) -> Verdict:
+    """The verdict by remedies in the order in which they pay.
+
+    Forms; of a smooth loop halves of the set, each of which costs a form and leaves out an eighth;
+    then programs, few of each bound first.
+    """
     decision.at_first()
     on_host, begun, around = jax.device_get((loop, X0, boxed(X0, "X0")))
 
@@ -163,14 +189,15 @@ def decide(
     by_cells, most = None, 1
     if loop.curved:
         most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / 2))
-    if most > 1:  # half a set costs a form, and what forms leave out of it is an eighth
+    if most > 1:
         with contextlib.suppress(UnboundedError):  # of halves there may be bounds
             climb(0)
         if decision.ended:
             return decision.verdict()
         task = CellTask(on_host, horizon, start, tuple(required), nodes=0)
         share = budget.share(FOR_CELLS if relaxation.nodes else 1.0)
-        by_cells = decided_by_cells(task, X0, roots(X0, most)[0], most, simulations, share)
+        given = most, decision.simulations, share
+        by_cells = decided_by_cells(task, X0, roots(X0, most)[0], *given)
         if by_cells.status is not VerdictStatus.UNKNOWN or not relaxation.nodes:
             return by_cells
     try:
@@ -193,6 +220,9 @@ class _Decision:
         required: the requirements.
         simulations: trajectories from the set; None if it is too thin for any.
         budget: of the call.
+
+    Attributes:
+        simulations: as given.
     """
 
     def __init__(
@@ -215,7 +245,7 @@ class _Decision:
         self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
         self._example: Counterexample | None = None
-        self._simulations = simulations
+        self.simulations = simulations
         if simulations is not None:
             self._seen(required, simulations.runs)
 
@@ -248,8 +278,8 @@ class _Decision:
         ]
         if claims:
             rows = self._middle[None]
-            if self._simulations is not None:
-                rows = worst_of(self._simulations.runs, [claim.item for claim in claims])
+            if self.simulations is not None:
+                rows = worst_of(self.simulations.runs, [claim.item for claim in claims])
             runs = compiled_runs(self._loop, self._scenarios, rows, self._start)
             require_unbroken(self._loop, self._scenarios, self._start, runs, claims)
 
@@ -271,6 +301,8 @@ class _Decision:
         last = max(time for _, time in self._open)
         for k in range(1, last + 1):
             ladder.advance(tighten)
+            if self._budget.overdue:
+                return
             for key, item in list(self._open.items()):
                 if item.time == k and not self.ended:
                     self._decided(key, item, ladder)
@@ -279,7 +311,7 @@ class _Decision:
 
     def _decided(self, key: tuple[str, int], item: Requirement, ladder: Ladder) -> None:
         """Bound one requirement at the time that the ladder has come to."""
-        target, units = target_of(item, ladder, self._simulations, self._middle)
+        target, units = target_of(item, ladder, self.simulations, self._middle)
         left = sum(other.time >= item.time for other in self._open.values())
         share = self._budget.share(1 / left)
         climbed = ladder.climbed(target, (left - 1) * len(target.forms), share)
@@ -302,8 +334,8 @@ class _Decision:
 
     def _tried(self, item: Requirement, scenarios: np.ndarray) -> None:
         """Simulate scenarios that may break a requirement."""
-        if self._simulations is not None:
-            self._seen([item], self._simulations.include(scenarios))
+        if self.simulations is not None:
+            self._seen([item], self.simulations.include(scenarios))
         else:
             given = self._on_host, scenarios, self._horizon, self._start
             self._seen([item], Runs(scenarios, self._scenarios.runs(*given)))

@@ -29,6 +29,7 @@ from reachjax.numerics.checks import (
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds
 from reachjax.sets import Box, Ellipsoid, Template
 from reachjax.tubes.decisions import decide
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.propagation import known_numbers
 from reachjax.tubes.reach import reach
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
@@ -46,6 +47,9 @@ LONGEST, SHORTEST = 0.3, 1e-4
 
 FARTHEST = 2.0**20
 """How many times as long as one of `X0` a side may get: where nothing limits it, it ends there."""
+
+TURN = 0.3
+"""The part of the time that is left that a set may take: others are to be tried after it."""
 
 GROWTHS = 0.3, 0.1, 0.03, 0.01, 0.003
 """By which parts of itself a set or one of its sides is enlarged, as long as that is proved."""
@@ -101,6 +105,7 @@ def largest_set(
         `X0`, and no longer.
 
     Raises:
+        Interrupted: Ctrl-C; its `found` is the largest set so far.
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or
@@ -129,15 +134,24 @@ def largest_set(
             "relaxation": dataclasses.replace(relaxation, cells=1),  # what is tried fails often
             "start": start,
             "samples": 200,
-            "time_limit": budget.limit,
+            "time_limit": budget.share(TURN).limit,
         }
         return decide(loop, region, horizon, goal, safe, avoid, **limits)
 
     budget = Budget.of(time_limit)
     search = _Search(loop, X0, required, horizon, start, decided, budget)
-    for _ in wrapped(progress, search.tried(rounds)):
-        if budget.late:
-            break
+    try:
+        for _ in wrapped(progress, search.tried(rounds)):
+            if budget.late:
+                break
+    except KeyboardInterrupt:
+        if search.best is None:
+            raise
+        message = (
+            "interrupted: this exception's `found` is the largest set so far, and "
+            "largest_set(loop, found.region, ...) goes on"
+        )
+        raise Interrupted(message, search.best) from None
     if search.best is None:
         raise ValueError(
             "nothing is proved around the center of X0: give another one, or see "

@@ -65,7 +65,7 @@ class Options(NamedTuple):
     seed: int = 0
     progress: Progress | None = None
     gap: float = GAP
-    time_limit: float | None = None
+    time_limit: float | Budget | None = None
 
     @classmethod
     def named(cls, options: dict[str, Any]) -> Options:
@@ -160,6 +160,8 @@ def propagated(
     try:
         for _, step in zip(bar, _following(task, options, setting, before), strict=False):
             steps.append(step)
+            if budget.stopped:
+                raise KeyboardInterrupt
     except KeyboardInterrupt:
         if not steps or not is_concrete([step.proof for step in steps]):
             raise

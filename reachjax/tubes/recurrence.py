@@ -25,6 +25,7 @@ from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope
 from reachjax.tubes.decisions import decide
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.recurrent_sets import TRAJECTORIES, Candidate, candidate_sets, periods, within
 from reachjax.tubes.refutations import SUSPECTS, counterexample, suspects
@@ -95,7 +96,15 @@ def for_ever(
         return dataclasses.replace(verdict, status=refuted, counterexample=example)
     if verdict.status is VerdictStatus.UNKNOWN:
         return verdict
-    found = recurrence(tubes, X0, wanted, runs.states, budget)
+    try:
+        found = recurrence(tubes, X0, wanted, runs.states, budget)
+    except KeyboardInterrupt:
+        message = (
+            "interrupted: this exception's `found` is the verdict until the horizon; verify(..., "
+            "forever=True) looks again for a set that states come back to"
+        )
+        unknown = dataclasses.replace(verdict, status=VerdictStatus.UNKNOWN)
+        raise Interrupted(message, unknown) from None
     proved = found is not None and found.proved
     if proved:
         _require_unbroken(loop, X0, wanted, runs, start)

@@ -36,6 +36,7 @@ from reachjax.programs.relaxations import BranchAndCut
 from reachjax.sets import Box
 from reachjax.tubes.cell_jobs import CellJobs
 from reachjax.tubes.cell_tasks import CellTask, bounded, fails_everywhere
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.propagation import known_numbers
 from reachjax.tubes.requirements import AvoidSets, Region, Timed, requirements
@@ -125,6 +126,7 @@ def winning_set(
         All cells; of a loop with disturbances, proved for all of them, and refuted for all.
 
     Raises:
+        Interrupted: Ctrl-C; its `found` is the winning set so far.
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind, or a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or what
@@ -171,9 +173,17 @@ def winning_set(
             )
         cells_so_far = list(known.cells)
     run = _Run(task, domain, cells_so_far, most, Budget.of(time_limit))
-    with closing(run.results(executor)) as results:  # a bar may end before they do
-        for _ in wrapped(progress, results):
-            pass
+    try:
+        with closing(run.results(executor)) as results:  # a bar may end before they do
+            for _ in wrapped(progress, results):
+                pass
+    except KeyboardInterrupt:
+        found = WinningSet(domain, tuple(run.done), seal)
+        message = (
+            f"interrupted with {len(found.cells)} cells: this exception's `found` is the winning "
+            "set so far, and winning_set(..., known=found) goes on"
+        )
+        raise Interrupted(message, found) from None
     require_unbroken_cells(loop, domain, horizon, start, required, run.done)
     return WinningSet(domain, tuple(run.done), seal)
 
@@ -234,8 +244,14 @@ class _Run:
                     boxes = [(cell.lower, cell.upper) for cell in batch]
                     jobs.submit(batch, sorted_cells, task, boxes, self._scale, self._budget)
                 for batch, results in jobs.finished():
-                    for cell, found in zip(batch, results, strict=True):
-                        self._judged(cell, found, task.by_programs)
+                    left = list(zip(batch, results, strict=True))
+                    try:
+                        while left:
+                            self._judged(*left[-1], task.by_programs)
+                            left.pop()
+                    except KeyboardInterrupt:
+                        self.done += [cell for cell, _ in left]
+                        raise
                     yield len(self.done)
         finally:
             self.done += [cell for batch in jobs.cancelled() for cell in batch]

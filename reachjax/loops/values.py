@@ -31,7 +31,7 @@ class Value:
         shape: of the array that they are, flattened.
         terms: the sum that they are, entry by entry, of values nearer to the inputs, and
         offset: what is added to it; None where they are no such sum.
-        nonnegative: whether they are squares, say, or sums of them: never below zero.
+        source: what they are entries of, and which, if they are picked.
     """
 
     def __init__(
@@ -40,10 +40,10 @@ class Value:
         shape: Shape,
         terms: tuple[Term, ...] | None = None,
         offset: Any = 0.0,
-        nonnegative: bool = False,
+        source: tuple[Value, Any] | None = None,
     ):
         self.place, self.shape, self.terms, self.offset = place, shape, terms, offset
-        self.nonnegative = nonnegative
+        self.source = source
 
     @property
     def size(self) -> int:
@@ -77,12 +77,16 @@ class Step(NamedTuple):
         parents: the places of these.
         entrywise: whether each entry is of the same entries of these alone.
         unit: that of a layer of units.
+        again: how it is recorded of other values, flat ones, in place of its parents.
+        linear: whether it is affine, by numbers that are known.
     """
 
     apply: Callable[..., Any]
     parents: tuple[int, ...]
     entrywise: bool = True
     unit: AbstractUnit | None = None
+    again: Callable[..., Any] | None = None
+    linear: bool = False
 
 
 def is_known(*plain: Any) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from reachjax.loops.limits import Limits
 from reachjax.loops.primitives.equations import (
     JUMPS,
     Equation,
@@ -53,21 +54,17 @@ def _larger(recorder: Recorder, one: Value, other: Operand) -> Value:
     if _is_plain(other) and not np.any(other):
         return recorder.rectified(one)
     found = recorder.added(recorder.rectified(recorder.added(one, other, -1)), other)
-    found.nonnegative = one.nonnegative or _never_negative(other)
-    return found
+    return recorder.limited(found, recorder.limits(one).larger(_limits(recorder, other)))
 
 
 def _smaller(recorder: Recorder, one: Value, other: Operand) -> Value:
     found = recorder.added(one, recorder.rectified(recorder.added(one, other, -1)), -1)
-    found.nonnegative = one.nonnegative and _never_negative(other)
-    return found
+    return recorder.limited(found, recorder.limits(one).smaller(_limits(recorder, other)))
 
 
-def _never_negative(operand: Operand) -> bool:
-    """Whether that is known of a value, or of plain numbers."""
-    if isinstance(operand, Value):
-        return operand.nonnegative
-    return _is_plain(operand) and bool(np.all(np.asarray(operand) >= 0))
+def _limits(recorder: Recorder, operand: Operand) -> Limits:
+    """Those of a value, or of plain numbers."""
+    return recorder.limits(operand) if isinstance(operand, Value) else Limits.of(operand)
 
 
 def largest(recorder: Recorder, one: Operand, other: Operand) -> Operand:

@@ -32,9 +32,7 @@ def _by(unit: AbstractUnit) -> Rule:
 def _raised(recorder: Recorder, value: Value, power: int) -> Any:
     """A whole power, by squares and products."""
     if power < 0:
-        inverse = recorder.unit(Reciprocal(), value)
-        inverse.nonnegative = value.nonnegative
-        return _raised(recorder, inverse, -power)
+        return _raised(recorder, recorder.unit(Reciprocal(), value), -power)
     if power == 0:
         return np.ones(value.shape)
     half = value if power < 2 else _raised(recorder, value, power // 2)
@@ -44,16 +42,12 @@ def _raised(recorder: Recorder, value: Value, power: int) -> Any:
     return square if power % 2 == 0 else recorder.product(square, value)
 
 
-def _rooted(recorder: Recorder, value: Value) -> Value:
-    return recorder.unit(Sqrt(nonnegative=value.nonnegative), value)
-
-
 def _to_the(recorder: Recorder, value: Value, exponent: float) -> Any:
     """A real power."""
     if exponent.is_integer():
         return _raised(recorder, value, int(exponent))
     if (2 * exponent).is_integer():
-        return _raised(recorder, _rooted(recorder, value), int(2 * exponent))
+        return _raised(recorder, recorder.unit(Sqrt(), value), int(2 * exponent))
     return recorder.unit(Exp(), recorder.scaled(recorder.unit(Log(), value), np.array(exponent)))
 
 
@@ -101,11 +95,11 @@ def _square(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
 
 
 def _root(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    return _rooted(recorder, operands[0])
+    return recorder.unit(Sqrt(), operands[0])
 
 
 def _inverse_root(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    return recorder.unit(Reciprocal(), _rooted(recorder, operands[0]))
+    return recorder.unit(Reciprocal(), recorder.unit(Sqrt(), operands[0]))
 
 
 def _logistic(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:

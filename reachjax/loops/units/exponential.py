@@ -23,6 +23,7 @@ class Exp(SmoothUnit):
 
     nonexpansive = False
     image = (0.0, math.inf)
+    rises = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`exp y`."""
@@ -53,6 +54,7 @@ class Log(SmoothUnit):
     """
 
     nonexpansive = False
+    rises = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`log y`."""

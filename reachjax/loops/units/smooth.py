@@ -11,6 +11,7 @@ are used: no bound relies on how a slope, a stationary point or a coefficient wa
 from __future__ import annotations
 
 import abc
+import dataclasses
 import math
 from functools import reduce
 from typing import Any, ClassVar, NamedTuple
@@ -63,6 +64,20 @@ ENDLESS = 1e100
 """Inputs of this size are no matter of a domain."""
 
 
+class Origin(NamedTuple):
+    """What a unit is a part of, for errors: that which a user wrote.
+
+    Attributes:
+        name: of the function.
+        trouble: what its inputs must have met if the unit has no bounds.
+        advice: how to avoid that.
+    """
+
+    name: str
+    trouble: str
+    advice: str
+
+
 class UnboundedError(ValueError):
     """That a unit has no bounds on the range of its inputs.
 
@@ -75,30 +90,64 @@ class UnboundedError(ValueError):
     """
 
     def __init__(self, unit: AbstractUnit, t: int, lower: float, upper: float, line: str = ""):
-        name = type(unit).__name__
-        advice = (
-            "keep them away from what is outside of its domain, or take smaller cells of X0 "
-            "(reach_partitioned, or decide(..., cells=...))"
+        name, trouble, advice = (isinstance(unit, SmoothUnit) and unit.origin) or Origin(
+            type(unit).__name__, "", getattr(unit, "advice", SmoothUnit.advice)
         )
+        advice += ", or take smaller cells of X0 (reach_partitioned, or decide(..., cells=...))"
         if max(-lower, upper) > ENDLESS:
             advice = "states, or their bounds, grow without end: see whether the loop is stable"
-        super().__init__(
-            f"{name}{line} at t = {t} has inputs in [{lower:g}, {upper:g}], on which it has no "
-            f"bounds: {advice}"
-        )
+        where = f"inputs in [{lower:g}, {upper:g}]"
+        trouble = f"{trouble} ({where} of its divisor)" if trouble else f"has {where}, on which it"
+        super().__init__(f"{name}{line} at t = {t} {trouble} has no bounds: {advice}")
         self.given = unit, t, lower, upper
 
 
+@dataclasses.dataclass(frozen=True)
 class SmoothUnit(AbstractUnit):
     """A unit three times differentiable where it is defined.
+
+    Args:
+        least: what its inputs are known never to be below, as sums of squares are never below zero;
+            what bounds of them say beneath it then says nothing.
+        most: what they are known never to be above.
+        origin: what it is a part of, for errors; None if it is what a user wrote.
 
     Attributes:
         image: bounds of all its values.
         flushed: what numbers too small for floats may add to an error of its value.
+        rises: whether it increases wherever it is defined.
+        advice: what to do where inputs leave its domain.
     """
+
+    least: float = dataclasses.field(default=-math.inf, repr=False, kw_only=True)
+    most: float = dataclasses.field(default=math.inf, repr=False, kw_only=True)
+    origin: Origin | None = dataclasses.field(default=None, repr=False, kw_only=True)
 
     image: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
     flushed: ClassVar[float] = 1024 * TINY
+    rises: ClassVar[bool] = False
+    advice: ClassVar[str] = "keep them away from what is outside of its domain"
+
+    def met(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """What inputs can be of those between bounds."""
+        if self.least > -math.inf:
+            lower, upper = larger(lower, self.least), larger(upper, self.least)
+        if self.most < math.inf:
+            lower, upper = smaller(lower, self.most), smaller(upper, self.most)
+        return lower, upper
+
+    def limits(self, least: Array, most: Array) -> tuple[Array, Array]:
+        """Bounds of the value for inputs in `[least, most]`, one end or both of which may be
+        infinite.
+        """
+        low, high = (np.where(np.isfinite(end), end, 1.0) for end in (least, most))
+        if self.rises:
+            first, last = self.interval(low, low)[0], self.interval(high, high)[1]
+        else:
+            first, last = self.interval(low, high)
+            least = most = np.where(np.isfinite(least) & np.isfinite(most), 0.0, math.inf)
+        known = np.isfinite(least), np.isfinite(most)
+        return np.where(known[0], first, self.image[0]), np.where(known[1], last, self.image[1])
 
     @abc.abstractmethod
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
@@ -136,7 +185,7 @@ class SmoothUnit(AbstractUnit):
         They hold for any slope, and are infinite where the unit is not defined.
         """
         xp = namespace(slope, lower, upper)
-        slope, lower, upper = settled((slope, lower, upper))
+        slope, lower, upper = settled((slope, *self.met(lower, upper)))
         fine = self.defined(lower, upper) & (abs(slope) < math.inf)
         slope = xp.where(fine, slope, 0.0)
         lower, upper = (xp.where(fine, end, 1.0) for end in (lower, upper))
@@ -159,6 +208,7 @@ class SmoothUnit(AbstractUnit):
 
         Where the unit is not defined they are infinitely far from each other.
         """
+        lower, upper = self.met(lower, upper)
         slope = settled(self._chord(lower, upper))
         low, high = self.remainder(slope, lower, upper)
         return Lines(below=Line(slope, low), above=Line(slope, high))
@@ -184,7 +234,7 @@ class SmoothUnit(AbstractUnit):
         Lebesgue constant), here 2, beside the error of an exact interpolant.
         """
         xp = namespace(lower, upper)
-        lower, upper = settled((lower, upper))
+        lower, upper = settled(self.met(lower, upper))
         center = settled(lower / 2 + upper / 2)
         linear = self.linear(lower, upper)
         fine = self.defined(lower, upper)
@@ -218,6 +268,7 @@ class SmoothUnit(AbstractUnit):
 
     def linear(self, lower: Array, upper: Array) -> Quadratic:
         """The lines as a quadratic without curvature."""
+        lower, upper = self.met(lower, upper)
         (slope, low), (_, high) = self.lines(lower, upper)
         center = settled(lower / 2 + upper / 2)
         start, half = slope * center, low / 2 + high / 2

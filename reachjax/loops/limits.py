@@ -83,7 +83,9 @@ class Limits:
         ]
         least, most = np.minimum.reduce(corners), np.maximum.reduce(corners)
         exact = (abs(other.least) == 1) & (other.least == other.most)
-        off = (np.where(exact, 0.0, gamma(1) * abs(end) + TINY * (end != 0)) for end in (least, most))
+        off = (
+            np.where(exact, 0.0, gamma(1) * abs(end) + TINY * (end != 0)) for end in (least, most)
+        )
         return _outward(least, most, *off)
 
     __rmul__ = __mul__

@@ -6,12 +6,13 @@ Intervals of a wide set lose that to rounding, and forms to what they leave out;
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops.units import AbstractUnit, SmoothUnit
+from reachjax.loops.values import Parameter
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.rounding import TINY, gamma
 
@@ -22,7 +23,10 @@ class Limits:
     Attributes:
         least: `(k,)`.
         most: `(k,)`.
+        hidden: kinds of arrays of which nothing is taken to be known.
     """
+
+    hidden: ClassVar[tuple[type, ...]] = ()
 
     # numpy arrays on the left leave `array @ limits` and `array - limits` to this class
     __array_ufunc__ = None
@@ -39,10 +43,14 @@ class Limits:
     @classmethod
     def of(cls, plain: Any) -> Limits:
         """Those of plain numbers, which are themselves; of traced ones nothing is known."""
-        if not is_concrete(plain):
+        if cls._is_hidden(plain):
             return cls.unknown(1)
         flat = np.array(plain, float).reshape(-1)
         return cls(flat, flat)
+
+    @classmethod
+    def _is_hidden(cls, plain: Any) -> bool:
+        return not is_concrete(plain) or isinstance(plain, cls.hidden)
 
     @property
     def nonnegative(self) -> bool:
@@ -50,7 +58,7 @@ class Limits:
         return bool(np.all(self.least >= 0))
 
     def __getitem__(self, index: Any) -> Limits:
-        return Limits(self.least[index], self.most[index])
+        return type(self)(self.least[index], self.most[index])
 
     @np.errstate(invalid="ignore", over="ignore")
     def __add__(self, other: Any) -> Limits:
@@ -59,12 +67,12 @@ class Limits:
         for one, another in ((self.least, other.least), (self.most, other.most)):
             ends.append(one + another)
             off.append(np.where((one == 0) | (another == 0), 0.0, gamma(1) * abs(ends[-1])))
-        return _outward(*ends, *off)
+        return self._outward(*ends, *off)
 
     __radd__ = __add__
 
     def __neg__(self) -> Limits:
-        return Limits(-self.most, -self.least)
+        return type(self)(-self.most, -self.least)
 
     def __sub__(self, other: Any) -> Limits:
         return self + (-other)
@@ -86,14 +94,14 @@ class Limits:
         off = (
             np.where(exact, 0.0, gamma(1) * abs(end) + TINY * (end != 0)) for end in (least, most)
         )
-        return _outward(least, most, *off)
+        return self._outward(least, most, *off)
 
     __rmul__ = __mul__
 
     @np.errstate(invalid="ignore", over="ignore")
     def __rmatmul__(self, matrix: Any) -> Limits:
         """A plain matrix times the numbers; where it only picks them nothing is rounded."""
-        if not is_concrete(matrix):
+        if self._is_hidden(matrix):
             return self.unknown(matrix.shape[0])
         matrix = np.asarray(matrix, float)
         over, under = np.maximum(matrix, 0.0), np.minimum(matrix, 0.0)
@@ -104,26 +112,33 @@ class Limits:
             terms = _times(over, one) + _times(under, other)
             ends.append(terms.sum(axis=1))
             off.append(error * abs(terms).sum(axis=1))
-        return _outward(*ends, *off)
+        return self._outward(*ends, *off)
 
     def meeting(self, other: Limits) -> Limits:
         """Limits that both hold."""
-        return Limits(np.maximum(self.least, other.least), np.minimum(self.most, other.most))
+        return type(self)(np.maximum(self.least, other.least), np.minimum(self.most, other.most))
 
     def larger(self, other: Limits) -> Limits:
         """Those of the larger of two numbers each."""
-        return Limits(np.maximum(self.least, other.least), np.maximum(self.most, other.most))
+        return type(self)(np.maximum(self.least, other.least), np.maximum(self.most, other.most))
 
     def smaller(self, other: Limits) -> Limits:
         """Those of the smaller of two numbers each."""
-        return Limits(np.minimum(self.least, other.least), np.minimum(self.most, other.most))
+        return type(self)(np.minimum(self.least, other.least), np.minimum(self.most, other.most))
+
+    def _outward(self, least: Any, most: Any, below: Any, above: Any) -> Limits:
+        """Ends moved by so much; infinite ones stay."""
+        return type(self)(
+            np.where(np.isfinite(least), least - below, least),
+            np.where(np.isfinite(most), most + above, most),
+        )
 
     def at(self, unit: AbstractUnit) -> Limits:
         """Those of a layer of units of these inputs."""
-        found = unit.limits if isinstance(unit, SmoothUnit) else unit.interval
+        found: Any = unit.limits if isinstance(unit, SmoothUnit) else unit.interval
         with np.errstate(all="ignore"):
             least, most = found(self.least, self.most)
-        return Limits(np.asarray(least, float), np.asarray(most, float))
+        return type(self)(np.asarray(least, float), np.asarray(most, float))
 
 
 def _times(one: Any, other: Any) -> Any:
@@ -131,9 +146,10 @@ def _times(one: Any, other: Any) -> Any:
     return np.where((one == 0) | (other == 0), 0.0, one * other)
 
 
-def _outward(least: Any, most: Any, below: Any, above: Any) -> Limits:
-    """Ends moved by so much; infinite ones stay."""
-    return Limits(
-        np.where(np.isfinite(least), least - below, least),
-        np.where(np.isfinite(most), most + above, most),
-    )
+class ConstantLimits(Limits):
+    """Limits that rest on constants alone, as they do where parameters are traced.
+
+    What a recording is made of must not depend on numbers that are known in one place only.
+    """
+
+    hidden = (Parameter,)

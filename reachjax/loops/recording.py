@@ -15,11 +15,25 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from reachjax.loops.limits import Limits
+from reachjax.loops.limits import ConstantLimits, Limits
 from reachjax.loops.rationals import Rationals
 from reachjax.loops.units import AbstractUnit, AtUnit, ReLU, SmoothUnit, Square, UnboundedError
-from reachjax.loops.values import Operand, Shape, Step, Term, UnsupportedError, Value, is_known
+from reachjax.loops.values import (
+    Fact,
+    Operand,
+    Parameter,
+    Shape,
+    Step,
+    Term,
+    UnsupportedError,
+    Value,
+    is_constant,
+    is_known,
+)
 from reachjax.numerics.rounding import TINY, UNIT, Ball, larger, namespace
+
+NONE = Limits.of(0.0)
+"""Those of zero."""
 
 
 class Recorder:
@@ -43,7 +57,7 @@ class Recorder:
         self.inputs = [Value(place, shape) for place, shape in enumerate(shapes)]
         self.values = [*self.inputs]
         self._made: dict[Any, Value] = {}
-        self._limits: dict[int, Limits] = {}
+        self._limits: dict[type[Limits], dict[int, Limits]] = {}
 
     def run(self, numbers: Sequence[Any], unit: AtUnit, wanted: Value) -> Any:
         """The numbers of a value, from those of the inputs, of any one kind.
@@ -100,27 +114,38 @@ class Recorder:
             return value
         return Value(value.place, shape, value.terms, value.offset, value.source)
 
-    def limits(self, value: Value) -> Limits:
-        """Between what numbers its entries are, whatever the inputs are."""
-        for place in self.between(value, done=self._limits):
-            step = self.steps[place]
-            if step is None:
-                self._limits[place] = Limits.unknown(self.values[place].size)
-                continue
-            given = (self._limits[parent] for parent in step.parents)
-            self._limits[place] = step.apply(lambda unit, y: y.at(unit), *given)
-        return self._limits[value.place]
+    def limits(self, operand: Operand, kind: type[Limits] = Limits) -> Limits:
+        """Between what numbers operands are, whatever the inputs are.
 
-    def limited(self, value: Value, limits: Limits) -> Value:
-        """A value of which more is known than how it came about says."""
-        self._limits[value.place] = self.limits(value).meeting(limits)
+        Args:
+            operand: a value, or plain numbers.
+            kind: what is taken to be known.
+        """
+        if not isinstance(operand, Value):
+            return kind.of(operand)
+        known = self._limits.setdefault(kind, {})
+        for place in self.between(operand, done=known):
+            step, value = self.steps[place], self.values[place]
+            if step is None:
+                known[place] = kind.unknown(value.size)
+                continue
+            given = (known[parent] for parent in step.parents)
+            known[place] = step.apply(lambda unit, y: y.at(unit), *given)
+            if value.fact is not None:
+                also = value.fact(lambda operand: self.limits(operand, kind))
+                known[place] = known[place].meeting(also)
+        return known[operand.place]
+
+    def limited(self, value: Value, fact: Fact) -> Value:
+        """A value of which more is known than how it came about says: limits, from others."""
+        self.values[value.place].fact = fact
+        for known in self._limits.values():
+            known.pop(value.place, None)
         return value
 
-    def is_nonnegative(self, operand: Operand) -> bool:
+    def is_nonnegative(self, value: Value) -> bool:
         """Whether numbers are squares, say, or sums of them: never below zero."""
-        if isinstance(operand, Value):
-            return self.limits(operand).nonnegative
-        return is_known(operand) and bool(np.all(np.asarray(operand) >= 0))
+        return self.limits(value, ConstantLimits).nonnegative
 
     def picked(self, value: Value, index: Int[np.ndarray, ...]) -> Value:
         """Entries of a value, by their numbers in the flat vector, as an array of that shape."""
@@ -152,7 +177,7 @@ class Recorder:
             lambda unit, y: factor * y,
             (value.place,),
             again=lambda y: self.scaled(y, factor),
-            linear=is_known(factor),
+            linear=is_constant(factor),
         )
         key = _key("scaled", value.place, factor)
         return self.layer(value.shape, step, key, terms=(Term(value, factor),))
@@ -180,7 +205,7 @@ class Recorder:
             apply,
             (value.place,),
             again=lambda y: self.divided(y, divisor),
-            linear=is_known(divisor),
+            linear=is_constant(divisor),
         )
         key = _key("divided", value.place, divisor)
         return self.layer(value.shape, step, key, terms=(Term(value, 1.0, divisor),))
@@ -206,7 +231,7 @@ class Recorder:
             lambda unit, y: y + by,
             (value.place,),
             again=lambda y: self.shifted(y, by),
-            linear=is_known(by),
+            linear=is_constant(by),
         )
         key = _key("shifted", value.place, by)
         return self.layer(value.shape, step, key, terms=(Term(value),), offset=by)
@@ -233,7 +258,7 @@ class Recorder:
             (value.place,),
             entrywise=False,
             again=lambda y: self.mapped(y, matrix, shape),
-            linear=is_known(matrix),
+            linear=is_constant(matrix),
         )
         return self.layer(shape, step, _key("mapped", value.place, matrix))
 
@@ -295,8 +320,29 @@ class Recorder:
         if self.is_nonnegative(value):
             return value
         found = self.added(self.scaled(self.rectified(value), np.array(2.0)), value, -1)
-        step = Step(_sized, (found.place, value.place), again=lambda _, y: self.absolute(y))
-        return self.layer(value.shape, step, ("sized", *step.parents), terms=(Term(found),))
+        again = lambda _, y: self.absolute(y)  # noqa: E731
+        sized = self.met(found, [value], _size, again, terms=(Term(found),))
+        return self.limited(sized, lambda limits: limits(value).larger(-limits(value)).larger(NONE))
+
+    def met(
+        self, value: Value, others: Sequence[Value], held: Any, again: Any, **facts: Any
+    ) -> Value:
+        """A value whose intervals are met with what those of others say of it.
+
+        Args:
+            value: which one.
+            others: the values that more is known from.
+            held: from intervals of these to one that holds the value.
+            again: how the step is recorded of other values.
+            **facts: of the result.
+        """
+
+        def apply(unit: AtUnit, y: Any, *given: Any) -> Any:
+            known = type(y) is Ball and all(type(each) is Ball for each in given)
+            return y.meeting(held(*given)) if known else y
+
+        step = Step(apply, (value.place, *(each.place for each in others)), again=again)
+        return self.layer(value.shape, step, ("met", held, *step.parents), **facts)
 
     def product(self, one: Value, other: Value) -> Value:
         """`one * other = ((one + other)^2 - (one - other)^2) / 4`, entry by entry."""
@@ -337,7 +383,7 @@ def _key(kind: str, place: int, plain: Any) -> Any:
     """What makes a step the one that it is, by plain numbers; None if these are traced."""
     if not isinstance(plain, np.ndarray):
         return None
-    return kind, place, plain.shape, str(plain.dtype), plain.tobytes()
+    return kind, place, type(plain), plain.shape, str(plain.dtype), plain.tobytes()
 
 
 def _multiplied(unit: AtUnit, more: Any, less: Any, one: Any, other: Any) -> Any:
@@ -355,15 +401,13 @@ def _multiplied(unit: AtUnit, more: Any, less: Any, one: Any, other: Any) -> Any
     return squares.meeting(one.times(other)) if known else squares
 
 
-def _sized(unit: AtUnit, size: Any, y: Any) -> Any:
-    """Sizes `|y|`; of intervals, met with what these know of them."""
-    if isinstance(y, Limits):
-        return y.larger(-y).larger(Limits.of(0.0))
-    if type(size) is not Ball:
-        return size
+def _size(y: Ball) -> Ball:
+    """Sizes `|y|` of intervals."""
     least = larger(larger(y.lower, -y.upper), 0.0)
-    return size.meeting(Ball.between(least, larger(larger(-y.lower, y.upper), least)))
+    return Ball.between(least, larger(larger(-y.lower, y.upper), least))
 
 
 def _flat(plain: Any, value: Value) -> Any:
+    if isinstance(plain, Parameter):
+        return np.broadcast_to(plain, value.shape, subok=True).reshape(-1)
     return namespace(plain).broadcast_to(plain, value.shape).reshape(-1)

@@ -7,20 +7,24 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reachjax.loops.limits import Limits
+from reachjax.loops.limits import ConstantLimits, Limits
 from reachjax.loops.primitives.equations import Equation, Rule, entrywise
 from reachjax.loops.primitives.powers import by
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import Asin, Atan, Cos, Origin, Reciprocal, Sin, Sqrt
 from reachjax.loops.values import Operand, UnsupportedError, Value, is_known
+from reachjax.numerics.rounding import Ball, gamma, larger, namespace
 
 CUT = Origin(
     "arctan2(y, x)",
-    "comes too near to y = 0 with x <= 0, where angles jump by 2 pi,",
-    "keep (x, y) away from there, or turn the axes: arctan2(x, -y) is the angle from the axis "
-    "of y, which jumps where y <= 0",
+    "comes too near to y = 0 with x <= 0, where angles jump by 2 pi: x + sqrt(x^2 + y^2) is in",
+    "keep (x, y) away from there, or turn the axes: jnp.pi / 2 + jnp.arctan2(-x, y) is the same "
+    "angle, and jumps where x = 0 and y <= 0 instead",
 )
 """What is wrong where an angle has no bounds."""
+
+SMALL = 2.0**-500
+"""What squares and roots may lose of lengths whose squares vanish in 64 bits."""
 
 ROUNDING = 2.0**-53
 """How far the float `math.pi / 2` is from the number, at most."""
@@ -54,9 +58,7 @@ def _angle(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) 
     for each in operands:
         if not isinstance(each, Value) and not is_known(each):
             raise UnsupportedError("its operands must be known, or depend on inputs")
-    limits = [
-        recorder.limits(each) if isinstance(each, Value) else Limits.of(each) for each in operands
-    ]
+    limits = [recorder.limits(each, ConstantLimits) for each in operands]
     if np.all(limits[1].least > 0):
         return recorder.unit(Atan(), _quotient(recorder, y, x))
     if np.all(limits[0].least > 0) or np.all(limits[0].most < 0):
@@ -77,9 +79,25 @@ def _angle(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) 
     ]
     distance = recorder.unit(Sqrt(), recorder.added(squares[0], squares[1]))
     divisor = recorder.added(distance, x)
-    recorder.limited(divisor, Limits(np.zeros(divisor.size), np.full(divisor.size, np.inf)))
+    if isinstance(x, Value):
+        again = lambda divisor, *_: divisor  # noqa: E731
+        divisor = recorder.met(divisor, [y, x], _beyond, again)
+    recorder.limited(divisor, lambda _: Limits(np.zeros(1), np.full(1, np.inf)))
     half = recorder.product(y, recorder.unit(Reciprocal(origin=CUT), divisor))
     return recorder.scaled(recorder.unit(Atan(), half), np.array(2.0))
+
+
+def _beyond(y: Ball, x: Ball) -> Ball:
+    """`x + sqrt(x^2 + y^2) = y^2 / (sqrt(x^2 + y^2) - x)`, which grows with `x` and with `|y|`."""
+    xp = namespace(y.mid)
+    near, far = larger(larger(y.lower, -y.upper), 0.0), larger(-y.lower, y.upper)
+    ends = []
+    for a, b, sign in ((x.lower, near, -1), (x.upper, far, 1)):
+        distance = xp.sqrt(a * a + b * b)
+        behind = (a < 0) & (distance > 0)
+        found = xp.where(behind, b * b / xp.where(behind, distance - a, 1.0), a + distance)
+        ends.append(larger(found * (1 + sign * gamma(8)) + sign * SMALL, 0.0))
+    return Ball.between(*ends)
 
 
 def _quotient(recorder: Recorder, one: Operand, other: Operand) -> Value:

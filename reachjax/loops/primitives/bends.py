@@ -8,7 +8,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.limits import Limits
 from reachjax.loops.primitives.equations import (
     JUMPS,
     Equation,
@@ -54,17 +53,12 @@ def _larger(recorder: Recorder, one: Value, other: Operand) -> Value:
     if _is_plain(other) and not np.any(other):
         return recorder.rectified(one)
     found = recorder.added(recorder.rectified(recorder.added(one, other, -1)), other)
-    return recorder.limited(found, recorder.limits(one).larger(_limits(recorder, other)))
+    return recorder.limited(found, lambda limits: limits(one).larger(limits(other)))
 
 
 def _smaller(recorder: Recorder, one: Value, other: Operand) -> Value:
     found = recorder.added(one, recorder.rectified(recorder.added(one, other, -1)), -1)
-    return recorder.limited(found, recorder.limits(one).smaller(_limits(recorder, other)))
-
-
-def _limits(recorder: Recorder, operand: Operand) -> Limits:
-    """Those of a value, or of plain numbers."""
-    return recorder.limits(operand) if isinstance(operand, Value) else Limits.of(operand)
+    return recorder.limited(found, lambda limits: limits(one).smaller(limits(other)))
 
 
 def largest(recorder: Recorder, one: Operand, other: Operand) -> Operand:

@@ -141,8 +141,8 @@ def _inverse_cosine(recorder: Recorder, equation: Equation, operands: Sequence[O
 def _inverse_tangent(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
     """`artanh y = (log(1 + y) - log(1 - y)) / 2`."""
     one = np.ones(operands[0].shape)
-    parts = (recorder.unit(Log(), recorder.added(one, operands[0], sign)) for sign in (1, -1))
-    return recorder.scaled(recorder.added(*parts, -1), np.array(0.5))
+    more, less = (recorder.unit(Log(), recorder.added(one, operands[0], sign)) for sign in (1, -1))
+    return recorder.scaled(recorder.added(more, less, -1), np.array(0.5))
 
 
 def multiplied(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -37,7 +38,7 @@ class Square(SmoothUnit):
         """`2 y = s` at `s / 2`."""
         return (slope / 2,)
 
-    def limits(self, least: Array, most: Array) -> tuple[Array, Array]:
+    def limits(self, least: Any, most: Any) -> tuple[Any, Any]:
         """Squares of the nearest and of the farthest number."""
         near, far = nearest(least, most), farthest(least, most)
         return near * near * (1 - gamma(1)), far * far * (1 + gamma(1)) + TINY
@@ -128,7 +129,7 @@ class Reciprocal(SmoothUnit):
         """Where all inputs are positive, or all are negative."""
         return (nearest(lower, upper) >= TINY) & super().defined(lower, upper)
 
-    def limits(self, least: Array, most: Array) -> tuple[Array, Array]:
+    def limits(self, least: Any, most: Any) -> tuple[Any, Any]:
         """Inverses of the ends, where all inputs are positive, or all are negative."""
         right, left = (least >= 0) & (most > 0), (most <= 0) & (least < 0)
         low = np.where(right | (left & (most < 0)), 1 / most, -math.inf)

@@ -69,7 +69,7 @@ class Origin(NamedTuple):
 
     Attributes:
         name: of the function.
-        trouble: what its inputs must have met if the unit has no bounds.
+        trouble: what is in a range on which the unit has no bounds: a verb, and up to the range.
         advice: how to avoid that.
     """
 
@@ -96,9 +96,11 @@ class UnboundedError(ValueError):
         advice += ", or take smaller cells of X0 (reach_partitioned, or decide(..., cells=...))"
         if max(-lower, upper) > ENDLESS:
             advice = "states, or their bounds, grow without end: see whether the loop is stable"
-        where = f"inputs in [{lower:g}, {upper:g}]"
-        trouble = f"{trouble} ({where} of its divisor)" if trouble else f"has {where}, on which it"
-        super().__init__(f"{name}{line} at t = {t} {trouble} has no bounds: {advice}")
+        trouble = trouble or "has inputs in"
+        super().__init__(
+            f"{name}{line} at t = {t} {trouble} [{lower:g}, {upper:g}], on which it has no "
+            f"bounds: {advice}"
+        )
         self.given = unit, t, lower, upper
 
 
@@ -136,11 +138,12 @@ class SmoothUnit(AbstractUnit):
             lower, upper = smaller(lower, self.most), smaller(upper, self.most)
         return lower, upper
 
-    def limits(self, least: Array, most: Array) -> tuple[Array, Array]:
+    def limits(self, least: Any, most: Any) -> tuple[Any, Any]:
         """Bounds of the value for inputs in `[least, most]`, one end or both of which may be
         infinite.
         """
-        low, high = (np.where(np.isfinite(end), end, 1.0) for end in (least, most))
+        ends: Any = [np.where(np.isfinite(end), end, 1.0) for end in (least, most)]
+        low, high = ends
         if self.rises:
             first, last = self.interval(low, low)[0], self.interval(high, high)[1]
         else:

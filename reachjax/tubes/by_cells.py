@@ -178,7 +178,7 @@ class _Search:
             )
         budget = (
             MULTIPLICATIONS / _work(self._loop, len(directions))
-            if np.isinf(setting.deadline)
+            if not setting.budget.timed
             else np.inf
         )
         self._left = min(2 * most - 2, budget)
@@ -208,7 +208,7 @@ class _Search:
             if count % LOOKED == 0:
                 simulations.include(*(self.farthest(k) for k in range(len(self.bounds))))
                 least, most = self._simulated()
-            if self._left < 2 or self._setting.late:
+            if self._left < 2 or self._setting.budget.late:
                 return
             excess, half = self.bounds - most, np.fmax((most - least) / 2, floor)
             open_parts = np.divide(excess, half, out=np.zeros_like(excess), where=excess > 0)

@@ -8,7 +8,6 @@ nothing is kept but its box and its margins.
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor
@@ -20,6 +19,7 @@ import jax
 import numpy as np
 
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import described, whole_number, wrapped
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, Box
@@ -67,7 +67,7 @@ def decided_by_cells(
     begun: Sequence[Cell],
     most: int | None,
     simulations: Simulations | None,
-    deadline: float,
+    budget: Budget,
     executor: Executor | None = None,
     progress: Callable[[Iterable[Any]], Iterable[Any]] | None = None,
 ) -> Verdict:
@@ -79,11 +79,11 @@ def decided_by_cells(
         begun: the cells to begin with.
         most: how many cells there may be; None: as many as it takes.
         simulations: trajectories from the set.
-        deadline: when to stop, as `time.monotonic` says it.
+        budget: of the call.
         executor: runs the cells; None: here.
         progress: wraps the iteration over cells.
     """
-    run = _Run(task, X0, most, deadline)
+    run = _Run(task, X0, most, budget)
     if simulations is not None:
         run.seen(simulations.runs)
     if run.example is None:
@@ -101,8 +101,8 @@ class _Run:
         example: a counterexample, once one is found.
     """
 
-    def __init__(self, task: CellTask, X0: AbstractSet, most: int | None, deadline: float):
-        self._task, self._X0, self._most, self._deadline = task, X0, most, deadline
+    def __init__(self, task: CellTask, X0: AbstractSet, most: int | None, budget: Budget):
+        self._task, self._X0, self._most, self._budget = task, X0, most, budget
         self._loop = jax.device_put(task.loop)
         self._scenarios = Scenarios.of(self._loop, X0, task.horizon, task.start)
         self._done: list[DecidedCell] = []
@@ -134,7 +134,7 @@ class _Run:
         try:
             while open_cells or left_over or jobs:
                 while (open_cells or left_over) and len(jobs) < jobs.most:
-                    if not left_over and len(open_cells) >= TOGETHER and not self._late:
+                    if not left_over and len(open_cells) >= TOGETHER and not self._budget.late:
                         some = [open_cells.popleft() for _ in range(TOGETHER)]
                         left_over.extend(self._sifted(some))
                         yield len(self._done)
@@ -146,7 +146,7 @@ class _Run:
                         open_cells.extend(self._halved(cell, axis))
                         continue
                     part = jax.device_get(cell.part)
-                    jobs.submit(cell, outcome_of, self._task, part, self._deadline, known)
+                    jobs.submit(cell, outcome_of, self._task, part, self._budget, known)
                 for cell, outcome in jobs.finished():
                     open_cells.extend(self._judged(cell, outcome))
                     yield len(self._done)
@@ -187,13 +187,9 @@ class _Run:
             return []
         return self._halved(cell, outcome.axis)
 
-    @property
-    def _late(self) -> bool:
-        return time.monotonic() >= self._deadline
-
     def _may_halve(self, cell: Cell, axis: int) -> bool:
         full = self._most is not None and self._count >= self._most
-        return not (self._late or full) and float(cell.box.widths[axis]) > 0
+        return not (self._budget.late or full) and float(cell.box.widths[axis]) > 0
 
     def _halved(self, cell: Cell, axis: int) -> list[Cell]:
         found = halves_along(self._X0, cell.box, axis)

@@ -17,6 +17,7 @@ import numpy as np
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     owned,
     require_bar,
@@ -37,7 +38,6 @@ from reachjax.tubes.cell_tasks import CellTask
 from reachjax.tubes.ladder import WORK, Climbed, Ladder
 from reachjax.tubes.propagation import (
     Progress,
-    deadline_of,
     known_numbers,
     require_kinds,
     simulations_from,
@@ -132,7 +132,7 @@ def decide(
     loop.check_horizon(horizon, start)
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
-    deadline, (loop, X0) = deadline_of(time_limit), known_numbers("decide", loop, X0, "X0")
+    budget, (loop, X0) = Budget.of(time_limit), known_numbers("decide", loop, X0, "X0")
     required = requirements(loop.states, horizon, goal, avoid, safe)
     simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     if cells is not None:
@@ -140,15 +140,15 @@ def decide(
         require_executor(executor)
         require_bar(progress)
         task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
-        return decided_by_cells(task, X0, counts, most, simulations, deadline, executor, progress)
-    decision = _Decision(loop, X0, horizon, start, required, simulations)
+        return decided_by_cells(task, X0, counts, most, simulations, budget, executor, progress)
+    decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
     decision.at_first()
     on_host, begun, around = jax.device_get((loop, X0, boxed(X0, "X0")))
     for nodes in dict.fromkeys((min(FIRST_PROGRAMS, relaxation.nodes), relaxation.nodes)):
         if not decision.ended:
-            work = WORK if time_limit is None else np.inf
             scenarios = Scenarios.of(on_host, begun, horizon, start)
-            ladder = Ladder(on_host, begun, around, scenarios, start, nodes, deadline, work)
+            own = budget.with_work(np.inf if budget.timed else WORK)
+            ladder = Ladder(on_host, begun, around, scenarios, start, nodes, own)
             decision.climb(ladder, tighten=nodes > FIRST_PROGRAMS)
     return decision.verdict()
 
@@ -163,6 +163,7 @@ class _Decision:
         start: the time of the initial set.
         required: the requirements.
         simulations: trajectories from the set; None if it is too thin for any.
+        budget: of the call.
     """
 
     def __init__(
@@ -173,8 +174,9 @@ class _Decision:
         start: int,
         required: list[Requirement],
         simulations: Simulations | None,
+        budget: Budget,
     ):
-        self._loop, self._X0, self._start = loop, X0, start
+        self._loop, self._X0, self._start, self._budget = loop, X0, start, budget
         self._horizon, self._on_host = horizon, jax.device_get(loop)
         self._scenarios = Scenarios.of(loop, X0, horizon, start)
         self._middle = self._scenarios.middle(np.asarray(boxed(X0, "X0").center))
@@ -250,7 +252,8 @@ class _Decision:
         """Bound one requirement at the time that the ladder has come to."""
         target, units = target_of(item, ladder, self._simulations, self._middle)
         left = sum(other.time >= item.time for other in self._open.values())
-        climbed = ladder.climbed(target, (left - 1) * len(target.forms), ladder.until(1 / left))
+        share = self._budget.share(1 / left)
+        climbed = ladder.climbed(target, (left - 1) * len(target.forms), share)
         right = climbed.bounds <= 0 if item.inside else climbed.bounds < 0
         margin = float(np.min(-climbed.bounds / units))
         holds = bool(np.all(right))

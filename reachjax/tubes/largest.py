@@ -8,7 +8,6 @@ not said: neither is the problem concave, nor is what a relaxation proves all th
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     require_bar,
     require_double_precision,
@@ -28,7 +28,7 @@ from reachjax.numerics.checks import (
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds
 from reachjax.sets import Box, Ellipsoid, Template
 from reachjax.tubes.decisions import decide
-from reachjax.tubes.propagation import deadline_of, known_numbers
+from reachjax.tubes.propagation import known_numbers
 from reachjax.tubes.reach import reach
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
 from reachjax.tubes.shapes import Kind, Shape
@@ -124,14 +124,18 @@ def largest_set(
     required = requirements(loop.states, horizon, goal, avoid, safe)
 
     def decided(region: Kind) -> Verdict:
-        left = None if np.isinf(deadline) else max(deadline - time.monotonic(), 0.0)
-        limits = {"relaxation": relaxation, "start": start, "samples": 200, "time_limit": left}
+        limits = {
+            "relaxation": relaxation,
+            "start": start,
+            "samples": 200,
+            "time_limit": budget.limit,
+        }
         return decide(loop, region, horizon, goal, safe, avoid, **limits)
 
-    deadline = deadline_of(time_limit)
-    search = _Search(loop, X0, required, horizon, start, decided, deadline)
+    budget = Budget.of(time_limit)
+    search = _Search(loop, X0, required, horizon, start, decided, budget)
     for _ in wrapped(progress, search.tried(rounds)):
-        if time.monotonic() >= deadline:
+        if budget.late:
             break
     if search.best is None:
         raise ValueError(
@@ -156,9 +160,9 @@ class _Search:
         horizon: int,
         start: int,
         decided: Callable[[Kind], Verdict],
-        deadline: float,
+        budget: Budget,
     ):
-        self._decided, self._deadline = decided, deadline
+        self._decided, self._budget = decided, budget
         self._shape = Shape.of(X0)
         self._farthest = FARTHEST * self._shape.lengths
         self._margins = _margins(loop, required, horizon, start)
@@ -236,7 +240,7 @@ class _Search:
         for by in GROWTHS:
             while self._attempt(self._shape.enlarged(by)):
                 yield self._shape.volume()
-                if time.monotonic() >= self._deadline:
+                if self._budget.late:
                     return
             for side in self._shape.sides:
                 while self._attempt(self._shape.extended(side, by)):

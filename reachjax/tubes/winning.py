@@ -10,7 +10,6 @@ outer one.
 from __future__ import annotations
 
 import heapq
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
@@ -23,6 +22,7 @@ from jaxtyping import Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.loops.units import UnboundedError
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     require_bar,
     require_double_precision,
@@ -37,7 +37,7 @@ from reachjax.sets import Box
 from reachjax.tubes.cell_jobs import CellJobs
 from reachjax.tubes.cell_tasks import CellTask, bounded, fails_everywhere
 from reachjax.tubes.ladder import WORK, Ladder
-from reachjax.tubes.propagation import deadline_of, known_numbers
+from reachjax.tubes.propagation import known_numbers
 from reachjax.tubes.requirements import AvoidSets, Region, Timed, requirements
 from reachjax.tubes.seals import seal_of
 from reachjax.tubes.sieve import TOGETHER, Ends, Margins, Sieve, Sifted, no_margins
@@ -170,7 +170,7 @@ def winning_set(
                 "another question arrived: what was proved of that says nothing of this one"
             )
         cells_so_far = list(known.cells)
-    run = _Run(task, domain, cells_so_far, most, deadline_of(time_limit))
+    run = _Run(task, domain, cells_so_far, most, Budget.of(time_limit))
     with closing(run.results(executor)) as results:  # a bar may end before they do
         for _ in wrapped(progress, results):
             pass
@@ -192,9 +192,9 @@ class _Run:
         domain: Box,
         cells: Sequence[DecidedCell],
         most: int,
-        deadline: float,
+        budget: Budget,
     ):
-        self._task, self._most, self._deadline = task, most, deadline
+        self._task, self._most, self._budget = task, most, budget
         self._scale = np.asarray(domain.upper) - np.asarray(domain.lower)
         self._scale = np.where(self._scale > 0, self._scale, 1.0)
         self.done = [cell for cell in cells if cell.status is not VerdictStatus.UNKNOWN]
@@ -228,8 +228,8 @@ class _Run:
         """How many cells are decided, after each batch of some, the largest first."""
         jobs = CellJobs[list[DecidedCell]](executor, AHEAD)
         try:
-            while (cells and not self._late) or jobs:
-                while cells and len(jobs) < jobs.most and not self._late:
+            while (cells and not self._budget.late) or jobs:
+                while cells and len(jobs) < jobs.most and not self._budget.late:
                     batch = [heapq.heappop(cells)[2] for _ in range(min(together, len(cells)))]
                     boxes = [(cell.lower, cell.upper) for cell in batch]
                     jobs.submit(batch, sorted_cells, task, boxes, self._scale)
@@ -239,10 +239,6 @@ class _Run:
                     yield len(self.done)
         finally:
             self.done += [cell for batch in jobs.cancelled() for cell in batch]
-
-    @property
-    def _late(self) -> bool:
-        return time.monotonic() >= self._deadline
 
     def _judged(self, cell: DecidedCell, found: Sorted, last: bool) -> None:
         """Keep a cell, or halve it as long as there may be more, or leave it to programs."""
@@ -365,7 +361,7 @@ def _climbed(
         UnboundedError: a unit has no bounds over it.
     """
     scenarios = Scenarios.of(task.loop, box, task.horizon, task.start)
-    ladder = Ladder(task.loop, box, box, scenarios, task.start, task.nodes, np.inf, WORK)
+    ladder = Ladder(task.loop, box, box, scenarios, task.start, task.nodes, Budget(work=WORK))
     broken = [bool(np.all(row < 0)) for row in rooms]
     middle, proved = scenarios.middle(np.asarray(box.center)), not any(broken)
     for k in range(task.horizon + 1):

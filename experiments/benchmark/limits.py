@@ -91,7 +91,7 @@ def quadrotor() -> Question:
     layers = he_network((12, 32, 4), seed=0)
     layers[-1] = 0.05 * layers[-1][0], 0.0 * layers[-1][1]
     net = rj.MLP.from_layers(layers, activation=rj.Tanh())
-    return _around(rj.ClosedLoop(rj.NonlinearPlant(f, 12, 4), net), 0.1, 5, 0.5)
+    return _around(rj.ClosedLoop(rj.NonlinearPlant(f, 12, 4), net), 0.3, 5, 0.35)
 
 
 def pendulum() -> Question:

@@ -59,23 +59,19 @@ class Unbounded(NamedTuple):
 
     Attributes:
         given: what it was made of.
-        message: what it says.
     """
 
     given: tuple[Any, ...]
-    message: str
 
     @classmethod
     def of(cls, error: UnboundedError) -> Unbounded:
         """That of an error."""
-        return cls(error.given, str(error))
+        return cls((*error.given, error.line))
 
     @property
     def error(self) -> UnboundedError:
         """The error, to be raised."""
-        found = UnboundedError(*self.given)
-        found.args = (self.message,)
-        return found
+        return UnboundedError(*self.given)
 
 
 class Outcome(NamedTuple):

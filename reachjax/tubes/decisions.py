@@ -4,11 +4,12 @@ The directions of the requirements themselves, at the times that they speak of. 
 breaks one is looked for first: among samples, then where each linear program is largest. To be
 inside, the excess over each facet must be below zero; to be outside, the depth in the set must be,
 which is the least room to its facets. Each climbs the ladder of `BranchAndCut`, but for products,
-until it is decided.
+until it is decided. Between its forms and its programs a smooth loop is halved into cells.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from concurrent.futures import Executor
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.loops.units import UnboundedError
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     owned,
@@ -33,6 +35,7 @@ from reachjax.proofs.branches import BranchCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated, Simulations
 from reachjax.sets import AbstractSet
+from reachjax.tubes.by_cells import affordable
 from reachjax.tubes.cell_decisions import decided_by_cells, roots
 from reachjax.tubes.cell_tasks import CellTask
 from reachjax.tubes.ladder import WORK, Climbed, Ladder
@@ -51,6 +54,10 @@ from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
 
 FIRST_PROGRAMS = 50
 """Linear programs that each bound may take at first, while ranges are those of affine forms."""
+
+FOR_CELLS = 0.5
+"""The part of its time that a smooth loop's cells get, by forms; the rest is for programs over the
+whole set, which close what cells do not where much is switched and little is smooth."""
 
 PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
 """How far an initial state is brought towards the middle of the set, so that it surely is in it."""
@@ -95,7 +102,8 @@ def decide(
             begin with. Or a number in all, which begins with the whole set. Cells that stay
             undecided are halved where it matters most, until all are decided or the time is over,
             or there are as many as the number says. None: the whole set is bounded at once, and has
-            certificates.
+            certificates; of a smooth loop of which forms do not prove it, cells of the whole set
+            are tried next, as many as `relaxation` says, before its programs.
         executor: runs the cells: any with the interface of `concurrent.futures`, such as a
             `ProcessPoolExecutor`. None: one after the other, here.
         progress: wraps the iteration over cells to show a progress bar, such as `tqdm.tqdm`.
@@ -144,13 +152,34 @@ def decide(
     decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
     decision.at_first()
     on_host, begun, around = jax.device_get((loop, X0, boxed(X0, "X0")))
-    for nodes in dict.fromkeys((min(FIRST_PROGRAMS, relaxation.nodes), relaxation.nodes)):
+
+    def climb(nodes: int) -> None:
         if not decision.ended:
             scenarios = Scenarios.of(on_host, begun, horizon, start)
             own = budget.with_work(np.inf if budget.timed else WORK)
             ladder = Ladder(on_host, begun, around, scenarios, start, nodes, own)
             decision.climb(ladder, tighten=nodes > FIRST_PROGRAMS)
-    return decision.verdict()
+
+    by_cells, most = None, 1
+    if loop.curved:
+        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / 2))
+    if most > 1:  # half a set costs a form, and what forms leave out of it is an eighth
+        with contextlib.suppress(UnboundedError):  # of halves there may be bounds
+            climb(0)
+        if decision.ended:
+            return decision.verdict()
+        task = CellTask(on_host, horizon, start, tuple(required), nodes=0)
+        share = budget.share(FOR_CELLS if relaxation.nodes else 1.0)
+        by_cells = decided_by_cells(task, X0, roots(X0, most)[0], most, simulations, share)
+        if by_cells.status is not VerdictStatus.UNKNOWN or not relaxation.nodes:
+            return by_cells
+    try:
+        for nodes in dict.fromkeys((min(FIRST_PROGRAMS, relaxation.nodes), relaxation.nodes)):
+            climb(nodes)
+    except UnboundedError:
+        if by_cells is None:
+            raise
+    return decision.verdict() if by_cells is None or decision.ended else by_cells
 
 
 class _Decision:

@@ -65,7 +65,7 @@ LONGEST = 256
 """A side that is so many times as long as another one, in parts of the domain's, is cut first."""
 
 ENOUGH = 8
-"""So many cells are worth a compiled call; fewer are bounded one by one."""
+"""So many cells are worth a call that is compiled; fewer are bounded one by one."""
 
 
 class Sorted(NamedTuple):
@@ -232,7 +232,7 @@ class _Run:
                 while cells and len(jobs) < jobs.most and not self._budget.late:
                     batch = [heapq.heappop(cells)[2] for _ in range(min(together, len(cells)))]
                     boxes = [(cell.lower, cell.upper) for cell in batch]
-                    jobs.submit(batch, sorted_cells, task, boxes, self._scale)
+                    jobs.submit(batch, sorted_cells, task, boxes, self._scale, self._budget)
                 for batch, results in jobs.finished():
                     for cell, found in zip(batch, results, strict=True):
                         self._judged(cell, found, task.by_programs)
@@ -256,7 +256,7 @@ class _Run:
 
 
 def sorted_cells(
-    task: CellTask, boxes: Sequence[Ends], scale: Float[np.ndarray, " n"]
+    task: CellTask, boxes: Sequence[Ends], scale: Float[np.ndarray, " n"], budget: Budget
 ) -> list[Sorted]:
     """What is found of each of some boxes, wherever it runs.
 
@@ -264,6 +264,7 @@ def sorted_cells(
         task: what is decided.
         boxes: of the domain.
         scale: the unit in which each coordinate is measured.
+        budget: of the call; of boxes that it is too late for, trajectories alone are known.
     """
     with jax.enable_x64(True):
         points = [_points(*box) for box in boxes]
@@ -274,9 +275,11 @@ def sorted_cells(
         sifted: dict[int, Sifted] = {}
         if len(alike) >= ENOUGH:
             sieve = Sieve(task.loop, task.horizon, task.start, task.required)
-            sifted = dict(zip(alike, sieve.sifted([boxes[i] for i in alike]), strict=True))
+            some = [boxes[number] for number in alike]
+            if sieve.pays(some, budget):
+                sifted = dict(zip(alike, sieve.sifted(some), strict=True))
         return [
-            _sorted(task, box, scale, part, sifted.get(number))
+            _sorted(task, box, scale, part, sifted.get(number), budget)
             for number, (box, part) in enumerate(zip(boxes, each, strict=True))
         ]
 
@@ -323,10 +326,13 @@ def _sorted(
     scale: Float[np.ndarray, " n"],
     rooms: Float[np.ndarray, "r c"],
     sifted: Sifted | None,
+    budget: Budget,
 ) -> Sorted:
     """What is found of one box, given what trajectories from it do, and forms say of it."""
     least, widths = rooms.min(axis=0), (ends[1] - ends[0]) / scale
     if (least < 0).any() and (least >= 0).any():
+        return Sorted(VerdictStatus.UNKNOWN, np.nan, _axis(least, widths))
+    if sifted is None and budget.late:
         return Sorted(VerdictStatus.UNKNOWN, np.nan, _axis(least, widths))
     if sifted is None:
         sifted = _bounded(task, Box(*ends), rooms)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any, ClassVar, NamedTuple
 
@@ -87,21 +88,43 @@ class UnboundedError(ValueError):
         lower: of the range.
         upper: the same.
         line: where a user wrote it; nothing where that is not known.
+        cells: how small the cells are that were tried; nothing where none were.
     """
 
-    def __init__(self, unit: AbstractUnit, t: int, lower: float, upper: float, line: str = ""):
+    def __init__(
+        self,
+        unit: AbstractUnit,
+        t: int,
+        lower: float,
+        upper: float,
+        line: str = "",
+        cells: str = "",
+    ):
         name, trouble, advice = (isinstance(unit, SmoothUnit) and unit.origin) or Origin(
-            type(unit).__name__, "", getattr(unit, "advice", SmoothUnit.advice)
+            type(unit).__name__, "has inputs in", getattr(unit, "advice", SmoothUnit.advice)
         )
-        advice += ", or take smaller cells of X0 (reach_partitioned, or decide(..., cells=...))"
+        parts = (
+            "a smaller X0, or more time or cells for it"
+            if cells
+            else "smaller cells of X0 (reach_partitioned, or decide(..., cells=...))"
+        )
+        advice = f"{advice}, or take {parts}"
         if max(-lower, upper) > ENDLESS:
-            advice = "states, or their bounds, grow without end: see whether the loop is stable"
-        trouble = trouble or "has inputs in"
+            advice = (
+                "bounds grow without end. Take a shorter step of integration in the plant's "
+                f"function, or {parts}; and see whether the loop is stable"
+            )
         super().__init__(
             f"{name}{line} at t = {t} {trouble} [{lower:g}, {upper:g}], on which it has no "
-            f"bounds: {advice}"
+            f"bounds{cells}: {advice}"
         )
-        self.given = unit, t, lower, upper
+        self.given, self.line = (unit, t, lower, upper), line
+
+    def after(self, cells: int, widths: Sequence[float]) -> UnboundedError:
+        """The error where it is of one of so many cells, of these widths."""
+        sides = ", ".join(f"{width:.3g}" for width in widths)
+        tried = f", even over one of {cells} cells, with sides of {sides}"
+        return UnboundedError(*self.given, line=self.line, cells=tried)
 
 
 @dataclasses.dataclass(frozen=True)

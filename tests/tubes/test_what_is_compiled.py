@@ -58,3 +58,13 @@ def test_nothing_large_is_compiled_for_a_counterexample(operations):
     found = rj.decide(cart_pole(), X0, 5, safe=safe)
     assert found.status is rj.VerdictStatus.REFUTED
     assert 0 < max(operations) < SMALL
+
+
+@pytest.mark.parametrize("call", ["decide", "winning_set"])
+def test_nothing_large_is_compiled_for_cells_under_a_limit(operations, call):
+    X0, safe = boxes(0.1, 0.5)  # 64 cells are enough for a compiled call
+    if call == "decide":
+        rj.decide(cart_pole(), X0, 5, safe=safe, cells=[4, 2, 4, 2], time_limit=3.0)
+    else:
+        rj.winning_set(cart_pole(), X0, 5, safe=safe, cells=64, time_limit=3.0)
+    assert 0 < max(operations) < SMALL

@@ -9,15 +9,19 @@ Turn on 64-bit floats before building networks and sets::
 """
 
 from reachjax.loops import (
+    ISRU,
     MLP,
     AbstractActivation,
     AbstractNetwork,
     AbstractPlant,
     AbstractUnit,
     AffinePlant,
+    Asin,
+    Asinh,
     Atan,
     ClosedLoop,
     Cos,
+    Erf,
     Exp,
     HardTanh,
     LeakyReLU,
@@ -32,6 +36,7 @@ from reachjax.loops import (
     Sqrt,
     Square,
     Tanh,
+    XLogX,
     runge_kutta,
     zero_order_hold,
 )
@@ -111,6 +116,7 @@ def __dir__() -> list[str]:
 
 
 __all__ = [
+    "ISRU",
     "MLP",
     "SCS",
     "AbstractActivation",
@@ -125,6 +131,8 @@ __all__ = [
     "AbstractUnit",
     "AffinePlant",
     "AllProducts",
+    "Asin",
+    "Asinh",
     "Atan",
     "Auto",
     "Box",
@@ -143,6 +151,7 @@ __all__ = [
     "Ellipsoid",
     "EllipsoidCertificate",
     "EllipsoidTemplate",
+    "Erf",
     "Exp",
     "HardTanh",
     "InteriorPoint",
@@ -180,6 +189,7 @@ __all__ = [
     "Verdict",
     "VerdictStatus",
     "WinningSet",
+    "XLogX",
     "change_of_basis",
     "decide",
     "failures",

@@ -9,15 +9,19 @@ Turn on 64-bit floats before building networks and sets::
 """
 
 from reachjax.loops import (
+    ISRU,
     MLP,
     AbstractActivation,
     AbstractNetwork,
     AbstractPlant,
     AbstractUnit,
     AffinePlant,
+    Asin,
+    Asinh,
     Atan,
     ClosedLoop,
     Cos,
+    Erf,
     Exp,
     HardTanh,
     LeakyReLU,
@@ -32,6 +36,7 @@ from reachjax.loops import (
     Sqrt,
     Square,
     Tanh,
+    XLogX,
     runge_kutta,
     zero_order_hold,
 )
@@ -112,6 +117,7 @@ def __dir__() -> list[str]:
 
 
 __all__ = [
+    "ISRU",
     "MLP",
     "SCS",
     "AbstractActivation",
@@ -126,6 +132,8 @@ __all__ = [
     "AbstractUnit",
     "AffinePlant",
     "AllProducts",
+    "Asin",
+    "Asinh",
     "Atan",
     "Auto",
     "Box",
@@ -144,6 +152,7 @@ __all__ = [
     "Ellipsoid",
     "EllipsoidCertificate",
     "EllipsoidTemplate",
+    "Erf",
     "Exp",
     "HardTanh",
     "InteriorPoint",
@@ -181,6 +190,7 @@ __all__ = [
     "Verdict",
     "VerdictStatus",
     "WinningSet",
+    "XLogX",
     "change_of_basis",
     "decide",
     "failures",

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.numerics.budget import Budget
@@ -26,12 +25,13 @@ from reachjax.numerics.checks import (
     whole_number,
     wrapped,
 )
-from reachjax.programs.relaxations import BranchAndCut, LinearBounds
-from reachjax.sets import Box, Ellipsoid, Template
+from reachjax.numerics.host import in_numpy
+from reachjax.programs.relaxations import BranchAndCut
+from reachjax.programs.unrolled import unrolled
+from reachjax.sets import Box, Ellipsoid
 from reachjax.tubes.decisions import decide
 from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.propagation import known_numbers
-from reachjax.tubes.reach import reach
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
 from reachjax.tubes.shapes import Kind, Shape
 from reachjax.tubes.verdicts import Verdict, VerdictStatus
@@ -207,7 +207,7 @@ class _Search:
 
     def _too_long(self, shape: Shape) -> bool:
         """Whether a side is longer than any shall be."""
-        return bool(jnp.any(shape.lengths > self._farthest))
+        return bool(np.any(shape.lengths > self._farthest))
 
     def _shrunk(self) -> Iterator[float]:
         for _ in range(SMALLEST):
@@ -219,16 +219,14 @@ class _Search:
 
     def _climbed(self, rounds: int) -> Iterator[float]:
         """Climb along the gradient of affine forms, whose margins stay positive."""
-        shape, weight, length = self._shape, BARRIER, LONGEST
+        shape, weight, length, budget = self._shape, BARRIER, LONGEST, self._budget.share(1 / 2)
 
-        @jax.jit
-        def value(shape: Shape, weight: Array) -> Array:
-            margins = self._margins(shape)
-            inside = jnp.all(margins > 0)
-            logs = jnp.log(jnp.where(margins > 0, margins, 1.0))
-            return jnp.where(inside, shape.log_volume() + weight * logs.sum(), -jnp.inf)
+        def value(shape: Shape, weight: float) -> float:
+            margins = np.full(1, -np.inf) if budget.late else self._margins(shape)
+            if not np.all(margins > 0):
+                return -np.inf
+            return shape.log_volume() + weight * float(np.log(margins).sum())
 
-        slope = jax.jit(jax.grad(value))
         for _ in range(SMALLEST):
             if np.isfinite(value(shape, weight)):
                 break
@@ -236,7 +234,10 @@ class _Search:
         else:
             return
         for _ in range(rounds):
-            here, along = value(shape, weight), slope(shape, weight).preconditioned(shape)
+            here = value(shape, weight)
+            along = shape.uphill(partial(value, weight=weight), here)
+            if budget.late:
+                break
             while length > SHORTEST:
                 other = shape.moved(along, length)
                 better = value(other, weight) > here  # not if it is no number
@@ -265,17 +266,20 @@ class _Search:
 
 def _margins(
     loop: ClosedLoop, required: list[Requirement], horizon: int, start: int
-) -> Callable[[Shape], Float[Array, " r"]]:
+) -> Callable[[Shape], Float[np.ndarray, " r"]]:
     """The margins of all requirements by affine forms, as a function of a shape."""
     facets = [[np.asarray(part) for part in item.region.facets_in_units()] for item in required]
     rows = [C / norms[:, None] for C, _, norms in facets] + [np.eye(loop.states)]
     directions = np.unique(np.concatenate([*rows, *(-each for each in rows)]), axis=0)
-    template, every = Template(directions), jnp.asarray(directions)
+    on_host, rows_of = in_numpy(loop), np.tile(directions, (horizon, 1, 1))
 
-    def margins(shape: Shape) -> Float[Array, " r"]:
-        tube = reach(loop, shape.set(), horizon, template, LinearBounds(), start=start)
-        later = (X.bounds_along(every) for X in tube.sets[1:])
-        offsets = [shape.support(every), *later]
+    def margins(shape: Shape) -> Float[np.ndarray, " r"]:
+        try:
+            region = in_numpy(shape.set())
+            steps = unrolled(on_host, region, in_numpy(region.bounding_box()), rows_of, start)
+            offsets = [shape.support(directions), *(step.offsets for step in steps)]
+        except ValueError:  # a unit has no bounds, or there is no set
+            return np.full(1, -np.inf)
         found = []
         for item, (C, d, norms) in zip(required, facets, strict=True):
             rows, limits = C / norms[:, None], d / norms
@@ -283,8 +287,8 @@ def _margins(
                 found.append(limits - offsets[item.time][_places(directions, rows)])
             else:
                 room = -offsets[item.time][_places(directions, -rows)] - limits
-                found.append(jnp.max(room)[None])
-        return jnp.concatenate(found)
+                found.append(np.max(room, keepdims=True))
+        return np.concatenate(found)
 
     return margins
 

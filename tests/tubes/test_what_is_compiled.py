@@ -68,3 +68,10 @@ def test_nothing_large_is_compiled_for_cells_under_a_limit(operations, call):
     else:
         rj.winning_set(cart_pole(), X0, 5, safe=safe, cells=64, time_limit=3.0)
     assert 0 < max(operations) < SMALL
+
+
+def test_nothing_large_is_compiled_for_the_largest_set(operations):
+    X0, safe = boxes(0.01, 0.05)
+    found = rj.largest_set(cart_pole(), X0, 2, safe=safe, rounds=2, time_limit=5.0)
+    assert found.region.volume() > X0.volume()
+    assert 0 < max(operations) < SMALL

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.loops.draws import drawn
+from reachjax.loops.functions import Compiled
 from reachjax.loops.input_polytope import InputPolytope, input_set
 from reachjax.loops.networks import AbstractNetwork
 from reachjax.loops.plants import AbstractPlant
@@ -181,14 +182,12 @@ class ClosedLoop(Replaceable):
     @property
     def unit_layers(self) -> tuple[UnitLayer, ...]:
         """The layers of units in the order of the forward pass, the projection's last."""
-        leaves, structure = jax.tree.flatten(self)
-        return _recorded(structure, tuple(jnp.shape(leaf) for leaf in leaves))
+        return _recorded(*_shaped(self))
 
     @property
     def controller_layers(self) -> tuple[UnitLayer, ...]:
         """Those of them that are the controller's, after those of noise."""
-        leaves, structure = jax.tree.flatten(self.controller)
-        return _recorded(structure, tuple(jnp.shape(leaf) for leaf in leaves))
+        return _recorded(*_shaped(self.controller))
 
     @property
     def smooth_controller(self) -> bool:
@@ -367,13 +366,20 @@ def split(scenarios: Any, n_x: int, n_w: int, n_v: int) -> Scenario:
     return Scenario(states, w if n_w else None, v if n_v else None)
 
 
+def _shaped(tree: Any) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
+    """The structure of a tree, and the shapes and kinds of its leaves."""
+    leaves, structure = jax.tree.flatten(tree)
+    kinds = ((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    return structure, tuple(jax.ShapeDtypeStruct(*each) for each in kinds)
+
+
 @lru_cache(maxsize=256)
-def _recorded(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[UnitLayer, ...]:
+def _recorded(structure: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> tuple[UnitLayer, ...]:
     """The layers of units that the forward pass of a loop or a network of this structure meets.
 
     Args:
         structure: of the loop as a tree.
-        shapes: of its leaves.
+        leaves: their shapes and kinds.
     """
     layers = []
 
@@ -384,7 +390,6 @@ def _recorded(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Unit
     def passed(tree: Any, x: Array) -> Array:
         return tree.step(x, 0, record) if loops else tree.propagate(x, record)
 
-    leaves = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
     tree = jax.tree.unflatten(structure, leaves)
     loops = isinstance(tree, ClosedLoop)
     state = jax.ShapeDtypeStruct((tree.states if loops else tree.inputs,), float)
@@ -392,7 +397,7 @@ def _recorded(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Unit
     return tuple(layers)
 
 
-@partial(jax.jit, static_argnames="horizon")
+@partial(Compiled, static_argnames="horizon")
 def _simulate(
     loop: ClosedLoop, x0: Array, w: Array | None, v: Array | None, horizon: int, start: int
 ) -> Array:

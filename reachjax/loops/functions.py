@@ -8,6 +8,7 @@ layers of units, that any kind of number can be run through.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -15,13 +16,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.interpreter import require_traced, walked
+from reachjax.loops.interpreter import Constants
+from reachjax.loops.readings import ConstantPart, Evaluation, Number, Recording, require_traced
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import Sizes, Trace
 from reachjax.loops.units import AtUnit, evaluate
 from reachjax.loops.values import Comparison, Operand, Parameter, UnsupportedError, Value
 from reachjax.numerics.checks import described, is_concrete
-from reachjax.numerics.pytrees import pytree, static
+from reachjax.numerics.pytrees import pytree, static, unchecked
 
 
 class Structure(NamedTuple):
@@ -45,10 +47,12 @@ class Function:
     Attributes:
         parameters: its arrays.
         structure: all else.
+        constants: what is computed of parameters alone and rounded; None: that is still to be done.
     """
 
     parameters: tuple[Any, ...]
     structure: Structure = static()
+    constants: tuple[Any, ...] | None = None
 
     @classmethod
     def of(cls, function: Callable, inputs: Sizes, outputs: int, name: str) -> Function:
@@ -136,7 +140,38 @@ class Function:
 
     def __call__(self, *inputs: Any) -> Any:
         """The value, for arrays of JAX."""
-        return self.structure.trace(self.parameters, *inputs)
+        trace = self.structure.trace
+        vectors = [jnp.asarray(each, float) for each in inputs]
+        if not trace.rounds_constants:
+            return trace(self.parameters, *vectors)
+        given = [*self._given(), *map(Number, vectors)]
+        (found,) = Evaluation(Constants(self.constants)).walk(trace.closed, given)
+        return found.array if isinstance(found, Number) else jnp.asarray(found)
+
+    def with_constants(self) -> Function:
+        """The function with all that is computed of parameters alone; of numbers it is kept."""
+        trace = self.structure.trace
+        if self.constants is not None or not trace.rounds_constants:
+            return self
+        kept = self.__dict__.get("_evaluated")
+        if kept is not None:
+            return kept
+        constants = Constants()
+        nothing = [None] * len(self.structure.inputs)
+        ConstantPart(constants).walk(trace.closed, [*self._given(), *nothing])
+        found = unchecked(
+            Function,
+            parameters=self.parameters,
+            structure=self.structure,
+            constants=tuple(constants.computed),
+        )
+        if is_concrete(found):
+            object.__setattr__(self, "_evaluated", found)
+        return found
+
+    def _given(self) -> list[Any]:
+        """The parameters, as operands."""
+        return [*map(Parameter.of, self.parameters)]
 
     def stored(self) -> tuple[Callable, Sizes, int]:
         """The function with its parameters, and its sizes: what a file needs."""
@@ -160,7 +195,8 @@ class Function:
 
     def _steps(self) -> tuple[Recorder, Operand]:
         """The steps; of numpy arrays they are kept."""
-        if not all(isinstance(each, np.ndarray) for each in self.parameters):
+        given = *self.parameters, *(self.constants or ())
+        if not all(isinstance(each, np.ndarray) for each in given):
             return self._recorded()[1]
         kept = self.__dict__.get("_kept")
         if kept is None:
@@ -174,14 +210,53 @@ class Function:
         recorder = Recorder([(size,) for size in sizes])
         try:
             require_traced(closed)
-            given = [*map(Parameter.of, self.parameters), *recorder.inputs]
-            (wanted,) = walked(recorder, closed, given)
+            reading = Recording(Constants(self.constants), recorder)
+            (wanted,) = reading.walk(closed, [*self._given(), *recorder.inputs])
         except UnsupportedError as error:
             raise TypeError(
                 f"the primitive {error.primitive!r}{error.line} cannot be certified: {error}"
             ) from None
         assert not isinstance(wanted, Comparison)  # its result is a number
         return self.parameters, (recorder, wanted)
+
+
+def with_constants(tree: Any) -> Any:
+    """A tree in which functions have computed what depends on their parameters alone.
+
+    So it is not done again, and rounded otherwise, in what is compiled.
+    """
+
+    def is_function(node: Any) -> bool:
+        return isinstance(node, Function)
+
+    leaves, structure = jax.tree.flatten(tree, is_leaf=is_function)
+    found = [each.with_constants() if is_function(each) else each for each in leaves]
+    same = all(one is other for one, other in zip(leaves, found, strict=True))
+    return tree if same else jax.tree.unflatten(structure, found)
+
+
+class Compiled:
+    """A function that JAX compiles, of loops whose constants are computed before.
+
+    Args:
+        function: which one.
+        **options: of `jax.jit`.
+    """
+
+    def __init__(self, function: Callable[..., Any], **options: Any):
+        self._jitted = jax.jit(function, **options)
+        functools.update_wrapper(self, function)
+
+    def __call__(self, *given: Any, **static: Any) -> Any:
+        """The value."""
+        return self._jitted(*with_constants(given), **with_constants(static))
+
+    def lower(self, *given: Any, **static: Any) -> Any:
+        """What is compiled for such arguments."""
+        return self._jitted.lower(*with_constants(given), **with_constants(static))
+
+    def _cache_size(self) -> int:
+        return self._jitted._cache_size()  # type: ignore[attr-defined]
 
 
 def _require_bound(function: Any, name: str) -> None:

@@ -1,9 +1,15 @@
-"""A jaxpr as steps of a recording: calls, loops and branches are followed, one by one."""
+"""A jaxpr, equation by equation: calls, loops and branches are followed where they need to be.
+
+What depends on constants and parameters alone is computed here and nowhere else, in one order, by
+everybody who follows a jaxpr: so a function that is simulated has the same numbers in it as one
+that is certified, however XLA would have rounded them.
+"""
 
 from __future__ import annotations
 
+import abc
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -13,91 +19,198 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from reachjax.loops.primitives import Equation, recorded
-from reachjax.loops.recording import Recorder
-from reachjax.loops.traces import equations
-from reachjax.loops.values import Comparison, Operand, Parameter, UnsupportedError, Value, is_known
-
-CALLS = (
-    "jit",
-    "pjit",
-    "closed_call",
-    "core_call",
-    "core_closed_call",
-    "checkpoint",
-    "remat",
-    "remat2",
-    "custom_jvp_call",
-    "custom_vjp_call",
-    "custom_vjp_call_jaxpr",
-)
-"""Primitives that only call a jaxpr."""
-
-BODIES = {"jaxpr", "call_jaxpr", "fun_jaxpr"}
-"""Under one of these names it is among their parameters."""
-
-PRINTS = ("debug_callback", "debug_print")
-"""Primitives without a value."""
-
-DRAWS = ("random_", "rng_", "threefry")
-"""How names of primitives begin that draw numbers."""
-
-CALLBACKS = ("pure_callback", "io_callback")
-"""Primitives that call Python, where nothing can be traced."""
+from reachjax.loops.dependence import CALLS, OWN_SLOPES, body_of, rounds, rounds_within
+from reachjax.loops.values import Operand, Parameter, UnsupportedError, is_known
 
 TURNS = 1000
 """A loop that takes more turns than this is taken to be endless."""
 
 
-def require_traced(jaxpr: Any) -> None:
-    """Raise an error for what cannot be known of any number.
+class Constants:
+    """The numbers of a function that depend on its parameters alone and are rounded, in order.
 
-    Raises:
-        UnsupportedError: it draws random numbers, or calls back to Python.
+    Args:
+        known: all of them, to be taken one after the other; None: they are computed.
+
+    Attributes:
+        computed: those so far that were.
     """
-    for equation in equations(jaxpr):
-        name, why = equation.primitive.name, ""
-        if name.startswith(DRAWS):
-            why = (
-                "it draws random numbers: what is random is a disturbance or a noise of the loop; "
-                "put modules into evaluation mode"
+
+    def __init__(self, known: Sequence[Any] | None = None):
+        self.computed: list[Any] = []
+        self._known: Iterator[Any] | None = None if known is None else iter(known)
+
+    def of(self, equation: Any, operands: Sequence[Any]) -> list[Any]:
+        """The results of an equation whose operands are plain."""
+        own = any(isinstance(each, Parameter) or not is_known(each) for each in operands)
+        if not own or not rounds(equation):
+            return _evaluated(equation, operands)
+        if self._known is not None:
+            return [Parameter.of(next(self._known)) for _ in equation.outvars]
+        found = _evaluated(equation, operands)
+        self.computed += found
+        return found
+
+
+class Interpreter(abc.ABC):
+    """A way to read a jaxpr.
+
+    Args:
+        constants: its numbers that depend on parameters alone.
+
+    Attributes:
+        follows_all: whether it reads jaxprs within equations also where these may stay as they are,
+            since nothing is rounded in them that depends on no input.
+        has_effects: whether equations that no result depends on are evaluated, such as prints.
+    """
+
+    follows_all = False
+    has_effects = False
+
+    def __init__(self, constants: Constants):
+        self._constants = constants
+
+    @abc.abstractmethod
+    def is_plain(self, operand: Operand) -> bool:
+        """Whether an operand depends on no input."""
+
+    @abc.abstractmethod
+    def apply(self, equation: Any, operands: Sequence[Operand]) -> list[Operand]:
+        """What an equation makes of operands some of which depend on inputs."""
+
+    @abc.abstractmethod
+    def entry(self, operand: Operand, k: int) -> Operand:
+        """An entry along the first axis of what depends on inputs."""
+
+    @abc.abstractmethod
+    def stacked(self, column: Sequence[Operand]) -> Operand:
+        """Operands, some of which depend on inputs, as one."""
+
+    def walk(self, closed: Any, operands: Sequence[Operand]) -> list[Operand]:
+        """What a jaxpr makes of operands.
+
+        Raises:
+            UnsupportedError: some of it is not supported.
+        """
+        jaxpr = getattr(closed, "jaxpr", closed)
+        known: dict[Any, Operand] = {}
+        constants = getattr(closed, "consts", ())
+        known.update(zip(jaxpr.constvars, map(_plain, constants), strict=True))
+        known.update(zip(jaxpr.invars, operands, strict=True))
+
+        def read(variable: Any) -> Operand:
+            return _plain(variable.val) if isinstance(variable, core.Literal) else known[variable]
+
+        needed = _needed(jaxpr)
+        for number, equation in enumerate(jaxpr.eqns):
+            if number not in needed and not self.has_effects:
+                continue
+            given = [read(each) for each in equation.invars]
+            try:
+                found = (self._made if number in needed else self._beside)(equation, given)
+            except UnsupportedError as error:
+                raise located(error, equation) from None
+            known.update(zip(equation.outvars, found, strict=True))
+        return [read(each) for each in jaxpr.outvars]
+
+    def _made(self, equation: Any, operands: Sequence[Operand]) -> list[Operand]:
+        """What one equation makes of its operands."""
+        name, params = equation.primitive.name, equation.params
+        varies = [not self.is_plain(each) for each in operands]
+        if not any(varies):
+            return self._constants.of(equation, operands)
+        if name not in WAYS or not (self.follows_all or rounds_within(equation, varies)):
+            return self.apply(equation, operands)
+        if name in OWN_SLOPES and rounds_within(equation, varies):
+            raise UnsupportedError(
+                "it has a derivative of its own, and computes in it what depends on parameters or "
+                "constants alone: compute that before, and give it as an argument"
             )
-        if name in CALLBACKS:
-            why = "what Python computes outside of JAX has no bounds"
-        if why:
-            raise _located(UnsupportedError(why), equation)
+        return WAYS[name](self, params, operands)
+
+    def _beside(self, equation: Any, operands: Sequence[Operand]) -> list[Operand]:
+        """The same of an equation that no result depends on, but what is printed may."""
+        plain = all(map(self.is_plain, operands))
+        return (_evaluated if plain else self.apply)(equation, operands)
+
+    def _called(self, params: dict[str, Any], operands: Sequence[Operand]) -> list[Operand]:
+        """The jaxpr of a call."""
+        return self.walk(body_of(params), operands)
+
+    def _unrolled(self, params: dict[str, Any], operands: Sequence[Operand]) -> list[Operand]:
+        """A scan, step by step."""
+        constants = list(operands[: params["num_consts"]])
+        carry = list(operands[params["num_consts"] : params["num_consts"] + params["num_carry"]])
+        streams = operands[params["num_consts"] + params["num_carry"] :]
+        length, rows = params["length"], []
+        order = range(length)[::-1] if params["reverse"] else range(length)
+        for k in order:
+            given = [each[k] if self.is_plain(each) else self.entry(each, k) for each in streams]
+            found = self.walk(params["jaxpr"], [*constants, *carry, *given])
+            carry, row = found[: len(carry)], found[len(carry) :]
+            rows.append(row)
+        if not rows:
+            empty = params["jaxpr"].out_avals[len(carry) :]
+            return [*carry, *(np.zeros((0, *each.shape), each.dtype) for each in empty)]
+        rows = rows[::-1] if params["reverse"] else rows
+        return [*carry, *(self._column(column) for column in zip(*rows, strict=True))]
+
+    def _column(self, column: Sequence[Operand]) -> Operand:
+        if not all(map(self.is_plain, column)):
+            return self.stacked(column)
+        if not all(isinstance(each, np.ndarray | np.generic) for each in column):
+            return jnp.stack(column)
+        own = any(isinstance(each, Parameter) for each in column)
+        found = np.stack([np.asarray(each) for each in column])
+        return Parameter.of(found) if own else found
+
+    def _repeated(self, params: dict[str, Any], operands: Sequence[Operand]) -> list[Operand]:
+        """A loop whose condition is known."""
+        first, second = params["cond_nconsts"], params["body_nconsts"]
+        asked, done = operands[:first], operands[first : first + second]
+        carry = list(operands[first + second :])
+        for _ in range(TURNS):
+            (goes_on,) = self.walk(params["cond_jaxpr"], [*asked, *carry])
+            if not self.is_plain(goes_on) or not is_known(goes_on):
+                raise UnsupportedError(
+                    "how often it repeats must not depend on inputs or traced parameters: use "
+                    "jax.lax.fori_loop between known numbers, or jax.lax.scan"
+                )
+            if not bool(np.asarray(goes_on)):
+                return carry
+            carry = self.walk(params["body_jaxpr"], [*done, *carry])
+        raise UnsupportedError(f"it has not ended after {TURNS} turns")
+
+    def _branch(self, params: dict[str, Any], operands: Sequence[Operand]) -> list[Operand]:
+        """The one that is taken."""
+        which, *given = operands
+        if not self.is_plain(which) or not is_known(which):
+            raise UnsupportedError(
+                "which branch is taken must not depend on inputs or traced parameters: use "
+                "jnp.where between functions that agree where it changes"
+            )
+        branches = params["branches"]
+        return self.walk(branches[int(np.clip(which, 0, len(branches) - 1))], given)
 
 
-def walked(recorder: Recorder, closed: Any, operands: Sequence[Operand]) -> list[Operand]:
-    """What a jaxpr makes of operands.
-
-    Raises:
-        UnsupportedError: there is no rule for one of its primitives.
-    """
-    jaxpr = getattr(closed, "jaxpr", closed)
-    known: dict[Any, Operand] = {}
-    constants = getattr(closed, "consts", ())
-    known.update(zip(jaxpr.constvars, map(_plain, constants), strict=True))
-    known.update(zip(jaxpr.invars, operands, strict=True))
-
-    def read(variable: Any) -> Operand:
-        return _plain(variable.val) if isinstance(variable, core.Literal) else known[variable]
-
-    for equation in _needed(jaxpr):
-        found = _equation(recorder, equation, [read(each) for each in equation.invars])
-        known.update(zip(equation.outvars, found, strict=True))
-    return [read(each) for each in jaxpr.outvars]
+WAYS: dict[str, Callable[..., list[Operand]]] = {
+    "scan": Interpreter._unrolled,
+    "while": Interpreter._repeated,
+    "cond": Interpreter._branch,
+    **dict.fromkeys((*CALLS, *OWN_SLOPES), Interpreter._called),
+}
+"""How equations with jaxprs of their own are followed."""
 
 
-def _needed(jaxpr: Any) -> list[Any]:
-    """The equations that its results depend on."""
+def _needed(jaxpr: Any) -> set[int]:
+    """The numbers of the equations that results depend on."""
     used = {each for each in jaxpr.outvars if not isinstance(each, core.Literal)}
-    found = []
-    for equation in reversed(jaxpr.eqns):
+    found = set()
+    for number, equation in reversed([*enumerate(jaxpr.eqns)]):
         if used.intersection(equation.outvars):
             used.update(each for each in equation.invars if not isinstance(each, core.Literal))
-            found.append(equation)
-    return found[::-1]
+            found.add(number)
+    return found
 
 
 def _plain(value: Any) -> Any:
@@ -108,127 +221,54 @@ def _plain(value: Any) -> Any:
     return np.asarray(value)
 
 
-def _is_plain(operand: Operand) -> bool:
-    return not isinstance(operand, Value | Comparison)
+def _evaluated(equation: Any, operands: Sequence[Any]) -> list[Any]:
+    """What an equation makes of plain arrays: in numpy's, if they are."""
+    own = any(isinstance(each, Parameter) for each in operands)
+    given = [*map(_bare, operands)]
+    if not is_known(*given):
+        return bound(equation, given)
+    with jax.ensure_compile_time_eval():  # known numbers stay known where others are traced
+        is_call = equation.primitive.name in OWN_SLOPES  # numbers have no slopes
+        body = core.jaxpr_as_fun(body_of(equation.params)) if is_call else None
+        found = bound(equation, given) if body is None else body(*given)
+    if not all(isinstance(each, np.ndarray | np.generic | float | int) for each in operands):
+        return found
+    return [Parameter.of(each) if own else np.asarray(each) for each in found]
 
 
-def _equation(recorder: Recorder, equation: Any, operands: Sequence[Operand]) -> list[Operand]:
-    """What one equation makes of its operands."""
-    name, params = equation.primitive.name, equation.params
-    try:
-        if all(map(_is_plain, operands)) and name.startswith("custom_"):
-            return _called(equation, operands)
-        if all(map(_is_plain, operands)):
-            found = Equation(equation).evaluate(*operands)
-            return list(found) if equation.primitive.multiple_results else [found]
-        if name == "scan":
-            return _unrolled(recorder, params, operands)
-        if name == "while":
-            return _repeated(recorder, params, operands)
-        if name == "cond":
-            which, *given = operands
-            if not _is_plain(which) or not is_known(which):
-                raise UnsupportedError("which branch is taken must not depend on inputs")
-            branches = params["branches"]
-            return walked(recorder, branches[int(np.clip(which, 0, len(branches) - 1))], given)
-        if name in CALLS:
-            return walked(recorder, params[(BODIES & params.keys()).pop()], operands)
-        key = name, tuple(map(_identity, operands)), str(params)
-        if key not in recorder.known:  # what is written twice is done once
-            recorder.line = _line(equation) or recorder.line
-            found = recorded(recorder, Equation(equation), operands)
-            recorder.known[key] = found if isinstance(found, list) else [found], operands
-        return recorder.known[key][0]
-    except UnsupportedError as error:
-        raise _located(error, equation) from None
+def _bare(plain: Any) -> Any:
+    return np.asarray(plain) if isinstance(plain, Parameter) else plain
 
 
-def _called(equation: Any, operands: Sequence[Any]) -> list[Any]:
-    """A function with derivatives of its own, of plain arrays."""
-    if any(isinstance(each, Parameter) for each in operands):
-        return [*map(Parameter.of, _called(equation, [*map(np.asarray, operands)]))]
-    given = dict(zip(equation.invars, operands, strict=True))
-    given = {each: value for each, value in given.items() if not isinstance(each, core.Literal)}
-    jaxpr = core.Jaxpr([], [*given], equation.outvars, [equation])
-    call = core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, []))
-    if not is_known(*given.values()):
-        return call(*given.values())
-    with jax.ensure_compile_time_eval():
-        return call(*given.values())
+def bound(equation: Any, operands: Sequence[Any]) -> list[Any]:
+    """The results of an equation for arrays."""
+    primitive, params = equation.primitive, equation.params
+    if primitive.name in OWN_SLOPES:
+        return _with_own_slopes(equation, operands)
+    with equation.ctx.manager:
+        found = primitive.bind(*operands, **params)
+    return list(found) if primitive.multiple_results else [found]
 
 
-def _located(error: UnsupportedError, equation: Any) -> UnsupportedError:
+def _with_own_slopes(equation: Any, operands: Sequence[Any]) -> list[Any]:
+    """The results of a call that has a derivative of its own."""
+    given = {
+        each: value
+        for each, value in zip(equation.invars, operands, strict=True)
+        if not isinstance(each, core.Literal)
+    }
+    body = body_of(equation.params)
+    jaxpr = getattr(body, "jaxpr", body).replace(
+        constvars=[], invars=[*given], outvars=equation.outvars, eqns=[equation]
+    )
+    return core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, []))(*given.values())
+
+
+def located(error: UnsupportedError, equation: Any) -> UnsupportedError:
+    """An error that tells of which equation it speaks."""
     error.primitive = error.primitive or equation.primitive.name
-    error.line = error.line or _line(equation)
+    error.line = error.line or line_of(equation)
     return error
-
-
-def _identity(operand: Operand) -> Any:
-    """What two operands have in common only if they are the same."""
-    if isinstance(operand, Value):
-        return operand.place, operand.shape
-    if isinstance(operand, np.ndarray) and operand.size == 1:
-        return str(operand.dtype), operand.shape, operand.item()
-    return id(operand)
-
-
-def _unrolled(
-    recorder: Recorder, params: dict[str, Any], operands: Sequence[Operand]
-) -> list[Operand]:
-    """A scan, step by step."""
-    constants = list(operands[: params["num_consts"]])
-    carry = list(operands[params["num_consts"] : params["num_consts"] + params["num_carry"]])
-    streams = operands[params["num_consts"] + params["num_carry"] :]
-    length, rows = params["length"], []
-    order = range(length)[::-1] if params["reverse"] else range(length)
-    for k in order:
-        given = [_slice(recorder, each, k) for each in streams]
-        found = walked(recorder, params["jaxpr"], [*constants, *carry, *given])
-        carry, row = found[: len(carry)], found[len(carry) :]
-        rows.append(row)
-    if not rows:
-        empty = params["jaxpr"].out_avals[len(carry) :]
-        return [*carry, *(np.zeros((0, *each.shape), each.dtype) for each in empty)]
-    rows = rows[::-1] if params["reverse"] else rows
-    return [*carry, *(_stacked(recorder, column) for column in zip(*rows, strict=True))]
-
-
-def _repeated(
-    recorder: Recorder, params: dict[str, Any], operands: Sequence[Operand]
-) -> list[Operand]:
-    """A loop whose condition is known."""
-    first, second = params["cond_nconsts"], params["body_nconsts"]
-    asked, done = operands[:first], operands[first : first + second]
-    carry = list(operands[first + second :])
-    for _ in range(TURNS):
-        (goes_on,) = walked(recorder, params["cond_jaxpr"], [*asked, *carry])
-        if not _is_plain(goes_on) or not is_known(goes_on):
-            raise UnsupportedError(
-                "how often it repeats must not depend on inputs or traced parameters"
-            )
-        if not bool(np.asarray(goes_on)):
-            return carry
-        carry = walked(recorder, params["body_jaxpr"], [*done, *carry])
-    raise UnsupportedError(f"it has not ended after {TURNS} turns")
-
-
-def _slice(recorder: Recorder, operand: Operand, k: int) -> Operand:
-    if not isinstance(operand, Value):
-        return operand[k]
-    return recorder.picked(operand, np.arange(operand.size).reshape(operand.shape)[k])
-
-
-def _stacked(recorder: Recorder, column: Sequence[Operand]) -> Operand:
-    if all(map(_is_plain, column)):
-        on_host = all(isinstance(each, np.ndarray | np.generic) for each in column)
-        return np.stack(column) if on_host else jnp.stack(column)
-    if all(isinstance(each, Comparison) for each in column):
-        return Comparison(_stacked(recorder, [each.value for each in column]))
-    if any(isinstance(each, Comparison) for each in column):
-        raise UnsupportedError("a comparison in one of its steps is none in another")
-    joined, (first, *_) = recorder.joined(column), column
-    shape = first.shape if isinstance(first, Value) else np.shape(first)
-    return recorder.picked(joined, np.arange(joined.size).reshape(len(column), *shape))
 
 
 @lru_cache(maxsize=1)
@@ -241,7 +281,7 @@ def _folders() -> tuple[Path, ...]:
     return tuple(found)
 
 
-def _line(equation: Any) -> str:
+def line_of(equation: Any) -> str:
     """Where a user wrote it: ` (in NAME, FILE:LINE)`; nothing where that is not known."""
     frames = getattr(equation.source_info.traceback, "frames", ())
     for frame in frames:

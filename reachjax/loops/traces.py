@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
+from reachjax.loops.dependence import rounds_plain
 from reachjax.numerics.checks import is_concrete
 
 Sizes = tuple[int, ...]
@@ -47,6 +48,7 @@ class Trace:
     ):
         self._parts = tree, others, shapes, inputs
         self._closed: dict[bool, core.ClosedJaxpr] = {}
+        self._rounds: bool | None = None
         self.described = _description(self.closed)
 
     @classmethod
@@ -97,9 +99,17 @@ class Trace:
 
     def __call__(self, parameters: Sequence[Any], *inputs: Any) -> Any:
         """What was traced, evaluated."""
-        vectors = [jnp.asarray(each, float) for each in inputs]
-        (found,) = core.jaxpr_as_fun(self.closed)(*parameters, *vectors)
+        (found,) = core.jaxpr_as_fun(self.closed)(*parameters, *inputs)
         return found
+
+    @property
+    def rounds_constants(self) -> bool:
+        """Whether it rounds numbers that depend on parameters or constants alone."""
+        if self._rounds is None:
+            count = len(self.closed.jaxpr.invars) - len(self._parts[3])
+            varies = [number >= count for number in range(len(self.closed.jaxpr.invars))]
+            self._rounds = rounds_plain(self.closed, varies)
+        return self._rounds
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Trace) or self.described is None:

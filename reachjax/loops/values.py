@@ -63,10 +63,20 @@ class Term(NamedTuple):
     divisor: Any = 1.0
 
 
-class Comparison(NamedTuple):
-    """Whether numbers are above zero; at zero it must not matter."""
+class Comparison:
+    """Whether numbers are above zero; at zero it must not matter.
 
-    value: Value
+    Attributes:
+        value: these numbers.
+    """
+
+    def __init__(self, value: Value):
+        self.value = value
+
+    @property
+    def shape(self) -> Shape:
+        """The shape of the array of truth values."""
+        return self.value.shape
 
 
 Operand = Any
@@ -103,6 +113,11 @@ class Parameter(np.ndarray):
     def of(cls, plain: Any) -> Any:
         """A parameter; one that is traced as it is."""
         return np.asarray(plain).view(cls) if is_concrete(plain) else plain
+
+
+def is_plain(operand: Operand) -> bool:
+    """Whether an operand depends on no input."""
+    return not isinstance(operand, Value | Comparison)
 
 
 def is_constant(plain: Any) -> bool:

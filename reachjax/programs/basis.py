@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Block, Facts, Line, Lines, Mark
 from reachjax.numerics.checks import require_double_precision, require_kind
 from reachjax.numerics.pytrees import pytree
@@ -189,7 +190,7 @@ def change_of_basis(loop: ClosedLoop, t: int = 0) -> ChangeOfBasis:
     return _change_of_basis(loop, t)
 
 
-@jax.jit
+@Compiled
 def _change_of_basis(loop: ClosedLoop, t: int) -> ChangeOfBasis:
     n, k = loop.states, loop.units
     size = n + k + 1

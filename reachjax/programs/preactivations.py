@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.functions import Compiled
 from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.rounding import Ball, gamma
 from reachjax.programs.basis import Rows, columns, loop_rows, picking
@@ -128,7 +129,7 @@ def _upper(rows: Rows, X: AbstractSet, bounds: LoopBounds) -> Float[Array, " k"]
     return B @ z.mid + c + X.support(A) + spread
 
 
-@jax.jit
+@Compiled
 def first_rows(loop: ClosedLoop) -> Rows | None:
     """Rows over `[x, 1]` of the inputs of the controller's first layer.
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.host import in_numpy
 from reachjax.programs.affine import AffineForms
@@ -106,7 +107,7 @@ def unrolled(
         yield found._replace(drawn=tuple(np.sign(forms.columns[:, each]) for each in free))
 
 
-@partial(jax.jit, static_argnames="t")
+@partial(Compiled, static_argnames="t")
 def unrolled_at_once(
     loop: ClosedLoop,
     X0: AbstractSet,
@@ -134,7 +135,7 @@ def unrolled_at_once(
     return jax.lax.scan(advance, state, (jnp.arange(steps), directions))[1]
 
 
-@partial(jax.jit, static_argnames="t")
+@partial(Compiled, static_argnames="t")
 def unrolled_from_boxes(
     loop: ClosedLoop,
     lower: Float[Array, "c n_x"],
@@ -151,7 +152,7 @@ def unrolled_from_boxes(
     return jax.vmap(one)(lower, upper)
 
 
-@partial(jax.jit, static_argnames="t")
+@partial(Compiled, static_argnames="t")
 def weighed_at_once(
     loop: ClosedLoop,
     X0: AbstractSet,

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.functions import Compiled
 from reachjax.loops.units import Facts
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.numerics.rounding import Ball
@@ -185,7 +186,7 @@ def _first(
     return state, _holding(cone_facts, state) @ T, T
 
 
-@jax.jit
+@Compiled
 def _bounds(
     loop: ClosedLoop,
     around: AbstractSet | None,
@@ -199,7 +200,7 @@ def _bounds(
     return bounds_over(loop, around, box, t, known)
 
 
-@partial(jax.jit, static_argnames="prune")
+@partial(Compiled, static_argnames="prune")
 def _extended(
     loop: ClosedLoop,
     state: Rows,

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.functions import Compiled
 from reachjax.loops.scenarios import Scenarios
 from reachjax.sets import AbstractSet
 
@@ -23,7 +24,7 @@ LONGEST = 4.0
 """The longest step, in half-widths of the set: from further away projections are worse."""
 
 
-@partial(jax.jit, static_argnames=("horizon", "start"))
+@partial(Compiled, static_argnames=("horizon", "start"))
 def ascended(
     loop: ClosedLoop,
     scenarios: Scenarios,

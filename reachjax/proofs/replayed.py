@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.affine_steps import UnitForms
@@ -97,7 +98,7 @@ def _lines(
     return slope, np.asarray(z - slope * y)
 
 
-@partial(jax.jit, static_argnames="start")
+@partial(Compiled, static_argnames="start")
 def replayed(
     loop: ClosedLoop,
     X0: AbstractSet,

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.functions import Compiled
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.sets import AbstractSet
 from reachjax.tubes.refutations import deviates, enclosures, most_room
@@ -160,7 +161,7 @@ def compiled_runs(
     return Runs(rows, np.stack(jax.device_get(found), axis=1)[: len(rows)])
 
 
-@jax.jit
+@Compiled
 def _stepped(
     loop: ClosedLoop,
     states: Float[Array, "c n_x"],

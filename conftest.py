@@ -15,8 +15,8 @@ from pathlib import Path
 import jax
 import pytest
 
-pytest_plugins = ["tests.campaign.session"]
-"""Its options have to be known before the folder of the campaign is read."""
+pytest_plugins = ["tests.campaign.session", "tests.selection"]
+"""Their options have to be known before any test is read."""
 
 ROOT = Path(__file__).parent
 

@@ -6,13 +6,14 @@ minutes. With a path, or `--every-case`, all cases are taken.
 
 from collections import defaultdict
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
-ELSEWHERE = "tests/experiments/", "tests/test_notebooks.py", "tests/test_docs.py"
+ELSEWHERE = "tests/experiments", "tests/test_notebooks.py", "tests/test_docs.py"
 """Claims about the experiments, the notebooks and the site, which are not about the library."""
 
 
@@ -49,16 +50,28 @@ def _shifted(draws: Callable[..., Any], seed: int) -> Callable[..., Any]:
     return shifted
 
 
+def _everything(config: pytest.Config) -> bool:
+    """Whether all cases are asked for."""
+    bare = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    return not bare or config.getoption("every_case") or bool(config.getoption("keyword"))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave unread, in a bare run, the files of claims that are not about the library."""
+    if _everything(config):
+        return None
+    place = f"{collection_path.relative_to(config.rootpath).as_posix()}/"
+    return True if place.startswith(tuple(f"{each}/" for each in ELSEWHERE)) else None
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave one case of each claim, the one in the middle, unless all are asked for."""
-    bare = config.args_source is pytest.Config.ArgsSource.TESTPATHS
-    if not bare or config.getoption("every_case") or config.getoption("keyword"):
+    if _everything(config):
         return
     cases = defaultdict(list)
     for item in items:
-        about = item.nodeid.startswith(ELSEWHERE) or item.get_closest_marker("costly")
-        if not about:
+        if not item.get_closest_marker("costly"):
             cases[item.nodeid.partition("[")[0]].append(item)
     kept = {id(each[len(each) // 2]) for each in cases.values()}
     left = [item for item in items if id(item) not in kept]

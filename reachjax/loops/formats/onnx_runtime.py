@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from reachjax.loops.formats.onnx_graphs import Graph
 
 NETWORK = 32 * float(np.finfo(np.float32).eps)
-"""What a runtime may be off by, over the largest number within the network: 4e-6. Of 300 random
-graphs it was 5e-7 at most."""
+"""What a runtime may be off by, over the largest number within the network: 4e-6."""
 
 AMPLIFIED = 100.0
 """What it may be off by, over the difference of an evaluation in 32 bits from one in 64."""
@@ -41,11 +40,11 @@ def require_same(path: Path, graph: Graph, points: Sequence[np.ndarray]) -> None
         for x in points:
             (found,) = session.run([wanted], _fed(session, graph, x))
             _require_near(graph, x, np.asarray(found, float).ravel())
-    except (state.InvalidGraph, state.InvalidArgument, state.InvalidProtobuf) as error:
+    except (state.InvalidGraph, state.InvalidProtobuf) as error:
         text = " ".join(str(error).split())[:400]
         raise ValueError(f"onnxruntime refuses it: {text}") from error
-    except (state.Fail, state.NotImplemented, state.RuntimeException, state.NoSuchFile):
-        return  # an older runtime, or one without this operator in 64 bits
+    except (state.Fail, state.NotImplemented, state.InvalidArgument, state.RuntimeException):
+        return  # an older runtime, or one without this operator in 64 bits, or for a batch of none
 
 
 def _fed(session: Any, graph: Graph, x: np.ndarray) -> dict[str, np.ndarray]:
@@ -83,8 +82,8 @@ def _require_near(graph: Graph, x: np.ndarray, found: np.ndarray) -> None:
     parameters = tuple(np.asarray(each, np.float32) for each in graph.parameters)
     rounded = np.asarray(Graph(parameters, graph.structure)(x), float)
     outputs = [name for node in graph.structure.nodes for name in node.outputs if name]
-    sizes = [np.abs(values[name].astype(float)).max(initial=0.0) for name in outputs]
-    room = NETWORK * max(sizes, default=0.0) + AMPLIFIED * np.abs(own - rounded).max(initial=0.0)
+    sizes = [np.abs(each.astype(float)).max(initial=0.0) for each in (x, *map(values.get, outputs))]
+    room = NETWORK * max(sizes) + AMPLIFIED * np.abs(own - rounded).max(initial=0.0)
     compared = np.isfinite(own) & np.isfinite(found) & np.isfinite(room)
     off = np.where(compared, np.abs(own - found), 0.0)
     if (off > room).any():

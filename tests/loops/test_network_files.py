@@ -103,11 +103,11 @@ REFUSED = {
     ),
     "an attribute of nothing": (
         {"nodes": [node("Relu", "x", mystery=1)]},
-        "against ONNX's rules.*mystery",
+        r"node 'y' \(Relu\) has the attribute 'mystery', which is not known",
     ),
     "a wrong length": (
         {"nodes": [node("Mul", "x w")], "held": [raw("w", 1, [3], b"\0" * 8)]},
-        "(?i)initiali[sz]er 'w'|tensor name: w",
+        "tensor name: w|initialiser 'w'",
     ),
     "a kind that there is none of": (
         {"nodes": [node("Mul", "x w")], "held": [raw("w", 99, [3], b"\0" * 12)]},
@@ -125,13 +125,24 @@ REFUSED = {
         {"nodes": [node("Mul", "x w")], "held": {"w": np.array([1, np.inf, 1], np.float32)}},
         "'w' must be finite",
     ),
+    "a length of a terabyte": (
+        {
+            "nodes": [node("Cast", "w", "f", to=1), node("Mul", "x f")],
+            "held": [raw("w", 7, [10**12])],
+        },
+        "initialiser 'w' must hold 1000000000000 numbers",
+    ),
     "a shape of a terabyte": (
         {"nodes": [node("Relu", "x")], "shape": (1, 10**12)},
         "entries, but 16777216 is the most",
     ),
     "a constant of a shape without end": (
         {
-            "nodes": [node("ConstantOfShape", "n", "c"), node("Add", "x c")],
+            "nodes": [
+                node("ConstantOfShape", "n", "c"),
+                node("ReduceMax", "c", "m"),
+                node("Add", "x m"),
+            ],
             "held": {"n": np.array([10**10])},
         },
         "entries",
@@ -153,7 +164,11 @@ REFUSED = {
     ),
     "a cast that the standard leaves open": (
         {
-            "nodes": [node("Cast", "p", "n", to=3), node("Cast", "n", "f", to=1), node("Mul", "x f")],
+            "nodes": [
+                node("Cast", "p", "n", to=3),
+                node("Cast", "n", "f", to=1),
+                node("Mul", "x f"),
+            ],
             "held": {"p": np.array([300.0], np.float32)},
         },
         r"node 'n' \(Cast\).*cannot be cast to int8",
@@ -326,9 +341,7 @@ def test_complex_weights_of_a_matlab_file_are_refused(tmp_path):
     path = tmp_path / "net.mat"
     held = {"W": cells([np.ones((1, 2)) + 1j]), "b": cells([np.ones((1, 1))])}
     scipy.io.savemat(path, held | {"act_fcns": ["relu"]})
-    with pytest.raises(
-        ValueError, match=r"net\.mat cannot be read: weights 1 must be .*complex128"
-    ):
+    with pytest.raises(ValueError, match=r"net\.mat cannot be read: weights 1 .*complex128"):
         rj.Network.from_file(path)
 
 

@@ -268,12 +268,10 @@ def _nnet(text: str) -> Chain:
         pairs.append((np.array(W), np.ravel(b)))
     if lines.rest:
         raise ValueError(f"{len(lines.rest)} lines are left after the last layer")
-    return Chain(
-        _joined(pairs),
-        ("relu",) * (count - 1) + ("affine",),
-        _limits(*map(np.array, limits), n),
-        *_scalers(*map(np.array, scaler), n),
-    )
+    lower, upper, means, ranges = map(np.array, (*limits, *scaler))
+    scalers = _scalers(means, ranges, n)
+    activations = ("relu",) * (count - 1) + ("affine",)
+    return Chain(_joined(pairs), activations, _limits(lower, upper, n), *scalers)
 
 
 def _limits(lower: np.ndarray, upper: np.ndarray, n: int) -> tuple[np.ndarray, ...] | None:

@@ -91,8 +91,6 @@ def split(attributes: Attributes, x: Any, sizes: Any = None) -> list[Any]:
     """Parts along an axis, of given sizes, or all but the last ones of one size."""
     axis, sizes = attributes["axis"], attributes.get("split") if sizes is None else sizes
     total, count = np.shape(x)[axis], attributes["parts"]
-    if attributes.get("num_outputs", count) != count:
-        raise ValueError(f"{attributes['num_outputs']} parts are announced, but {count} have names")
     if sizes is None:
         size = -(-total // count)
         if attributes["opset"] < 18 and size * count != total:

@@ -7,7 +7,7 @@ has it, is an error: a graph is read as exactly the function that it holds, or r
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,22 +85,22 @@ def read_file(path: Path, inputs: Sequence[str] | None, output: str | None) -> N
     opset = _opset(model)
     for node in nodes:
         _require_known(node)
-    reduced = _reduced(model, nodes, held, given, wanted)
-    kinds, shapes = _inferred(reduced)
+    # before the standard's own checks, whose memory grows with what a shape claims
+    arrays = {each.name: _array(each, f"the initialiser {each.name!r}") for each in held}
+    attributes = [_attributes(node, opset) for node in nodes]
+    kinds, shapes = _inferred(_reduced(model, nodes, held, given, wanted))
     for name, kind in kinds.items():
         if kind not in KINDS:
             raise ValueError(f"{name!r} is of {kind_name(kind)}, which is not known")
-    arrays = {each.name: _array(each, f"the initialiser {each.name!r}") for each in held}
     room = sum(math.prod(shape) for name, shape in shapes.items() if name not in arrays)
     if room > ROOM:
         raise ValueError(f"arrays within the network have {room} entries, but {ROOM} is the most")
     read = []
-    for node in reduced.graph.node:
-        attributes = _attributes(node, opset)
+    for node, chosen in zip(nodes, attributes, strict=True):
         if node.op_type == "Constant":
-            arrays[node.output[0]] = _constant(attributes, _named(node))
+            arrays[node.output[0]] = _constant(chosen, _named(node))
         else:
-            read.append(_read(node, attributes, kinds))
+            read.append(_read(node, chosen, kinds))
     ends = tuple((each.name, _shape(each)) for each in given)
     return NetworkFile(tuple(read), arrays, ends, wanted, kinds, shapes)
 
@@ -125,11 +125,25 @@ def _loaded(path: Path) -> Any:
             model = onnx.inliner.inline_local_functions(model)
     except Exception as error:  # kinds of protobuf's and onnx's own
         raise ValueError(f"it is no ONNX file: {_line(error)}") from error
+    if not all(isinstance(text, str) for text in _texts(model)):
+        raise ValueError("it holds names that are no text")
     for each in model.graph.node:
         each.domain = "" if each.domain in DEFAULT else each.domain
     if [each.version for each in model.opset_import if each.domain in DEFAULT] == [OLD]:
         _modernise(model)
     return model
+
+
+def _texts(model: Any) -> Iterator[Any]:
+    """The names in a model, which are bytes where they are no text."""
+    for each in (*model.graph.input, *model.graph.output):
+        yield each.name
+        yield from (dim.dim_param for dim in each.type.tensor_type.shape.dim)
+    yield from (each.name for each in model.graph.initializer)
+    yield from (each.domain for each in model.opset_import)
+    for node in model.graph.node:
+        yield from (node.name, node.op_type, node.domain, *node.input, *node.output)
+        yield from (attribute.name for attribute in node.attribute)
 
 
 OLD = 6
@@ -328,7 +342,10 @@ def _attributes(node: Any, opset: int) -> dict[str, Any]:
     """The attributes of a node, with the standard's defaults; errors for those not understood."""
     import onnx
 
-    schema = onnx.defs.get_schema(node.op_type, opset, "")
+    try:
+        schema: Any = onnx.defs.get_schema(node.op_type, opset, "")
+    except onnx.defs.SchemaError:
+        raise ValueError(f"{_named(node)} is no operator of version {opset}") from None
     known = OPERATORS[node.op_type].attributes if node.op_type in OPERATORS else schema.attributes
     found = {"opset": opset, "parts": len(node.output)}
     for name, each in schema.attributes.items():
@@ -343,9 +360,23 @@ def _attributes(node: Any, opset: int) -> dict[str, Any]:
             )
         if each.name in given:
             raise ValueError(f"{_named(node)} has the attribute {each.name!r} twice")
+        if each.type != int(schema.attributes[each.name].type.value):
+            raise ValueError(f"{_named(node)} has the attribute {each.name!r} of another type")
         given.add(each.name)
         found[each.name] = _plain(each, node)
+    if found.get("num_outputs", len(node.output)) != len(node.output):
+        raise ValueError(
+            f"{_named(node)} announces {found['num_outputs']} parts, but {len(node.output)} of "
+            "them have names"
+        )
     return found
+
+
+NUMBERS = (1, 2, 6, 7)
+"""Types of attributes that are numbers: floats, whole ones, and rows of both."""
+
+SMALL = 2**31
+"""The largest whole number that an axis, a count or a flag may be."""
 
 
 def _plain(attribute: Any, node: Any) -> Any:
@@ -358,6 +389,10 @@ def _plain(attribute: Any, node: Any) -> Any:
     value = onnx.helper.get_attribute_value(attribute)
     if isinstance(value, bytes):
         return value.decode(errors="replace")
+    if attribute.type not in NUMBERS:
+        raise ValueError(f"{what} is of a type that is not known")
+    if attribute.name not in ("value_int", "to") and isinstance(value, int) and abs(value) > SMALL:
+        raise ValueError(f"{what} is {value}, which is too large")
     found = tuple(value) if not isinstance(value, int | float) else value
     numbers = found if isinstance(found, tuple) else (found,)
     if not all(isinstance(each, int) or np.isfinite(each) for each in numbers):

@@ -90,7 +90,7 @@ class Graph:
     def values(self, x: Any) -> dict[str, Any]:
         """The values of all nodes, by name."""
         structure = self.structure
-        values = {name: constant.array for name, constant in structure.constants}
+        values = {name: _within(each.array, x.dtype) for name, each in structure.constants}
         values |= dict(zip(structure.weights, self.parameters, strict=True))
         values |= entries(structure.given, x)
         for node in structure.nodes:
@@ -111,6 +111,14 @@ class Graph:
         structure = self.structure
         nodes, wanted = structure.nodes[: number + 1], structure.nodes[number].outputs[0]
         return Graph(self.parameters, structure._replace(nodes=nodes, wanted=wanted))
+
+
+def _within(array: np.ndarray, kind: Any) -> np.ndarray:
+    """Known numbers for a computation in floats of a kind: none is beyond the largest of these."""
+    if array.dtype.kind != "f" or kind.itemsize >= array.dtype.itemsize:
+        return array
+    largest = float(np.finfo(kind).max)
+    return np.clip(array, -largest, largest)
 
 
 def entries(given: Sequence[tuple[str, tuple[int, ...]]], x: Any) -> dict[str, Any]:

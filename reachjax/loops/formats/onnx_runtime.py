@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,9 +27,9 @@ def require_same(path: Path, graph: Graph, points: Sequence[np.ndarray]) -> None
     """
     try:
         import onnxruntime
-        from onnxruntime.capi import onnxruntime_pybind11_state as state
     except ImportError:
         return
+    state: Any = importlib.import_module("onnxruntime.capi.onnxruntime_pybind11_state")
     wanted = graph.structure.wanted
     try:
         options = onnxruntime.SessionOptions()
@@ -82,7 +83,10 @@ def _require_near(graph: Graph, x: np.ndarray, found: np.ndarray) -> None:
     parameters = tuple(np.asarray(each, np.float32) for each in graph.parameters)
     rounded = np.asarray(Graph(parameters, graph.structure)(x), float)
     outputs = [name for node in graph.structure.nodes for name in node.outputs if name]
-    sizes = [np.abs(each.astype(float)).max(initial=0.0) for each in (x, *map(values.get, outputs))]
+    sizes = [
+        np.abs(each.astype(float)).max(initial=0.0)
+        for each in (x, *(values[name] for name in outputs))
+    ]
     room = NETWORK * max(sizes) + AMPLIFIED * np.abs(own - rounded).max(initial=0.0)
     compared = np.isfinite(own) & np.isfinite(found) & np.isfinite(room)
     off = np.where(compared, np.abs(own - found), 0.0)

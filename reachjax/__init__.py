@@ -90,6 +90,7 @@ from reachjax.tubes.plotting import plot_cells, plot_set, plot_tube
 from reachjax.tubes.reach import Interrupted, ReachTube, reach, reach_step
 from reachjax.tubes.requirements import shortfall
 from reachjax.tubes.sizes import log_volume, log_widths, volume
+from reachjax.tubes.soundness import UnsoundError
 from reachjax.tubes.specs import verify
 from reachjax.tubes.verdicts import (
     Counterexample,
@@ -175,6 +176,7 @@ __all__ = [
     "Square",
     "Tanh",
     "Template",
+    "UnsoundError",
     "Verdict",
     "VerdictStatus",
     "WinningSet",

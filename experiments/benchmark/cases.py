@@ -19,7 +19,7 @@ from experiments.double_integrator.problem import INITIAL_BOX, closed_loop, temp
 
 RANDOM_BOX = np.array([[0.25, -0.25], [0.75, 0.25]])  # the size of the paper's X_0, near the kinks
 
-Study = Literal["steps", "growth", "loops", "rivals", "decisions"]
+Study = Literal["steps", "growth", "loops", "rivals", "decisions", "limits"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,8 @@ class Settings:
 
     study: tyro.conf.Positional[Study] = "steps"
     """One step of several networks; one facet as networks grow; tubes and training steps; tubes
-    beside those of what a user would pick instead; verdicts beside the same."""
+    beside those of what a user would pick instead; verdicts beside the same; calls that must end in
+    time."""
 
     widths: tuple[int, ...] = (10, 20, 32)
     """`steps`: neurons in each of the two hidden layers, one network a width."""
@@ -44,9 +45,11 @@ class Settings:
     reference_facets: int = 8
     """At most so many are timed with cvxpy rebuilt; fewer are scaled up to 8."""
     loops: tuple[str, ...] = ()
-    """`rivals`: names of loops as the table has them; all without any."""
+    """`rivals`, `limits`: names of loops as the table has them; all without any."""
     methods: tuple[str, ...] = ()
-    """`rivals`: names of methods as the table has them; all without any."""
+    """`rivals`, `limits`: names of methods as the table has them; all without any."""
+    limit: float = 5.0
+    """`limits`: seconds that each call is given."""
     simulations: int = 20_000
     """`rivals`: trajectories whose largest values bounds are compared with; `decisions`: those that
     tell what a set's margin is, and that samples refute by."""

@@ -6,7 +6,8 @@ set, some with random weights and a set of the same size where most of their neu
 `growth`: one facet of the paper's program as random networks grow. `loops`: six-step tubes of the
 trained 2-10-5-1 network, and training steps. `rivals`: tubes of ever larger loops beside HiGHS's
 mixed-integer programs, affine forms in plain numpy, and the paper's programs by cvxpy.
-`decisions`: verdicts on six initial sets of a car, beside affine forms and samples. All methods run
+`decisions`: verdicts on six initial sets of a car, beside affine forms and samples. `limits`: every
+entry point under a time limit, in a process where nothing is compiled yet. All methods run
 one after the other, with one BLAS thread and one thread for Clarabel (XLA takes what cores there
 are), so their ratios mean more than their seconds.
 """
@@ -29,6 +30,16 @@ from experiments.benchmark.growth import (
     in_new_process,
     jobs,
     related,
+)
+from experiments.benchmark.limits import (
+    GRACE,
+    LIMITS_NOTE,
+    limit_rows,
+    limits_table,
+    too_long,
+)
+from experiments.benchmark.limits import (
+    chosen as limited_calls,
 )
 from experiments.benchmark.loops import (
     LOOPS_NOTE,
@@ -154,6 +165,26 @@ def decisions(settings: Settings) -> None:
         raise SystemExit(f"error: what is proved is broken: {', '.join(wrong)}")
 
 
+def limits(settings: Settings) -> None:
+    """Every entry point under a time limit, each in a process of its own.
+
+    Raises:
+        SystemExit: a call took longer than it may.
+    """
+    results: list[dict] = []
+    with bar() as shown:
+        progress = shown.add_task("", total=len(limited_calls(settings)))
+        for row in limit_rows(settings):
+            results.append(row)
+            shown.update(progress, description=f"{row['loop']}: {row['call']}")
+            shown.advance(progress)
+            write(settings, rows=results)
+    rich.print(limits_table(results))
+    rich.print(LIMITS_NOTE)
+    if late := [f"{row['loop']}: {row['call']}" for row in results if too_long(row)]:
+        raise SystemExit(f"error: longer than {GRACE} times the limit: {', '.join(late)}")
+
+
 def write(settings: Settings, **results: list[dict]) -> None:
     """Settings, threads and every row of each table."""
     threads = {name: os.environ.get(name) for name in THREADS} | {"cores": os.cpu_count()}
@@ -166,6 +197,6 @@ def main(settings: Settings) -> None:
     """One study: its tables are printed, and its rows written."""
     require_folder(settings.output)
     jax.config.update("jax_enable_x64", True)
-    studies = {study.__name__: study for study in (steps, growth, loops, rivals, decisions)}
+    studies = {study.__name__: study for study in (steps, growth, loops, rivals, decisions, limits)}
     studies[settings.study](settings)
     rich.print(f"written: {settings.output / settings.study}.json")

@@ -28,6 +28,7 @@ from reachjax.tubes.cell_jobs import CellJobs
 from reachjax.tubes.cell_tasks import CellTask, Outcome, Unbounded, outcome_of
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.sieve import TOGETHER, Margins, Sieve, no_margins
+from reachjax.tubes.soundness import require_unbroken_cells
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.verdicts import Counterexample, DecidedCell, Verdict, VerdictStatus
 
@@ -218,7 +219,8 @@ class _Run:
         lower, upper = np.asarray(cell.box.lower), np.asarray(cell.box.upper)
         if self.example is not None:
             first = self.example.states[0]
-            if np.all((lower <= first) & (first <= upper)):
+            inside = np.all((lower <= first) & (first <= upper))
+            if inside and status is not VerdictStatus.PROVED:  # that would be a contradiction
                 status = VerdictStatus.REFUTED
         self._done.append(DecidedCell(lower, upper, status, outcome.margin))
         for item in self._task.required:
@@ -257,9 +259,13 @@ class _Run:
 
         Raises:
             UnboundedError: there is no cell over which all units have bounds.
+            UnsoundError: a trajectory breaks what is proved.
         """
         if self._lost and not self._bounded and self.example is None:
             raise self._lost.error
+        task = self._task
+        known = task.horizon, task.start, task.required, self._done
+        require_unbroken_cells(self._loop, self._X0, *known, self.example)
         statuses = {each.status for each in self._done}
         proved = statuses == {VerdictStatus.PROVED}
         status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN

@@ -44,6 +44,7 @@ from reachjax.tubes.propagation import (
 )
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
+from reachjax.tubes.soundness import Claim, compiled_runs, require_unbroken, worst_of
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.targets import target_of
 from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
@@ -108,6 +109,7 @@ def decide(
         TypeError: an argument is of another kind, or a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, `X0` is
             empty or unbounded, or numbers are traced inside `jax.jit`.
+        UnsoundError: a simulated trajectory breaks what is proved: a defect to be reported.
 
     Source: equations (reach_avoid) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 
@@ -176,7 +178,8 @@ class _Decision:
         self._horizon, self._on_host = horizon, jax.device_get(loop)
         self._scenarios = Scenarios.of(loop, X0, horizon, start)
         self._middle = self._scenarios.middle(np.asarray(boxed(X0, "X0").center))
-        self._open = {(item.name, item.time): item for item in required}
+        self._required = {(item.name, item.time): item for item in required}
+        self._open = dict(self._required)
         self._margins = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
@@ -191,7 +194,12 @@ class _Decision:
         return self._example is not None or not self._open
 
     def verdict(self) -> Verdict:
-        """All of it."""
+        """The verdict from everything proved and simulated so far.
+
+        Raises:
+            UnsoundError: a trajectory breaks what is proved.
+        """
+        self._require_unbroken()
         status = VerdictStatus.UNKNOWN if self._open else VerdictStatus.PROVED
         if self._example is not None:
             status = VerdictStatus.REFUTED
@@ -199,6 +207,20 @@ class _Decision:
         return Verdict(
             status, self._margins, self._simulated, self._example, certificates=certificates
         )
+
+    def _require_unbroken(self) -> None:
+        """Raise an error if a trajectory, as JAX runs it, breaks what is proved."""
+        claims = [
+            Claim(item, self._margins[item.name][item.time])
+            for key, item in self._required.items()
+            if key not in self._open
+        ]
+        if claims:
+            rows = self._middle[None]
+            if self._simulations is not None:
+                rows = worst_of(self._simulations.runs, [claim.item for claim in claims])
+            runs = compiled_runs(self._loop, self._scenarios, rows, self._start)
+            require_unbroken(self._loop, self._scenarios, self._start, runs, claims)
 
     def at_first(self) -> None:
         """Decide what is required of the initial set itself."""

@@ -29,6 +29,7 @@ from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.recurrent_sets import TRAJECTORIES, Candidate, candidate_sets, periods, within
 from reachjax.tubes.refutations import SUSPECTS, counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Region, requirements
+from reachjax.tubes.soundness import Claim, compiled_runs, require_unbroken, worst_of
 from reachjax.tubes.verdicts import Counterexample, Recurrence, Verdict, VerdictStatus
 
 LONG = 500
@@ -72,6 +73,7 @@ def for_ever(
 
     Raises:
         ValueError: the loop varies in time, or nothing is required at all times.
+        UnsoundError: a trajectory breaks what is proved.
     """
     loop, start = tubes[0].loop, tubes[0].start
     if loop.steps is not None:
@@ -94,6 +96,8 @@ def for_ever(
         return verdict
     found = recurrence(tubes, X0, wanted, runs.states, deadline)
     proved = found is not None and found.proved
+    if proved:
+        _require_unbroken(loop, X0, wanted, runs, start)
     status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
     return dataclasses.replace(verdict, status=status, recurrence=found)
 
@@ -122,6 +126,17 @@ def _broken_later(
             if example is not None or tried > SUSPECTS:
                 return example
     return None
+
+
+def _require_unbroken(
+    loop: ClosedLoop, X0: AbstractSet, wanted: Wanted, runs: Runs, start: int
+) -> None:
+    """Raise an error if a trajectory, as JAX runs it, breaks what is proved for all time."""
+    items = requirements(loop.states, LONG, None, wanted.avoid or None, wanted.safe)
+    scenarios = Scenarios.of(loop, X0, LONG, start)
+    rows = worst_of(runs.some(np.isfinite(runs.states).all(axis=(1, 2))), items)
+    long_runs = compiled_runs(loop, scenarios, rows, start)
+    require_unbroken(loop, scenarios, start, long_runs, [Claim(item, np.nan) for item in items])
 
 
 def _flat(safe: Region | None) -> PolyhedralSet | None:

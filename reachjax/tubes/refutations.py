@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.closed_loop import Scenario
@@ -20,6 +22,10 @@ from reachjax.tubes.verdicts import Counterexample
 
 SUSPECTS = 5
 """So many of the worst trajectories of each requirement are examined with their rounding."""
+
+TOLERATED = 16
+"""A simulated state may be beside the enclosure of its step by so many widths of that: rounding of
+compiled code is within it, but for what libraries of functions leave out."""
 
 
 class Suspect(NamedTuple):
@@ -69,18 +75,51 @@ def counterexample(
 
 def surely_broken(loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int) -> bool:
     """Whether the exact trajectory of a scenario breaks a requirement, rounding accounted for."""
+    *_, reached = enclosures(loop, scenario, item.time, start)
+    return most_room(item, reached) < 0
+
+
+def enclosures(loop: ClosedLoop, scenario: Scenario, steps: int, start: int) -> list[Box]:
+    """Boxes around the states of the exact trajectory of a scenario, rounding accounted for."""
     x0, w, v = scenario
-    reached = Box(x0, x0)
-    for t in range(item.time):
+    found = [Box(x0, x0)]
+    for t in range(steps):
         drawn = (None if part is None else part[t] for part in (w, v))
-        reached = successor_box(loop, reached, start + t, *drawn)
+        found.append(successor_box(loop, found[-1], start + t, *drawn))
+    return found
+
+
+def deviates(
+    loop: ClosedLoop, scenario: Scenario, states: Float[np.ndarray, "t n_x"], start: int
+) -> bool:
+    """Whether a simulated trajectory leaves the enclosure of a step by more than rounding.
+
+    Each step is enclosed from the state that was simulated, so that nothing adds up. Then what was
+    simulated is another loop than what is bounded.
+    """
+    _, w, v = scenario
+    for t, (x, following) in enumerate(itertools.pairwise(states)):
+        drawn = (None if part is None else part[t] for part in (w, v))
+        reached = successor_box(loop, Box(x, x), start + t, *drawn)
+        lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
+        with np.errstate(over="ignore", invalid="ignore"):
+            beyond = np.maximum(lower - following, following - upper)
+            slack = TOLERATED * (upper - lower + np.spacing(abs(following)))
+        if np.any(beyond > slack):
+            return True
+    return False
+
+
+def most_room(item: Requirement, reached: Box) -> float:
+    """How far a state of a box may be on the right side of a requirement, at most.
+
+    Negative where every state of it surely breaks the requirement. Of an ellipsoid only the sign is
+    known: infinite, or the least negative number.
+    """
     lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
     if item.ball is not None:
-        return (
-            _surely_beyond(item.ball, reached)
-            if item.inside
-            else _surely_within(item.ball, reached)
-        )
+        broken = _surely_beyond if item.inside else _surely_within
+        return -TINY if broken(item.ball, reached) else np.inf
     C, d = balanced(*(np.asarray(part) for part in item.region.facets), inner=not item.inside)
     ends = np.where(C > 0, lower, upper), np.where(C > 0, upper, lower)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -88,9 +127,16 @@ def surely_broken(loop: ClosedLoop, item: Requirement, scenario: Scenario, start
         size = np.sum(abs(C) * np.maximum(abs(lower), abs(upper)), axis=1)
         underflow = TINY * ((C != 0) @ ((lower != 0) | (upper != 0)))
         error = gamma(len(lower)) * size + underflow
-        if item.inside:
-            return bool(np.any(least - error > d))
-        return bool(np.all(most + error <= d))
+        lengths = np.linalg.norm(C, axis=1)
+        if item.inside:  # the comparison decides, whatever becomes of the quotient
+            broken = bool(np.any(least - error > d))
+            room = float(np.min((d - (least - error)) / lengths))
+        else:
+            broken = bool(np.all(most + error <= d))
+            room = float(np.max((most + error - d) / lengths))
+    if broken:
+        return min(room, -TINY)
+    return np.inf if np.isnan(room) else max(room, 0.0)
 
 
 def _surely_within(ball: Ellipsoid, box: Box) -> bool:

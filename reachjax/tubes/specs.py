@@ -23,6 +23,7 @@ from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.recurrence import for_ever
 from reachjax.tubes.refutations import counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, of_tube
+from reachjax.tubes.soundness import Claim, require_unbroken
 from reachjax.tubes.verdicts import Verdict, VerdictStatus, of_cells
 
 
@@ -58,6 +59,7 @@ def verify(
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, a part
             of the tube was exchanged for another one, or the tube is traced inside `jax.jit`; or
             something is required for ever of a loop that varies in time, or at given times only.
+        UnsoundError: a simulated trajectory breaks what is proved: a defect to be reported.
 
     Source: equations (reach_avoid) and (reach_avoid_approx) of the paper.
 
@@ -106,7 +108,7 @@ def _decided(
         runs = runs.some(np.asarray(X0.contains(runs.states[:, 0], BESIDE)))
     margins: dict[str, np.ndarray] = {}
     simulated: dict[str, np.ndarray] = {}
-    proved, found = True, []
+    proved, found, claims = True, [], list[Claim]()
     for item in required:
         blank = np.full(tube.horizon + 1, np.nan)
         compared, rooms = item.compared(tube), item.simulated(runs.states)
@@ -116,11 +118,12 @@ def _decided(
         margins.setdefault(item.name, blank.copy())[item.time] = margin
         simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min(initial=np.inf)
         proved = proved and holds
+        claims.append(Claim(item, margin, holds))
         found += suspects(item, rooms, runs)
+    begun = Scenarios.of(tube.loop, tube.sets[0], tube.horizon, tube.start)
+    require_unbroken(tube.loop, begun, tube.start, runs, claims)
     example = counterexample(tube.loop, X0, found, tube.start)
     if example is not None:
-        if proved:
-            raise RuntimeError("a proved specification is broken: please report this defect")
         return Verdict(VerdictStatus.REFUTED, margins, simulated, example, unsolved)
     status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
     return Verdict(status, margins, simulated, None, unsolved)

@@ -41,6 +41,7 @@ from reachjax.tubes.propagation import deadline_of, known_numbers
 from reachjax.tubes.requirements import AvoidSets, Region, Timed, requirements
 from reachjax.tubes.seals import seal_of
 from reachjax.tubes.sieve import TOGETHER, Ends, Margins, Sieve, Sifted, no_margins
+from reachjax.tubes.soundness import require_unbroken_cells
 from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
 from reachjax.tubes.winning_sets import WinningSet
 
@@ -128,6 +129,7 @@ def winning_set(
         TypeError: an argument is of another kind, or a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or what
             is known is of another question.
+        UnsoundError: a simulated trajectory breaks what is proved: a defect to be reported.
 
     Example:
         >>> from reachjax import MLP, AffinePlant
@@ -172,6 +174,7 @@ def winning_set(
     with closing(run.results(executor)) as results:  # a bar may end before they do
         for _ in wrapped(progress, results):
             pass
+    require_unbroken_cells(loop, domain, horizon, start, required, run.done)
     return WinningSet(domain, tuple(run.done), seal)
 
 

@@ -29,10 +29,10 @@ def unclear(error: BaseException) -> str | None:
     """
     inside, line = _origin(error)
     raised = inside and line.startswith("raise ")
+    if isinstance(error, rj.UnsoundError):
+        return "what is certified is broken"
     if type(error) not in (ValueError, TypeError, RuntimeError, NotImplementedError) or not raised:
         return f"{type(error).__name__} from {'within' if inside else 'elsewhere'}"
-    if "please report" in str(error):
-        return "a proved specification is broken"
     if not NAMES.search(str(error)):
         return "no argument named"
     heard = error.__context__

@@ -15,8 +15,8 @@ from pathlib import Path
 import jax
 import pytest
 
-pytest_plugins = ["tests.campaign.session"]
-"""Its options have to be known before the folder of the campaign is read."""
+pytest_plugins = ["tests.campaign.session", "tests.selection"]
+"""Their options have to be known before any test is read."""
 
 ROOT = Path(__file__).parent
 
@@ -28,7 +28,7 @@ QUICKER = {
 }
 """With them a tube's gradient is compiled in a third of the time, and runs as fast as without."""
 
-LARGEST = 6 * 2**30
+LARGEST = 5 * 2**28
 """Bytes that a process may take before it forgets what it compiled."""
 
 
@@ -65,9 +65,9 @@ def taken() -> int:
         return 0
 
 
-@pytest.fixture(autouse=True, scope="module")
+@pytest.fixture(autouse=True)
 def _memory_is_bounded():
-    """Files share what they compiled, until it fills gigabytes."""
+    """Tests share what they compiled until it fills a gigabyte; the cache on disk keeps it."""
     yield
     if taken() > LARGEST:
         jax.clear_caches()

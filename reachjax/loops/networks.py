@@ -243,27 +243,45 @@ class Network(AbstractNetwork):
         return cls(chain, *chain.sizes)
 
     @classmethod
-    def from_onnx(cls, path: str | os.PathLike[str]) -> Network:
+    def from_onnx(
+        cls,
+        path: str | os.PathLike[str],
+        inputs: str | Sequence[str] | None = None,
+        output: str | None = None,
+    ) -> Network:
         """A network from an ONNX file, such as `torch.onnx.export` writes them.
 
         Its weights are taken as they stand, and what is certified is the function of real numbers
         that they define: a runtime in 32-bit floats differs from it by its own rounding, some 1e-7
         of the sizes of numbers within the network. Input and output are flattened; dimensions that
-        the file leaves open, as of a batch, are 1.
+        the file leaves open, as of a batch, are 1. A graph that is against ONNX's rules, or has
+        anything that is not understood, is refused; where onnxruntime is installed, both are
+        evaluated at a few points and must agree.
 
         Args:
             path: of the file.
+            inputs: names of the inputs whose entries make up the vector, in this order; None for
+                the only one that is used.
+            output: the name of the output; None for the only one.
 
         Raises:
             FileNotFoundError: there is no such file.
             ImportError: the package `onnx` is missing.
-            TypeError: an operator's function has no bounds.
-            ValueError: it is no ONNX file, has several inputs or outputs, or an operator that is
-                not known.
+            TypeError: an operator's function has no bounds, or a name is no text.
+            ValueError: it is no ONNX file, or is not understood; the error names the node.
         """
-        from reachjax.loops.formats.onnx_graphs import read_graph
+        from reachjax.loops.formats.onnx_graphs import culprit, read_graph
 
-        return cls(*read_graph(existing_file("path", path)))
+        path = existing_file("path", path)
+        for name, value in (("inputs", inputs), ("output", output)):
+            texts = [value] if value is None or name == "output" else value
+            if not all(each is None or isinstance(each, str) for each in texts):
+                raise TypeError(f"{name} must be names of the file, but {value!r} arrived")
+        graph, *sizes = read_graph(path, inputs, output)
+        try:
+            return cls(graph, *sizes)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"{path}, {culprit(graph)}: {error}") from error
 
     def __repr__(self) -> str:
         return f"Network(inputs={self.inputs}, outputs={self.outputs})"

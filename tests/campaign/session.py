@@ -25,7 +25,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--cases", default=None, help=f"how many cases ({len(DEFAULT)} of them)", **number
     )
     group.addoption("--case", default=None, help="one case alone", **number)
-    group.addoption("--seed", default=0, help="of all cases (0)", **number)
+    group.addoption("--seed", default=0, help="of all that is drawn (0)", **number)
     group.addoption("--resume", action="store_true", help="keep the cases that are finished")
 
 

@@ -54,6 +54,7 @@ def every_chain(step):
     return (drawn(first + k) for first in CHAINS for k in range(0, BLOCK, step))
 
 
+@pytest.mark.costly
 def test_longdouble_is_off_by_no_more_than_it_says():
     for case in every_chain(7):
         if case.initial.inner is None:
@@ -130,6 +131,7 @@ def test_the_search_finds_about_as_much_as_many_samples(first):
     assert np.all(extremes(case, most)[0] >= most - 0.2 * ranges)
 
 
+@pytest.mark.costly
 def test_the_search_attains_the_suprema_of_affine_loops():
     checked = 0
     for case in every_chain(3):
@@ -270,6 +272,7 @@ def same(one, other):
     )
 
 
+@pytest.mark.costly
 def test_an_outcome_survives_being_written():
     outcome = tried(drawn(0))
     again = Outcome.read(json.loads(json.dumps(outcome.record())))

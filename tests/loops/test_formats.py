@@ -229,8 +229,10 @@ def test_weights_of_a_file_have_derivatives(tmp_path):
 
 
 def test_an_operator_that_is_not_known_is_named(tmp_path):
-    path = written(tmp_path / "net.onnx", [helper.make_node("Erf", ["x"], ["y"], name="bump")], {})
-    with pytest.raises(ValueError, match=r"net\.onnx contains the operator 'Erf' \(node 'bump'\)"):
+    path = written(
+        tmp_path / "net.onnx", [helper.make_node("Hardmax", ["x"], ["y"], name="bump")], {}
+    )
+    with pytest.raises(ValueError, match=r"net\.onnx .* operator 'Hardmax' \(node 'bump'\)"):
         rj.Network.from_onnx(path)
     other = helper.make_node("Relu", ["x"], ["y"], domain="mine")
     with pytest.raises(ValueError, match="'Relu'"):
@@ -252,7 +254,7 @@ def test_what_is_no_network_of_one_input_is_refused(tmp_path):
     with pytest.raises(TypeError, match="path must be the path of a file, but 3 arrived"):
         rj.Network.from_file(3)
     path.write_bytes(b"no protobuf at all")
-    with pytest.raises(ValueError, match=r"net\.onnx cannot be read as an ONNX file"):
+    with pytest.raises(ValueError, match=r"net\.onnx cannot be read: it is no ONNX file"):
         rj.Network.from_onnx(path)
     both = model([node("Relu", "x", "y")], {})
     both.graph.output.append(both.graph.input[0])
@@ -261,7 +263,7 @@ def test_what_is_no_network_of_one_input_is_refused(tmp_path):
         rj.Network.from_onnx(path)
     wrong = {"shape": np.array([7, 5])}
     written(path, [node("Reshape", "x shape", "y")], wrong)
-    with pytest.raises(ValueError, match="cannot be evaluated for one input vector"):
+    with pytest.raises(ValueError, match=r"net\.onnx cannot be read: the node 'y' \(Reshape\)"):
         rj.Network.from_onnx(path)
 
 

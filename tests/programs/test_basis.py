@@ -211,6 +211,7 @@ def test_the_papers_matrices_give_states_units_and_successor(n_x, boxed, hidden)
         np.testing.assert_allclose(actual, np.hstack(expected), atol=1e-11, err_msg=name)
 
 
+@pytest.mark.costly
 def test_a_traced_time_compiles_once():
     loop, traces = closed_loop(loop_data(2, True)), []
 

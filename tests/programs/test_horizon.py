@@ -92,6 +92,7 @@ def values(forms, columns):
     return forms.rows[:, 0] + columns[:, : forms.columns.shape[1]] @ forms.columns.T
 
 
+@pytest.mark.costly
 def test_no_column_is_larger_than_one(case):
     *_, horizon, _, _, columns = case
     states = horizon.start.spread.shape[1]
@@ -101,6 +102,7 @@ def test_no_column_is_larger_than_one(case):
     assert abs(rest).max(initial=0.0) <= 1 + 1e-9
 
 
+@pytest.mark.costly
 def test_units_switch_in_every_case(case):
     *_, horizon, _, _, _ = case
     assert len(horizon.zero) >= 2

@@ -137,6 +137,7 @@ def test_some_bounds_are_much_tighter_than_those_by_intervals(kind, n_x):
 
 
 @pytest.mark.parametrize("n_x", [1, 2, 3, 6])
+@pytest.mark.costly
 def test_the_bounds_of_the_first_layer_are_its_supports(n_x):
     data = random_loop(n_x, seed=4)
     W, b = data.layers[0]

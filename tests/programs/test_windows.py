@@ -40,6 +40,7 @@ def tube_of(data, relaxation, window, scale=1.0, **options):
     ),
     ids=str,
 )
+@pytest.mark.costly
 def test_longer_windows_are_tighter_and_hold_every_sample(relaxation, steps):
     data = random_loop(2, hidden=(4, 3), seed=1, steps=steps)
     tubes = [tube_of(data, relaxation, window) for window in (1, 2, HORIZON)]
@@ -56,6 +57,7 @@ def test_longer_windows_are_tighter_and_hold_every_sample(relaxation, steps):
 
 
 @pytest.mark.parametrize("window", [2, None])
+@pytest.mark.costly
 def test_a_window_begins_at_the_time_of_its_first_set(window):
     data = random_loop(2, hidden=(4, 3), seed=4, steps=6)
     tube = tube_of(data, rj.CuttingPlanes(), window, start=2)
@@ -75,6 +77,7 @@ def test_a_window_of_any_length_may_be_asked_for():
     np.testing.assert_allclose(long.sets[-1].b, whole.sets[-1].b, atol=1e-9)
 
 
+@pytest.mark.costly
 def test_the_length_is_chosen_by_the_columns_that_are_needed(monkeypatch):
     monkeypatch.setattr(importlib.import_module("reachjax.tubes.propagation"), "LARGEST_WINDOW", 8)
     data = random_loop(2, hidden=(5, 4), seed=2)
@@ -87,6 +90,7 @@ def test_the_length_is_chosen_by_the_columns_that_are_needed(monkeypatch):
     assert all(n <= max(9, m) for n, m in zip(used, alone, strict=True))
 
 
+@pytest.mark.costly
 def test_units_that_left_the_basis_take_no_columns():
     loop = closed_loop(random_loop(2, hidden=(20, 20), seed=1))
     box = rj.Box([0.0, 0.0], [1e-3, 1e-3])
@@ -175,6 +179,7 @@ def test_facts_hold_of_every_trajectory(n_x, kind, relaxation):
             assert np.all(np.linalg.norm(cone[:, 1:], axis=1) <= cone[:, 0] + 1e-12)
 
 
+@pytest.mark.costly
 def test_traced_windows_need_a_number():
     data = random_loop(2, hidden=(3, 2), seed=2)
     X0, template = rj.Box([0.0, 0.0], [0.1, 0.1]), rj.Template.box(2)

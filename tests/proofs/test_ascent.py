@@ -95,6 +95,7 @@ def test_values_are_those_after_so_many_steps(k):
     assert np.all(best >= sampled.max(axis=0) - 0.01 * np.ptp(sampled, axis=0))
 
 
+@pytest.mark.costly
 def test_a_time_varying_loop_is_climbed_from_its_start():
     data, X = random_loop(2, seed=3, steps=4), initial_set("box", 2, seed=3)
     A, B, c, lower, upper = (

@@ -155,6 +155,7 @@ def test_rounding_errors_of_the_rows_are_paid_for(case):
 
 
 @pytest.mark.parametrize("n_x", [1, pytest.param(2, marks=pytest.mark.long), 3])
+@pytest.mark.costly
 def test_degenerate_sets_and_networks_stay_sound(n_x):
     """A single point, a set flat in one coordinate, dead neurons, a network that is zero."""
     point, wide = np.linspace(-0.2, 0.3, n_x), np.full(n_x, 0.5)

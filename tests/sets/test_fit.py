@@ -153,6 +153,7 @@ def test_a_template_of_fewer_steps_than_the_horizon_is_an_error():
         rj.reach(loop, X0, 3, template)
 
 
+@pytest.mark.costly
 def test_a_tube_in_one_shot_has_about_the_area_of_the_states():
     data, (_, _, X0) = random_loop(2, hidden=(4,), seed=1), case(2)
     loop = closed_loop(data)

@@ -77,6 +77,7 @@ LARGE = ["three states", "a time-varying loop"]
         lambda name, window: (window == 1) == (name in STEPWISE) and name not in LARGE,
     ),
 )
+@pytest.mark.costly
 def test_no_bound_is_looser_than_with_local_bounds(name, window):
     case = CASES[name]
     data = random_loop(**case)
@@ -88,6 +89,7 @@ def test_no_bound_is_looser_than_with_local_bounds(name, window):
 
 
 @pytest.mark.parametrize("kind", SETS)
+@pytest.mark.costly
 def test_sets_of_every_kind(kind):
     data = random_loop(2, seed=1)
     X0, states = initial(kind, 2)
@@ -104,6 +106,7 @@ def test_as_tight_as_all_products(seed):
     assert len(few.program.products.free) <= len(every.program.products.free)
 
 
+@pytest.mark.costly
 def test_without_rounds_the_products_of_local_bounds_are_there_all_the_same():
     data = random_loop(2, hidden=(8, 6), seed=3)
     X0, states = initial("box", 2, seed=3)
@@ -198,6 +201,7 @@ def sizes(layers, X0, data, window, cuts=CUTS, horizon=2):
 
 
 @pytest.mark.parametrize("window", some([1, 2, None], lambda window: window is None))
+@pytest.mark.costly
 def test_the_gradient_is_that_of_differences(window):
     data = random_loop(2, hidden=(4, 3), seed=5)
     X0, _ = initial("box", 2, seed=5)
@@ -242,6 +246,7 @@ MOVED = {
 
 
 @pytest.mark.parametrize("kind", some(MOVED, lambda kind: kind == "polytope"))
+@pytest.mark.costly
 def test_the_gradient_in_the_initial_set_is_that_of_differences(kind):
     loop, (X0, _) = closed_loop(random_loop(2, hidden=(4, 3), seed=5)), initial(kind, 2, seed=5)
 
@@ -254,6 +259,7 @@ def test_the_gradient_in_the_initial_set_is_that_of_differences(kind):
 
 
 @pytest.mark.parametrize("horizon", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.costly
 def test_compiled_bounds_are_between_those_of_cuts_and_of_local_bounds(horizon):
     """Where numbers are traced nobody sees what a moment violates: products are LocalBounds'."""
     data = random_loop(2, hidden=(4, 3), seed=5)

@@ -58,6 +58,7 @@ OTHERS += [(1, (3,), 0, True), (2, (2, 2), 1, False), (2, (2, 2), 1, True)]
     ("n", "hidden", "seed", "repeated"),
     [(2, (3,), 0, False), *(pytest.param(*case, marks=pytest.mark.long) for case in OTHERS)],
 )
+@pytest.mark.costly
 def test_the_gradient_agrees_with_diffcp(n, hidden, seed, repeated):
     loop = closed_loop(random_loop(n, hidden=hidden, seed=seed))
     corners = box_region(n, seed).corners

@@ -61,6 +61,7 @@ FIVE_STEPS = [
 
 
 @pytest.mark.parametrize(("seed", "polytope"), FIVE_STEPS)
+@pytest.mark.costly
 def test_the_gradient_of_five_steps_is_the_central_difference(seed, polytope):
     """Neurons leave and enter the basis on the way."""
     args = planar(seed, polytope)
@@ -84,6 +85,7 @@ def test_the_gradient_of_a_volume_penalty_is_the_central_difference():
     assert error_in_all_parts(jax.jit(f), args, gradient, ALL_PARTS) <= PROMISED
 
 
+@pytest.mark.costly
 def test_the_gradient_is_as_accurate_as_the_solver():
     loop, X0 = planar(1)
     exact = jax.grad(partial(value, horizon=5))(loop, X0)
@@ -117,6 +119,7 @@ def agree(first, second):
     assert norm(jax.tree.map(jnp.subtract, first, second)) <= 3e-5 * norm(second)
 
 
+@pytest.mark.costly
 def test_compiled_and_plain_gradients_agree():
     args = planar(0)
     plain = jax.grad(value, argnums=(0, 1))(*args, 2)
@@ -124,6 +127,7 @@ def test_compiled_and_plain_gradients_agree():
     agree(plain, compiled)
 
 
+@pytest.mark.costly
 def test_a_batch_of_networks_and_sets_equals_one_at_a_time():
     loop, X0 = planar(0)
     nets = [jax.tree.map(lambda w, s=s: w * (1 + s), loop.controller) for s in (0.0, 0.1, 0.2)]
@@ -156,6 +160,7 @@ def test_scan_and_remat_give_the_same_gradient():
     agree(jax.tree.map(lambda leaf: leaf[0], first), plain.controller)
 
 
+@pytest.mark.costly
 def test_a_training_loop_compiles_once_while_neurons_become_stable():
     loop, X0 = planar(0)
     compiled = []
@@ -179,6 +184,7 @@ def test_a_training_loop_compiles_once_while_neurons_become_stable():
     assert len(compiled) == 1
 
 
+@pytest.mark.costly
 def test_forward_mode_and_second_derivatives_raise():
     loop, X0 = planar(0)
     of = lambda c: value(loop.replace(plant=loop.plant.replace(c=c)), X0)  # noqa: E731
@@ -208,6 +214,7 @@ def test_second_derivatives_of_forms_and_branches_are_refused(relaxation):
 @pytest.mark.parametrize(
     "template", [TEMPLATE, rj.EllipsoidTemplate(), rj.EllipsoidTemplate(np.eye(2))], ids=str
 )
+@pytest.mark.costly
 def test_second_derivatives_in_reverse_mode_raise(template, wrapped):
     """Numbers cross to the host as integers, whose derivative would be zero."""
     loop, X0 = planar(0)
@@ -222,6 +229,7 @@ def test_second_derivatives_in_reverse_mode_raise(template, wrapped):
 
 
 @pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.costly
 def test_the_gradient_is_the_central_difference_in_other_dimensions(n):
     region = box_region(n, seed=n)
     X0 = rj.Box(region.corners.min(axis=0), region.corners.max(axis=0))
@@ -257,6 +265,7 @@ def test_flat_and_thin_sets_and_points_have_gradients(widths):
         assert relative_error(f, args, gradient, direction, STEP) <= PROMISED
 
 
+@pytest.mark.costly
 def test_a_coordinate_that_becomes_constant_has_a_gradient():
     plant = rj.AffinePlant([[1.0, 1.0], [0.0, 0.0]], [[0.5], [0.0]], [0.0, 0.3])
 
@@ -272,6 +281,7 @@ def test_a_coordinate_that_becomes_constant_has_a_gradient():
         )
 
 
+@pytest.mark.costly
 def test_an_input_range_of_zero_width_has_a_one_sided_gradient():
     def f(lower, upper):
         loop = rj.ClosedLoop(INTEGRATOR, FORKED, input_box=rj.Box(lower, upper))
@@ -284,6 +294,7 @@ def test_an_input_range_of_zero_width_has_a_one_sided_gradient():
     np.testing.assert_allclose(gradient[1], (f(zero, zero + h) - f(zero, zero)) / h, atol=1e-4)
 
 
+@pytest.mark.costly
 def test_normals_have_a_derivative_where_bounds_are_attained_at_corners():
     loop, X0 = planar(1, polytope=True)
 
@@ -397,6 +408,7 @@ def test_the_gradient_of_an_interval_bound_is_the_central_difference(monkeypatch
         assert relative_error(f, args, gradient, along(part, *args, 0), 1e-5) <= 1e-6, part
 
 
+@pytest.mark.costly
 def test_a_neuron_whose_weights_have_decayed_does_not_spoil_the_gradient():
     """Its input is constant but for 1e-10: facts of that size would have multipliers of 1e5."""
     loop, X0 = planar(3)

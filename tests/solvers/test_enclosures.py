@@ -127,6 +127,7 @@ LONG = [
     ("n", "horizon", "seed", "template"),
     [*SHORT, *(pytest.param(*args, marks=pytest.mark.long) for args in LONG)],
 )
+@pytest.mark.costly
 def test_the_gradient_is_the_central_difference(n, horizon, seed, template):
     f = final(rj.EllipsoidTemplate(np.eye(n) if template == "given shape" else None), horizon)
     args = case(n, seed)

@@ -163,6 +163,7 @@ def test_faults_inside_jit_are_failed_proposals_too(fault):
     ids=["nothing", "too few multipliers", "NaN", "unknown status"],
 )
 @pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.costly
 def test_a_solver_may_be_wrong_in_a_compiled_step_too(answer, compiled):
     @dataclasses.dataclass(frozen=True)
     class Wrong(rj.AbstractSolver):

@@ -238,10 +238,12 @@ def planar_gradient():
     return jax.jit(value), args, jax.jit(jax.grad(value, argnums=(0, 1)))(*args)
 
 
+@pytest.mark.costly
 def test_the_gradient_is_the_central_difference(planar_gradient):
     assert error_in_all_parts(*planar_gradient, ALL_PARTS) <= PROMISED
 
 
+@pytest.mark.costly
 def test_compiled_and_plain_gradients_agree(planar_gradient):
     f, args, gradient = planar_gradient
     assert float(f(*args)) == pytest.approx(float(value(*args)), abs=1e-7)
@@ -250,6 +252,7 @@ def test_compiled_and_plain_gradients_agree(planar_gradient):
     assert np.sqrt(dot(off, off) / dot(plain, plain)) <= 1e-4
 
 
+@pytest.mark.costly
 def test_scan_and_vmap_equal_one_at_a_time(planar_gradient):
     f, (loop, X0), _ = planar_gradient
     nets = [jax.tree.map(lambda w, s=s: w * (1 + s), loop.controller) for s in (0.0, 0.1)]
@@ -418,6 +421,7 @@ def test_a_path_that_is_lost_still_gives_an_ellipsoid(network):
 @pytest.mark.parametrize(
     "shape", [pytest.param(None, marks=pytest.mark.long), np.eye(2)], ids=["free", "given"]
 )
+@pytest.mark.costly
 def test_gradients_of_ellipsoids_of_weights_that_are_no_numbers_are_none(shape):
     loop, X = closed_loop(random_loop(2)), round_of(2, 0)
 

@@ -60,6 +60,7 @@ def test_penalties_of_cells_are_the_mean_of_theirs(case, relaxation):
     assert penalty(X0, cells=(1, 3)) <= penalty(X0) * (1 + 1e-6)
 
 
+@pytest.mark.costly
 def test_cells_have_derivatives_in_compiled_code(case):
     loop, X0 = case
 
@@ -112,6 +113,7 @@ def test_bad_cells_are_named(case, cells, X0, error, match):
         rj.volume_penalty(loop, X0 or box, 1, TEMPLATE, cells=cells)
 
 
+@pytest.mark.costly
 def test_a_gradient_step_lowers_each_penalty(case):
     loop, X0 = case
     for penalty in (
@@ -178,6 +180,7 @@ class Counting(rj.AbstractSolver):
 
 
 @pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.costly
 def test_nothing_is_solved_at_steps_without_a_weight(case, compiled):
     loop, X0 = case
     solver = Counting()
@@ -495,6 +498,7 @@ def test_a_schedule_takes_arrays_and_penalties_of_single_precision():
     assert [float(apply(step)) for step in range(3)] == [1.0, 0.0, 1.0]
 
 
+@pytest.mark.costly
 def test_a_batch_of_networks_is_penalised_one_by_one(case):
     loop, X0 = case
     penalty = partial(rj.specification_penalty, goal=GOAL, margin=0.1)

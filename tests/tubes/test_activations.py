@@ -104,6 +104,7 @@ def test_intervals_hold_what_is_simulated(options):
 
 
 @each_controller
+@pytest.mark.costly
 def test_units_that_are_affine_leave_the_basis_and_the_set_is_then_exact(options):
     # no input is near a kink: all units are affine on a tiny set
     case, X = controlled(n_x=2, seed=4, boxed=False, **options), initial_box(2, 1e-4)
@@ -154,6 +155,7 @@ def test_garbage_multipliers_prove_what_holds(tube_of):
         lambda place, n_x: n_x == [3, 6, 1, 3][place],
     ),
 )
+@pytest.mark.costly
 def test_sets_of_other_dimensions_hold_every_sample(place, n_x):
     case, X = controlled(n_x=n_x, seed=n_x, **CONTROLLERS[place]), initial_box(n_x)
     template = rj.Template(directions(n_x, extra=1))

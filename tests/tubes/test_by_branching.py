@@ -143,6 +143,7 @@ def small():
     return loop, X0, rj.reach(loop, X0, 2, rj.Template.box(2), samples=100)
 
 
+@pytest.mark.costly
 def test_it_is_as_tight_as_products_alone(small):
     loop, X0, tube = small
     other = rj.reach(loop, X0, 2, rj.Template.box(2), rj.CuttingPlanes(), samples=100)

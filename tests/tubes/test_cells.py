@@ -106,6 +106,7 @@ def test_what_is_interrupted_keeps_what_is_proved(monkeypatch):
     assert caught.value.tube.horizon == 2
 
 
+@pytest.mark.costly
 def test_derivatives_are_those_of_what_is_proved():
     def size(lower, gravity):
         def f(gravity, x, u):
@@ -169,6 +170,7 @@ DIAMOND = np.array([[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
     [("polytope", 1000, 3e-3), ("polytope", 1, 3e-3), ("intersection", 1, 2e-2)],
     ids=["cells", "programs", "both"],
 )
+@pytest.mark.costly
 def test_derivatives_in_polytopes_are_those_of_their_facets(kind, cells, tolerance):
     plant = rj.NonlinearPlant(
         lambda x, u: jnp.array([x[0] + 0.2 * x[1], x[1] + 0.1 * jnp.sin(x[0]) + 0.2 * u[0]]), 2, 1

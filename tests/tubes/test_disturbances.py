@@ -57,6 +57,7 @@ def test_no_scenario_leaves_a_tube_by_forms_or_branches(n, kind):
         (rj.PaperQC(), "box", rj.EllipsoidTemplate()),
     ],
 )
+@pytest.mark.costly
 def test_no_scenario_leaves_a_tube_by_windows(relaxation, kind, template):
     loop = disturbed_loop(2, disturbance_set(kind, 2), disturbance_set("box", 2, seed=3), seed=1)
     states = attacked(loop, initial(2), 2)
@@ -65,6 +66,7 @@ def test_no_scenario_leaves_a_tube_by_windows(relaxation, kind, template):
     assert all(s is rj.SolverStatus.SOLVED for k in (1, 2) for s in tube.proof(k).statuses)
 
 
+@pytest.mark.costly
 def test_no_scenario_leaves_a_tube_by_long_windows_and_cuts():
     loop = disturbed_loop(2, disturbance_set("polytope", 2), disturbance_set("box", 2, 3), seed=1)
     relaxation = rj.CuttingPlanes(rounds=0)
@@ -93,6 +95,7 @@ def test_time_varying_loops_from_a_later_time():
         rj.reach(loop, initial(n), 3, rj.Template.box(n), start=1)
 
 
+@pytest.mark.costly
 def test_sets_are_as_large_as_what_is_reached():
     """Against mixed-integer programs over initial states, disturbances and noise."""
     loop, X0 = double_integrator()
@@ -145,6 +148,7 @@ def test_noise_alone_and_disturbances_without_width():
     "relaxation", [rj.LinearBounds(), rj.BranchAndCut()], ids=lambda r: type(r).__name__
 )
 @pytest.mark.parametrize("kind", ["box", "polytope", "ellipsoid"])
+@pytest.mark.costly
 def test_gradients_are_those_of_differences(relaxation, kind):
     loop = disturbed_loop(2, disturbance_set(kind, 2), disturbance_set("box", 2, 3), seed=1)
     X0, template = initial(2), rj.Template.octagonal(2)
@@ -174,6 +178,7 @@ def test_gradients_are_those_of_differences(relaxation, kind):
         assert abs(exact - difference) <= 1e-4 * max(abs(difference), 1e-2)
 
 
+@pytest.mark.costly
 def test_a_compiled_gradient_is_the_same():
     loop, X0 = double_integrator()
 
@@ -324,6 +329,7 @@ def test_mistakes_are_named(call, error, message):
         call()
 
 
+@pytest.mark.costly
 def test_no_scenarios_are_split_into_parts_of_none():
     loop, _ = double_integrator()
     states, w, v = loop.split(np.zeros((0, 2 + 3 * 4)))

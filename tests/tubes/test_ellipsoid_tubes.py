@@ -41,6 +41,7 @@ def test_no_state_is_outside_an_ellipsoid(n, relaxation):
     assert all(tube.proof(t).recheck() <= 1 for t in (1, 2, 3))
 
 
+@pytest.mark.costly
 def test_no_state_of_six_is_outside_an_ellipsoid_of_a_varying_loop():
     loop = closed_loop(random_loop(6, hidden=(4, 4), seed=3, steps=2))
     tube = recursion(loop, ellipsoid(6, 3), 2, rj.EllipsoidTemplate())
@@ -96,6 +97,7 @@ def test_a_given_shape_is_kept_and_larger_than_the_minimum_volume():
     np.testing.assert_allclose(given.sets[1].center, loop.step(X0.center, 0))
 
 
+@pytest.mark.costly
 def test_tighter_relaxations_give_smaller_ellipsoids():
     loop, X0 = case(3, 1)
     volumes = [
@@ -114,6 +116,7 @@ def affine(A, c=None):
     return rj.ClosedLoop(rj.AffinePlant(A, [[0.0], [0.0]], c), rj.MLP.from_layers(ZERO_NET))
 
 
+@pytest.mark.costly
 def test_a_flat_image_has_an_ellipsoid_that_is_nearly_flat():
     tube = recursion(
         affine([[1.0, 1.0], [2.0, 2.0]]),
@@ -198,6 +201,7 @@ class Claiming(rj.AbstractSolver):
 
 @pytest.mark.parametrize("shape", [None, np.eye(2)], ids=["free", "given"])
 @pytest.mark.parametrize("status", rj.SolverStatus)
+@pytest.mark.costly
 def test_whatever_a_solver_says_an_ellipsoid_has_a_gradient(status, shape):
     """The optimum's where numbers bear it out, and that of what is proved where they do not."""
     loop, X0 = case(2, 0)
@@ -252,6 +256,7 @@ class Held(rj.AbstractSolver):
     ),
     ids=["inaccurate-free", "inaccurate-given", "failed-free", "failed-given"],
 )
+@pytest.mark.costly
 def test_the_gradient_of_what_is_reported_is_the_central_difference(answering, shape, monkeypatch):
     monkeypatch.setattr(ellipsoids, "ATTEMPTS", 1)  # others would begin where the first one ended
     args, template = case(2, 0, hidden=(4, 3)), rj.EllipsoidTemplate(shape)
@@ -294,6 +299,7 @@ def test_a_failed_solver_still_gives_a_sound_ellipsoid(monkeypatch):
     ),
     ids=["1, free", "1, given", "2, free", "2, given"],
 )
+@pytest.mark.costly
 def test_compiled_batched_and_plain_ellipsoids_agree(shape, horizon):
     loop, X0 = case(2, 0, hidden=(3,))
 

@@ -93,6 +93,7 @@ def summed(loop, X0):
 
 
 @pytest.mark.parametrize("name", ["triangle", "pentagon", "cube"])
+@pytest.mark.costly
 def test_gradients_are_those_of_differences(name):
     loop = polytope_loop(SETS[name], seed=1)
     gradient = jax.grad(summed, argnums=(0, 1))(loop, X0)
@@ -101,6 +102,7 @@ def test_gradients_are_those_of_differences(name):
         assert relative_error(summed, (loop, X0), gradient, direction, 1e-5) < 1e-6, part
 
 
+@pytest.mark.costly
 def test_offsets_that_are_given_to_a_polytope_have_a_derivative():
     C, d = SETS["pentagon"]
     loop = polytope_loop((C, d), seed=1)
@@ -113,6 +115,7 @@ def test_offsets_that_are_given_to_a_polytope_have_a_derivative():
     np.testing.assert_allclose(jax.grad(f)(jnp.asarray(d)) @ by, difference, rtol=1e-6)
 
 
+@pytest.mark.costly
 def test_compiled_affine_forms_are_those_of_the_host_and_have_derivatives():
     loop = polytope_loop(SETS["triangle"], hidden=(3,), seed=3)
 
@@ -141,6 +144,7 @@ def test_verdicts_are_decided(room, status):
     assert rj.verify(tube, goal=goal).status.name == status
 
 
+@pytest.mark.costly
 def test_ellipsoids_and_partitions_hold_what_is_simulated():
     loop = polytope_loop(SETS["triangle"], hidden=(3,), seed=3)
     ball = rj.reach(loop, X0, 1, rj.EllipsoidTemplate())

@@ -34,6 +34,7 @@ def wins(loop, X):
     [rj.Box([1.0, -0.2], [1.2, 0.2]), rj.Ellipsoid([0.5, 0.0], [[0.01, 0.0], [0.0, 0.01]])],
     ids=["box", "ellipsoid"],
 )
+@pytest.mark.costly
 def test_it_is_proved_and_much_larger(loop, X0):
     found = rj.largest_set(loop, X0, HORIZON, rounds=10, relaxation=QUICK, **WANTED)
     assert found.verdict.status is rj.VerdictStatus.PROVED
@@ -57,6 +58,7 @@ def test_avoided_sets_are_kept_away_from():
     assert found.region.lower == pytest.approx(-2.0, abs=0.02)
 
 
+@pytest.mark.costly
 def test_it_can_be_gone_on_with_and_shows_its_progress(loop):
     seen = []
 
@@ -80,6 +82,7 @@ def test_what_begins_where_nothing_is_proved_is_named(loop):
         rj.largest_set(loop, rj.Polytope(np.eye(2), [1.0, 1.0]), HORIZON, **WANTED)
 
 
+@pytest.mark.costly
 def test_flat_sides_stay_flat(loop):
     point = rj.largest_set(scalar(0.9), rj.Box([1.0], [1.0]), 2, goal=rj.Box([-1.0], [2.0]))
     assert (point.region.lower, point.region.upper) == (1.0, 1.0)

@@ -159,6 +159,7 @@ def test_nothing_is_called_from_compiled_code():
     assert "callback" not in compiled.as_text()
 
 
+@pytest.mark.costly
 def test_a_training_step_compiles_once_whatever_switches():
     traced = []
 
@@ -176,6 +177,7 @@ def test_a_training_step_compiles_once_whatever_switches():
     assert len(traced) == 1
 
 
+@pytest.mark.costly
 def test_loops_and_sets_are_mapped_over():
     loops = [closed_loop(random_loop(2, seed=seed)) for seed in range(3)]
     X0 = initial_set("box", 2)
@@ -184,6 +186,7 @@ def test_loops_and_sets_are_mapped_over():
     np.testing.assert_allclose(values, [float(penalty(loop, X0)) for loop in loops], rtol=1e-9)
 
 
+@pytest.mark.costly
 def test_penalties_take_it():
     loop, X0, template = closed_loop(random_loop(2)), initial_set("box", 2), rj.Template.box(2)
     options = {"relaxation": rj.LinearBounds()}

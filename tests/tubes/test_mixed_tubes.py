@@ -74,6 +74,7 @@ def test_a_step_has_what_either_template_alone_has(X0):
     np.testing.assert_allclose(both.support(D), least, atol=1e-6)
 
 
+@pytest.mark.costly
 def test_later_sets_are_smaller_than_those_of_either_template_alone():
     loop, X0 = case(3, 1)
     both = recursion(loop, X0, 3, rj.MixedTemplate(FACETS[3]))
@@ -96,11 +97,13 @@ def test_facets_tell_a_program_what_the_ellipsoid_does_not():
 
 
 @pytest.mark.parametrize("relaxation", [rj.PaperQC(), rj.LocalBounds(remove_stable=False)], ids=str)
+@pytest.mark.costly
 def test_other_relaxations_hold_too(relaxation):
     loop, X0 = case(2, 1, hidden=(3,))
     assert all(holds(recursion(loop, X0, 2, rj.MixedTemplate(FACETS[2]), relaxation)))
 
 
+@pytest.mark.costly
 def test_flat_images_and_flat_parts_hold():
     plant = rj.AffinePlant([[1.0, 1.0], [2.0, 2.0]], [[0.0], [0.0]])
     loop = rj.ClosedLoop(plant, rj.MLP.from_layers([([[0.0, 0.0]], [0.0])]))
@@ -139,6 +142,7 @@ def final(template, horizon):
     ],
     ids=["1, least volume", "1, given shape", "3, least volume", "3, given shape"],
 )
+@pytest.mark.costly
 def test_the_gradient_is_the_central_difference(horizon, shape):
     f = final(rj.MixedTemplate(rj.Template.box(2), rj.EllipsoidTemplate(shape)), horizon)
     args = case(2, 1)
@@ -161,6 +165,7 @@ def test_compiled_and_plain_penalties_agree(horizon):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.costly
 def test_compiled_and_plain_steps_agree():
     loop, X0 = case(1, 0, hidden=(3,))[0], intersection(1)
 

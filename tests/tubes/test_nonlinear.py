@@ -113,6 +113,7 @@ def test_no_state_is_outside(case, relaxation):
         assert np.all(proof.gaps >= -1e-12 * (1 + abs(np.asarray(proof.bounds))))
 
 
+@pytest.mark.costly
 def test_compiled_sets_are_those_of_the_host(case):
     loop, X0 = case
     template = rj.Template.box(loop.states)
@@ -150,6 +151,7 @@ def test_sets_are_tight(name, most):
 
 @pytest.mark.parametrize("relaxation", RELAXATIONS[:2], ids=lambda r: type(r).__name__)
 @pytest.mark.parametrize("name", ["pendulum", "boxed", "ball", "tank"])
+@pytest.mark.costly
 def test_derivatives_are_central_differences(name, relaxation):
     loop, X0 = LOOPS[name]
     template = rj.Template.box(loop.states)
@@ -206,6 +208,7 @@ def test_specifications_are_decided():
     assert rj.decide(loop, X0, HORIZON, goal=small).status.name == "REFUTED"
 
 
+@pytest.mark.costly
 def test_ellipsoids_and_mixed_sets_hold_every_state():
     loop, X0 = LOOPS["pendulum"]
     runs = trajectories(loop, X0)
@@ -216,6 +219,7 @@ def test_ellipsoids_and_mixed_sets_hold_every_state():
             assert np.all(np.asarray(tube.sets[t].contains(runs[:, t], 1e-9)))
 
 
+@pytest.mark.costly
 def test_cells_hold_every_state_together():
     loop, X0 = LOOPS["wide"]
     tube = rj.reach_partitioned(

@@ -79,6 +79,7 @@ def test_cells_of_cells_have_no_more_facets():
     assert len(quarter.part.facts()) == len(half.part.facts()) == 4
 
 
+@pytest.mark.costly
 def test_a_state_beside_the_set_refutes_nothing():
     # cells that a skewed ellipse barely reaches are made larger, and hold points beside it
     needle = rj.Ellipsoid([0.0, 0.0], [[1.0, 0.95], [0.95, 1.0]])
@@ -113,6 +114,7 @@ def test_the_union_is_tighter_than_one_cell(loop, partitioned):
     assert partitioned.gaps(3).sum() < 0.7 * whole.proof(3).gaps.sum()
 
 
+@pytest.mark.costly
 def test_guided_cells_close_the_gap_faster_than_none(loop):
     template = rj.Template.octagonal(2)
     tubes = [
@@ -187,6 +189,7 @@ def test_any_executor_runs_the_cells(loop, partitioned):
         np.testing.assert_array_equal(tube.bounds(t), partitioned.bounds(t))
 
 
+@pytest.mark.costly
 def test_a_cluster_runs_the_cells(loop, partitioned):
     from distributed import Client, LocalCluster
 
@@ -212,6 +215,7 @@ def test_cells_may_be_counted_by_arrays(loop, cells):
     assert len(tube.tubes) == 2
 
 
+@pytest.mark.costly
 def test_a_gap_ends_the_halving_of_cells(loop):
     given = loop, SETS["box"], 3, rj.Template.octagonal(2)
     few, more = (

@@ -42,6 +42,7 @@ def test_the_default_relaxation_contains_every_sampled_state(n_x, boxed):
             assert np.all(tube.sets[t].contains(reached, size))
 
 
+@pytest.mark.costly
 def test_a_start_time_shifts_a_time_varying_loop():
     data, region = random_loop(2, steps=5), box_region(2, seed=0)
     X0, template = rj.Polytope(region.A, region.b), rj.Template.box(2)

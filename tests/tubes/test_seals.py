@@ -96,6 +96,7 @@ def test_tubes_from_inside_jit_and_vmap_are_proofs_of_their_own_loops(tube):
         first.replace(sets=second.sets)
 
 
+@pytest.mark.costly
 def test_derivatives_go_through_a_sealed_tube(tube):
     goal = rj.Box([0.0, 0.0], [0.01, 0.01])
     slope = jax.grad(lambda loop: rj.shortfall(tube_of(loop), goal=goal))(LOOP)

@@ -198,6 +198,7 @@ def test_what_is_avoided_may_be_as_far_away_as_floats_go(tube):
         assert np.nanmin(away.margins["avoid[0]"]) == pytest.approx(min(abs(lower), abs(upper)))
 
 
+@pytest.mark.costly
 def test_a_tube_from_a_set_too_thin_to_be_sampled_has_bounds_and_no_witnesses():
     cap = rj.Intersection(rj.Box([1 - 1e-12], [2.0]), rj.Ellipsoid([0.0], [[1.0]]))
     thin = recursion(contraction(1), cap, 1, rj.Template.box(1))

@@ -152,6 +152,7 @@ def test_what_is_no_ball_to_be_decided_is_refused(tube):
         jax.jit(lambda r: len(requirements(2, 2, ball(r), None, None)))(0.3)
 
 
+@pytest.mark.costly
 def test_winning_sets_and_largest_sets_take_them():
     goal = {2: ball(0.5)}  # |x0| <= 2
     found = rj.winning_set(HALVES, rj.Box([-3.0, -3.0], [3.0, 3.0]), 2, goal=goal, cells=300)
@@ -165,6 +166,7 @@ def test_winning_sets_and_largest_sets_take_them():
     assert 1.7 < np.linalg.norm(corners, axis=1).max() <= 2.0
 
 
+@pytest.mark.costly
 def test_a_round_set_for_ever(tube):
     assert rj.verify(tube, safe=ball(3.0), forever=True).proved
 

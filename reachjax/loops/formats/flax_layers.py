@@ -22,7 +22,10 @@ from flax import nnx
 from reachjax.loops.units import AbstractActivation, HardTanh, LeakyReLU, ReLU, Sigmoid, Tanh
 from reachjax.numerics.checks import is_concrete
 
-ADVICE = "give its layers by MLP.from_layers"
+ADVICE = (
+    "give its layers by MLP.from_layers, or the module itself to "
+    "reachjax.Network(module, inputs, outputs), which takes any function of JAX that has bounds"
+)
 
 SIZES = 10.0 ** np.arange(-6, 31, 0.125)
 POINTS = np.concatenate([-SIZES[::-1], [0.0], SIZES])
@@ -50,7 +53,8 @@ def read_activation(activation: Any) -> Any:
                 return each
     raise ValueError(
         f"activation must compute what one of {', '.join(type(each).__name__ for each in known)} "
-        f"does, but {activation!r} arrived"
+        f"does, but {activation!r} arrived: a module with others is a network as it is, "
+        "reachjax.Network(module, inputs, outputs)"
     )
 
 

@@ -1,217 +1,292 @@
-"""What ONNX's operators compute, over `jax.numpy`, and over numpy where nothing is a number.
+"""ONNX's operators over numpy and `jax.numpy` alike, with the attributes of each that are known.
 
-Shapes, indices and limits are plain arrays; only what depends on the input or on weights is of JAX.
+Defaults of attributes are the standard's own, of the version that a file is written in; an
+attribute that an operator does not list here is refused. Shapes, indices and limits must be known
+numbers; numbers that depend on nothing but known ones are computed once, in the file's own kinds.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from reachjax.loops.formats import moving, reductions
+from reachjax.loops.formats.arrays import erf, over, sigmoid, softplus
+from reachjax.loops.formats.kinds import BOOL, KINDS, REAL, cast, kind_name, power, quotient
+
 Attributes = Mapping[str, Any]
-Operator = Callable[..., Any]
-"""From attributes and operands, None for those left out, to the result, or to several."""
+Compute = Callable[..., Any]
+"""From attributes and operands, None for those left out, to the result, or to a list of several."""
 
-FLOATS = (1, 10, 11, 16)
-"""ONNX's numbers of the types that are floats: 32, 16, 64 bits, and bfloat16."""
-
-
-def _over(*operands: Any) -> Any:
-    """`jax.numpy`, or numpy if all operands are plain."""
-    return np if all(isinstance(each, np.ndarray | np.generic) for each in operands) else jnp
+OPSETS = range(7, 29)
+"""Versions of ONNX's standard whose operators were compared with a runtime."""
 
 
-def _whole(values: Any) -> list[int]:
-    return [int(each) for each in np.asarray(values).ravel()]
+class Operator(NamedTuple):
+    """One of ONNX's operators.
+
+    Attributes:
+        compute: what it computes of real numbers.
+        attributes: names of those that are known.
+        known: places of operands that must be known numbers.
+        fixed: places of operands that are no weights, wherever they can be known.
+        exact: what it computes of known numbers, where that is something else.
+    """
+
+    compute: Compute
+    attributes: tuple[str, ...] = ()
+    known: tuple[int, ...] = ()
+    fixed: tuple[int, ...] = ()
+    exact: Compute | None = None
 
 
-def _entrywise(name: str) -> Operator:
-    return lambda attributes, *given: getattr(_over(*given), name)(*given)
+def _entrywise(name: str) -> Compute:
+    return lambda attributes, *given: getattr(over(*given), name)(*given)
 
 
-def _folded(name: str) -> Operator:
-    """Of any number of operands."""
+def _folded(name: str) -> Compute:
+    """The operator of any number of operands, two at a time."""
 
-    def operator(attributes: Attributes, *given: Any) -> Any:
+    def compute(attributes: Attributes, *given: Any) -> Any:
         found, *rest = given
         for each in rest:
-            found = getattr(_over(found, each), name)(found, each)
+            found = getattr(over(found, each), name)(found, each)
         return found
 
-    return operator
+    return compute
+
+
+def _mean(attributes: Attributes, *given: Any) -> Any:
+    return _folded("add")(attributes, *given) / len(given)
 
 
 def _gemm(attributes: Attributes, a: Any, b: Any, c: Any = None) -> Any:
-    a = a.T if attributes.get("transA", 0) else a
-    b = b.T if attributes.get("transB", 0) else b
+    if np.ndim(a) != 2 or np.ndim(b) != 2:
+        raise ValueError(f"it takes matrices, but shapes {np.shape(a)} and {np.shape(b)} arrived")
+    a = a.T if attributes["transA"] else a
+    b = b.T if attributes["transB"] else b
     found = a @ b
-    alpha, beta = attributes.get("alpha", 1.0), attributes.get("beta", 1.0)
+    alpha, beta = attributes["alpha"], attributes["beta"]
     found = found if alpha == 1 else alpha * found
     return found if c is None else found + (c if beta == 1 else beta * c)
-
-
-def _flatten(attributes: Attributes, x: Any) -> Any:
-    axis = attributes.get("axis", 1)
-    rows = int(np.prod(np.shape(x)[:axis], dtype=int))
-    return x.reshape(rows, -1)
-
-
-def _reshape(attributes: Attributes, x: Any, shape: Any) -> Any:
-    sizes = _whole(shape)
-    if not attributes.get("allowzero", 0):
-        sizes = [np.shape(x)[k] if size == 0 else size for k, size in enumerate(sizes)]
-    return x.reshape(sizes)
-
-
-def _axes(attributes: Attributes, axes: Any) -> tuple[int, ...] | None:
-    """Those of an attribute of old, or of an operand."""
-    given = attributes.get("axes") if axes is None else axes
-    return None if given is None else tuple(_whole(given))
-
-
-def _squeeze(attributes: Attributes, x: Any, axes: Any = None) -> Any:
-    return _over(x).squeeze(x, _axes(attributes, axes))
-
-
-def _unsqueeze(attributes: Attributes, x: Any, axes: Any = None) -> Any:
-    return _over(x).expand_dims(x, _axes(attributes, axes))
-
-
-def _transpose(attributes: Attributes, x: Any) -> Any:
-    return _over(x).transpose(x, attributes.get("perm"))
-
-
-def _concatenated(attributes: Attributes, *parts: Any) -> Any:
-    return _over(*parts).concatenate(parts, axis=attributes["axis"])
-
-
-def _split(attributes: Attributes, x: Any, sizes: Any = None) -> Any:
-    axis, sizes = attributes.get("axis", 0), attributes.get("split") if sizes is None else sizes
-    if sizes is None:  # all but the last ones have one size
-        count, total = attributes["num_outputs"], np.shape(x)[axis]
-        size = -(-total // count)
-        sizes = [min(size, max(total - k * size, 0)) for k in range(count)]
-    return _over(x).split(x, np.cumsum(_whole(sizes))[:-1].tolist(), axis)
-
-
-def _gathered(attributes: Attributes, x: Any, indices: Any) -> Any:
-    indices, axis = np.asarray(indices), attributes.get("axis", 0)
-    return _over(x).take(x, np.where(indices < 0, indices + np.shape(x)[axis], indices), axis)
-
-
-def _sliced(
-    attributes: Attributes,
-    x: Any,
-    starts: Any = None,
-    ends: Any = None,
-    axes: Any = None,
-    steps: Any = None,
-) -> Any:
-    starts = _whole(attributes["starts"] if starts is None else starts)
-    ends = _whole(attributes["ends"] if ends is None else ends)
-    axes = _axes(attributes, axes) or tuple(range(len(starts)))
-    steps = [1] * len(starts) if steps is None else _whole(steps)
-    taken = [slice(None)] * np.ndim(x)
-    for axis, start, end, step in zip(axes, starts, ends, steps, strict=True):
-        last = None if step < 0 and end < -np.shape(x)[axis] else end
-        taken[axis] = slice(start, last, step)
-    return x[tuple(taken)]
 
 
 def _clip(attributes: Attributes, x: Any, low: Any = None, high: Any = None) -> Any:
     low = attributes.get("min") if low is None else low
     high = attributes.get("max") if high is None else high
-    x = x if low is None else _over(x).maximum(x, low)
-    return x if high is None else _over(x).minimum(x, high)
+    for limit in (low, high):
+        if np.ndim(limit) != 0:
+            raise ValueError(f"its limits must be single numbers, but {np.shape(limit)} arrived")
+    x = x if low is None else over(x).maximum(x, low)
+    return x if high is None else over(x).minimum(x, high)
 
 
-def _reduced(name: str) -> Operator:
-    def operator(attributes: Attributes, x: Any, axes: Any = None) -> Any:
-        found = _axes(attributes, axes) or None
-        if found is None and attributes.get("noop_with_empty_axes", 0):
-            return x
-        keep = bool(attributes.get("keepdims", 1))
-        return getattr(_over(x), name)(x, axis=found, keepdims=keep)
-
-    return operator
+def _elu(attributes: Attributes, x: Any) -> Any:
+    below = over(x).expm1(over(x).minimum(x, 0.0))
+    return over(x).maximum(x, 0.0) + attributes["alpha"] * below
 
 
-def _normalised(
-    attributes: Attributes, x: Any, scale: Any, bias: Any, mean: Any, variance: Any
-) -> Any:
-    """Batch normalisation, with the statistics that were found in training."""
-    shape = (1, -1, *([1] * (np.ndim(x) - 2)))
-    factor = scale / jnp.sqrt(variance + attributes.get("epsilon", 1e-5))
-    return (x - mean.reshape(shape)) * factor.reshape(shape) + bias.reshape(shape)
+def _celu(attributes: Attributes, x: Any) -> Any:
+    alpha = attributes["alpha"]
+    below = over(x).expm1(over(x).minimum(x, 0.0) / alpha)
+    return over(x).maximum(x, 0.0) + alpha * below
 
 
-def _constant_of_shape(attributes: Attributes, shape: Any) -> Any:
-    value = attributes.get("value")
-    return np.full(_whole(shape), 0.0 if value is None else np.asarray(value).ravel()[0])
+def _gelu(attributes: Attributes, x: Any) -> Any:
+    way = attributes["approximate"]
+    if way == "tanh":
+        return 0.5 * x * (1 + over(x).tanh(math.sqrt(2 / math.pi) * (x + 0.044715 * x**3)))
+    if way == "none":
+        return 0.5 * x * (1 + erf(x / math.sqrt(2)))
+    raise ValueError(f"its attribute 'approximate' must be 'none' or 'tanh', but {way!r} arrived")
 
 
-def _cast(attributes: Attributes, x: Any) -> Any:
-    """Numbers stay as exact as they are; what becomes whole must be plain."""
-    if attributes["to"] in FLOATS:
-        return x.astype(float)
-    return np.asarray(x).astype(np.int64)
+def _raised(attributes: Attributes, x: Any, exponent: Any) -> Any:
+    """Powers; of one whole exponent, also those of negative numbers."""
+    if isinstance(exponent, np.ndarray) and exponent.size > 0:
+        first = exponent.ravel()[0]
+        if (exponent == first).all() and float(first).is_integer() and abs(first) < 1000:
+            spread = np.broadcast_shapes(np.shape(x), exponent.shape)
+            return over(x).broadcast_to(x, spread) ** int(first)
+    return over(x, exponent).power(x, exponent)
 
+
+def _sloped(attributes: Attributes, x: Any, slope: Any) -> Any:
+    return over(x, slope).where(x >= 0, x, slope * x)
+
+
+def _dropped(attributes: Attributes, x: Any, ratio: Any = None, training: Any = None) -> Any:
+    if training is not None and np.any(training):
+        raise ValueError("it is in training mode, and leaves out entries at random")
+    return x
+
+
+def _kept(attributes: Attributes, x: Any) -> Any:
+    """A cast between 32 and 64 bits: real numbers stay as they are."""
+    if x.dtype == bool:
+        raise ValueError("a comparison as a number jumps where it changes")
+    if attributes["to"] not in REAL:
+        raise ValueError(
+            f"numbers that depend on the input are cast to {kind_name(attributes['to'])}, so they "
+            "jump: only casts to 32 and 64 bit floats are continuous"
+        )
+    return x
+
+
+def _einsum(attributes: Attributes, *given: Any) -> Any:
+    return over(*given).einsum(attributes["equation"].replace(" ", ""), *given)
+
+
+def _convolved(attributes: Attributes, x: Any, W: Any, b: Any = None) -> Any:
+    """A convolution: the sum over the kernel's places of matrices times shifted inputs."""
+    n, space, groups = np.ndim(x) - 2, np.shape(W)[2:], attributes["group"]
+    strides, dilations = (attributes.get(k) or (1,) * n for k in ("strides", "dilations"))
+    pads = attributes.get("pads") or (0,) * 2 * n
+    if attributes["auto_pad"] not in ("NOTSET", "VALID"):
+        raise ValueError(f"its attribute 'auto_pad' is {attributes['auto_pad']!r}: give 'pads'")
+    sizes = (len(space), len(strides), len(dilations), len(pads) // 2, len(pads) - len(pads) // 2)
+    if n < 1 or set(sizes) != {n} or attributes.get("kernel_shape", space) != space:
+        raise ValueError("its kernel, strides, dilations and pads do not fit its operand")
+    if min(*strides, *dilations, *space, groups) < 1 or min(pads) < 0:
+        raise ValueError("its strides, dilations and pads must be positive")
+    if np.shape(x)[1] != groups * np.shape(W)[1] or np.shape(W)[0] % groups:
+        raise ValueError("the channels of its kernel do not fit its operand")
+    if any(pads):
+        x = over(x).pad(x, [(0, 0), (0, 0), *zip(pads[:n], pads[n:], strict=True)])
+    reach = [d * (k - 1) + 1 for d, k in zip(dilations, space, strict=True)]
+    counts = [
+        (size - r) // s + 1 for size, r, s in zip(np.shape(x)[2:], reach, strides, strict=True)
+    ]
+    if min(counts) < 1:
+        raise ValueError("its kernel is larger than its operand")
+    moving.require_room([*counts, *np.shape(W)])
+    found = []
+    for inputs, kernel in zip(
+        over(x).split(x, groups, 1), over(W).split(W, groups, 0), strict=True
+    ):
+        total = 0.0
+        for place in itertools.product(*map(range, space)):
+            taken = tuple(
+                slice(d * k, d * k + s * (c - 1) + 1, s)
+                for d, k, s, c in zip(dilations, place, strides, counts, strict=True)
+            )
+            part = inputs[(slice(None), slice(None), *taken)]
+            matrix = kernel[(slice(None), slice(None), *place)]
+            total = total + over(part, matrix).einsum("oc,bc...->bo...", matrix, part)
+        found.append(total)
+    joined = found[0] if groups == 1 else over(*found).concatenate(found, axis=1)
+    return joined if b is None else joined + b.reshape(-1, *([1] * n))
+
+
+FOLLOWED = {
+    "Abs": "abs",
+    "Acos": "arccos",
+    "Add": "add",
+    "And": "logical_and",
+    "Asin": "arcsin",
+    "Asinh": "arcsinh",
+    "Atan": "arctan",
+    "Ceil": "ceil",
+    "Cos": "cos",
+    "Cosh": "cosh",
+    "Equal": "equal",
+    "Exp": "exp",
+    "Floor": "floor",
+    "Greater": "greater",
+    "GreaterOrEqual": "greater_equal",
+    "Less": "less",
+    "LessOrEqual": "less_equal",
+    "Log": "log",
+    "MatMul": "matmul",
+    "Mul": "multiply",
+    "Neg": "negative",
+    "Not": "logical_not",
+    "Or": "logical_or",
+    "Sin": "sin",
+    "Sinh": "sinh",
+    "Sqrt": "sqrt",
+    "Sub": "subtract",
+    "Tan": "tan",
+    "Tanh": "tanh",
+    "Where": "where",
+}
+"""Operators without attributes that numpy and JAX have, and what these call them."""
+
+REDUCED = ("axes", "keepdims", "noop_with_empty_axes")
+NORMALISED = ("axis", "epsilon", "stash_type")
 
 OPERATORS: dict[str, Operator] = {
-    "Abs": _entrywise("abs"),
-    "Add": _entrywise("add"),
-    "Atan": _entrywise("arctan"),
-    "BatchNormalization": _normalised,
-    "Cast": _cast,
-    "Clip": _clip,
-    "Concat": _concatenated,
-    "ConstantOfShape": _constant_of_shape,
-    "Cos": _entrywise("cos"),
-    "Cosh": _entrywise("cosh"),
-    "Div": _entrywise("divide"),
-    "Dropout": lambda attributes, x, *others: x,
-    "Elu": lambda attributes, x: jax.nn.elu(x, attributes.get("alpha", 1.0)),
-    "Exp": _entrywise("exp"),
-    "Flatten": _flatten,
-    "Gather": _gathered,
-    "Gemm": _gemm,
-    "HardSigmoid": lambda a, x: jnp.clip(a.get("alpha", 0.2) * x + a.get("beta", 0.5), 0.0, 1.0),
-    "Identity": lambda attributes, x: x,
-    "LeakyRelu": lambda a, x: jnp.where(x >= 0, x, a.get("alpha", 0.01) * x),
-    "Log": _entrywise("log"),
-    "MatMul": _entrywise("matmul"),
-    "Max": _folded("maximum"),
-    "Min": _folded("minimum"),
-    "Mul": _entrywise("multiply"),
-    "Neg": _entrywise("negative"),
-    "PRelu": lambda attributes, x, slope: jnp.where(x >= 0, x, slope * x),
-    "Pow": lambda attributes, x, power: _over(x, power).power(x, power),
-    "Reciprocal": lambda attributes, x: 1.0 / x,
-    "ReduceMean": _reduced("mean"),
-    "ReduceSum": _reduced("sum"),
-    "Relu": lambda attributes, x: jnp.maximum(x, 0.0),
-    "Reshape": _reshape,
-    "Shape": lambda attributes, x: np.array(np.shape(x), np.int64),
-    "Sigmoid": lambda attributes, x: jax.nn.sigmoid(x),
-    "Sin": _entrywise("sin"),
-    "Sinh": _entrywise("sinh"),
-    "Slice": _sliced,
-    "Softplus": lambda attributes, x: jax.nn.softplus(x),
-    "Softsign": lambda attributes, x: jax.nn.soft_sign(x),
-    "Split": _split,
-    "Sqrt": _entrywise("sqrt"),
-    "Squeeze": _squeeze,
-    "Sub": _entrywise("subtract"),
-    "Sum": _folded("add"),
-    "Tan": _entrywise("tan"),
-    "Tanh": _entrywise("tanh"),
-    "Transpose": _transpose,
-    "Unsqueeze": _unsqueeze,
+    **{name: Operator(_entrywise(twin)) for name, twin in FOLLOWED.items()},
+    **{name: Operator(each, REDUCED, known=(1,)) for name, each in reductions.REDUCTIONS.items()},
+    "BatchNormalization": Operator(
+        reductions.batch_normalised, ("epsilon", "momentum", "training_mode", "spatial")
+    ),
+    "Cast": Operator(
+        _kept,
+        ("to", "saturate", "round_mode"),  # the last two speak of kinds of 8 bits alone
+        exact=lambda attributes, x: cast(x, KINDS[attributes["to"]]),
+    ),
+    "Celu": Operator(_celu, ("alpha",)),
+    "Clip": Operator(_clip, ("min", "max"), known=(1, 2)),
+    "Concat": Operator(moving.concatenated, ("axis",)),
+    "ConstantOfShape": Operator(moving.filled, ("value",), known=(0,)),
+    "Conv": Operator(
+        _convolved, ("auto_pad", "dilations", "group", "kernel_shape", "pads", "strides")
+    ),
+    "Div": Operator(_entrywise("divide"), exact=lambda attributes, x, y: quotient(x, y)),
+    "Dropout": Operator(_dropped, ("ratio", "seed"), known=(1, 2)),
+    "Einsum": Operator(_einsum, ("equation",)),
+    "Elu": Operator(_elu, ("alpha",)),
+    "Erf": Operator(lambda attributes, x: erf(x)),
+    "Expand": Operator(moving.expanded, known=(1,)),
+    "Flatten": Operator(moving.flattened, ("axis",)),
+    "Gather": Operator(moving.gathered, ("axis",), known=(1,)),
+    "Gelu": Operator(_gelu, ("approximate",)),
+    "Gemm": Operator(_gemm, ("alpha", "beta", "transA", "transB")),
+    "HardSigmoid": Operator(
+        lambda a, x: over(x).clip(a["alpha"] * x + a["beta"], 0.0, 1.0), ("alpha", "beta")
+    ),
+    "HardSwish": Operator(lambda a, x: x * over(x).clip(x / 6 + 0.5, 0.0, 1.0)),
+    "Identity": Operator(lambda attributes, x: x),
+    "LayerNormalization": Operator(reductions.layer_normalised, NORMALISED),
+    "LeakyRelu": Operator(lambda a, x: over(x).where(x >= 0, x, a["alpha"] * x), ("alpha",)),
+    "LogSoftmax": Operator(reductions.LOG_SOFTMAX, ("axis",)),
+    "Max": Operator(_folded("maximum")),
+    "Mean": Operator(_mean),
+    "Min": Operator(_folded("minimum")),
+    "Mish": Operator(lambda attributes, x: x * over(x).tanh(softplus(x))),
+    "PRelu": Operator(_sloped),
+    "Pow": Operator(_raised, fixed=(1,), exact=lambda attributes, x, y: power(x, y)),
+    "RMSNormalization": Operator(reductions.rms_normalised, NORMALISED),
+    "Range": Operator(moving.ranged, known=(0, 1, 2)),
+    "Reciprocal": Operator(lambda attributes, x: 1.0 / x),
+    "Relu": Operator(lambda attributes, x: over(x).maximum(x, 0.0)),
+    "Reshape": Operator(moving.reshaped, ("allowzero",), known=(1,)),
+    "Selu": Operator(
+        lambda a, x: a["gamma"] * _elu(a, x),
+        ("alpha", "gamma"),
+    ),
+    "Shape": Operator(moving.shape_of, ("start", "end")),
+    "Sigmoid": Operator(lambda attributes, x: sigmoid(x)),
+    "Size": Operator(lambda attributes, x: np.array(np.size(x), np.int64)),
+    "Slice": Operator(moving.sliced, ("starts", "ends", "axes"), known=(1, 2, 3, 4)),
+    "Softmax": Operator(reductions.SOFTMAX, ("axis",)),
+    "Softplus": Operator(lambda attributes, x: softplus(x)),
+    "Softsign": Operator(lambda attributes, x: x / (1 + over(x).abs(x))),
+    "Split": Operator(moving.split, ("axis", "split", "num_outputs"), known=(1,)),
+    "Squeeze": Operator(moving.squeezed, ("axes",), known=(1,)),
+    "Sum": Operator(_folded("add")),
+    "Swish": Operator(lambda a, x: x * sigmoid(a["alpha"] * x), ("alpha",)),
+    "Transpose": Operator(moving.transposed, ("perm",)),
+    "Unsqueeze": Operator(moving.unsqueezed, ("axes",), known=(1,)),
 }
 
-FIXED = {"Pow": (1,), "Clip": (1, 2)}
-"""Operands that are numbers and yet no weights, by their places."""
+SIZES = ("Shape", "Size")
+"""Operators whose results are known, whatever their operands are."""
+
+PLAIN = frozenset(KINDS) - frozenset(REAL) - {BOOL}
+"""Kinds of numbers that must be known, for what depends on the input cannot be of them."""

@@ -1,0 +1,79 @@
+"""Which cases a run takes, and from where all is drawn, as a plugin of pytest.
+
+`python -m pytest` takes one case of each claim: what somebody needs to trust an installation, in
+minutes. With a path, or `--every-case`, all cases are taken.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+ELSEWHERE = "tests/experiments", "tests/test_notebooks.py", "tests/test_docs.py"
+"""Claims about the experiments, the notebooks and the site, which are not about the library."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Whether all cases are taken."""
+    parser.addoption(
+        "--every-case",
+        action="store_true",
+        help="all cases of each claim, as with a path; else one of each about the library",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Draw all that is random from the seed of the session, before tests are imported."""
+    config.addinivalue_line("markers", "costly: a claim that only `--every-case` or a path runs")
+    if seed := config.getoption("seed"):
+        for module, name in (
+            (np.random, "default_rng"),
+            (jax.random, "key"),
+            (jax.random, "PRNGKey"),
+        ):
+            setattr(module, name, _shifted(getattr(module, name), seed))
+
+
+def _shifted(draws: Callable[..., Any], seed: int) -> Callable[..., Any]:
+    """A source of random numbers, with one more seed mixed into those that are given to it."""
+
+    def shifted(own: Any = None, *args: Any, **kwargs: Any) -> Any:
+        if isinstance(own, int | np.integer | list | tuple) and not isinstance(own, bool):
+            mixed = np.random.SeedSequence([*np.ravel(own).tolist(), seed])
+            own = int(mixed.generate_state(1, np.uint32)[0] >> 1)
+        return draws(own, *args, **kwargs)
+
+    return shifted
+
+
+def _everything(config: pytest.Config) -> bool:
+    """Whether all cases are asked for."""
+    bare = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    return not bare or config.getoption("every_case") or bool(config.getoption("keyword"))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave unread, in a bare run, the files of claims that are not about the library."""
+    if _everything(config):
+        return None
+    place = f"{collection_path.relative_to(config.rootpath).as_posix()}/"
+    return True if place.startswith(tuple(f"{each}/" for each in ELSEWHERE)) else None
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave one case of each claim, the one in the middle, unless all are asked for."""
+    if _everything(config):
+        return
+    cases = defaultdict(list)
+    for item in items:
+        if not item.get_closest_marker("costly"):
+            cases[item.nodeid.partition("[")[0]].append(item)
+    kept = {id(each[len(each) // 2]) for each in cases.values()}
+    left = [item for item in items if id(item) not in kept]
+    items[:] = [item for item in items if id(item) in kept]
+    config.hook.pytest_deselected(items=left)

@@ -19,7 +19,7 @@ import numpy as np
 from reachjax.loops.interpreter import Constants
 from reachjax.loops.readings import ConstantPart, Evaluation, Number, Recording, require_traced
 from reachjax.loops.recording import Recorder
-from reachjax.loops.traces import Sizes, Trace
+from reachjax.loops.traces import Sizes, Trace, UpdatedError
 from reachjax.loops.units import AtUnit, evaluate
 from reachjax.loops.values import Comparison, Operand, Parameter, UnsupportedError, Value
 from reachjax.numerics.checks import described, is_concrete
@@ -67,13 +67,19 @@ class Function:
         Raises:
             TypeError: it is no function, or contains what has no bounds.
             ValueError: it cannot be called with such vectors, its result has another shape, or a
-                parameter is not finite.
+                parameter is not finite, or it changes variables of its own.
         """
         if not callable(function):
             raise TypeError(f"{name} must be a function, but {described(function)} arrived")
         _require_bound(function, name)
         try:
             trace, parameters = Trace.of(function, inputs)
+        except UpdatedError:
+            raise ValueError(
+                f"{name} changes variables of its own when it is called, as modules in training "
+                "mode do, so that it is no function of its arguments alone: put it into "
+                "evaluation mode, as module.eval() of flax does"
+            ) from None
         except jax.errors.ConcretizationTypeError as error:
             raise ValueError(
                 f"{name} must not branch on values, nor make Python numbers of them, which cannot "

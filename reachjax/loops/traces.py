@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import operator
 import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -24,6 +25,10 @@ Sizes = tuple[int, ...]
 
 SIZE = 32
 """Bytes of a description: two computations never have one."""
+
+
+class UpdatedError(Exception):
+    """A function changes variables of its own when it is called: it is another one afterwards."""
 
 
 class _Held:
@@ -83,7 +88,13 @@ class Trace:
         vectors = [jax.ShapeDtypeStruct((size,), float) for size in inputs]
 
         def called(parameters: Sequence[Any], *vectors: Any) -> Any:
-            return self.function(parameters)(*vectors)
+            function = self.function(parameters)
+            before = jax.tree.leaves(function)
+            found = function(*vectors)
+            after = jax.tree.leaves(function)
+            if len(before) != len(after) or any(map(operator.is_not, before, after)):
+                raise UpdatedError
+            return found
 
         return _owned(jax.make_jaxpr(called)(parameters, *vectors))
 

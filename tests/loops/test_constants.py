@@ -1,0 +1,174 @@
+"""What a function computes of constants and parameters alone is the same wherever it is used.
+
+XLA rounds a function that is compiled as a whole in other ways than equation by equation; what is
+certified, what is simulated, and what a user's own compiled code simulates see the same numbers.
+"""
+
+import flax.nnx as nnx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.tree_util import Partial
+
+import reachjax as rj
+
+STILL = rj.Network(lambda x: 0 * x, inputs=1, outputs=1)
+D = 1e6 + 1e-3 * np.random.default_rng(0).normal(size=1000)
+M = np.random.default_rng(1).normal(size=(5, 5))
+F32, F16, B16 = jnp.float32, jnp.float16, jnp.bfloat16
+
+
+def variance(d):
+    """A variance in which digits cancel."""
+    return jnp.mean(d**2) - jnp.mean(d) ** 2
+
+
+def power_iteration(A):
+    """An eigenvalue by fifty steps."""
+
+    def step(v, _):
+        w = A @ v
+        return w / jnp.linalg.norm(w), None
+
+    v, _ = jax.lax.scan(step, jnp.ones(len(A)), None, length=50)
+    return v @ A @ v
+
+
+def told_apart(x):
+    """A reduction in 32 bits inside of a loop over what depends on the state."""
+    return jax.lax.fori_loop(0, 3, lambda k, y: y + jnp.sum(jnp.full((100,), 0.1, F32)), x)
+
+
+CONSTANTS = {
+    "sum in 32 bits": lambda: jnp.sum(jnp.full((1000,), 0.1, F32)),
+    "mean in 32 bits": lambda: jnp.mean(jnp.arange(7, dtype=F32) / 7),
+    "digits that cancel in 32 bits": lambda: jnp.sum(jnp.array([1e8, 1.0, -1e8], F32)),
+    "sum in 16 bits": lambda: jnp.sum(jnp.full((1000,), 0.1, F16)),
+    "products in bfloat16": lambda: jnp.prod(jnp.full((9,), 1.1, B16)),
+    "variance": lambda: variance(jnp.asarray(D)),
+    "product of matrices in 32 bits": lambda: jnp.sum(jnp.asarray(M, F32) @ jnp.asarray(M, F32)),
+    "determinant": lambda: jnp.linalg.det(jnp.asarray(M)),
+    "softmax": lambda: jax.nn.softmax(jnp.asarray(D) * 1e-6)[3],
+    "exponentials in 32 bits": lambda: jnp.sum(jnp.exp(jnp.arange(50, dtype=F32) / 7)),
+    "eigenvalue": lambda: power_iteration(jnp.asarray(M @ M.T)),
+    "sum of sines": lambda: jnp.sum(jnp.sin(jnp.arange(300.0))),
+    "relu of a number": lambda: jax.nn.relu(0.5),
+    "relu6 of a number": lambda: jax.nn.relu6(0.5),
+    "logarithm of a sum of numbers": lambda: jnp.logaddexp(0.5, 1.0),
+}
+
+PARAMETERS = {
+    "variance": variance,
+    "standard deviation": jnp.std,
+    "norm": jnp.linalg.norm,
+    "softmax": lambda d: jax.nn.softmax(d)[3] * 1e3,
+    "logarithm of a sum": jax.nn.logsumexp,
+    "sum in 32 bits": lambda d: jnp.sum(d.astype(F32)).astype(float),
+}
+
+
+def assert_simulated(plant, compiled=True):
+    """The certified set of one step from a point, against all ways to simulate it."""
+    loop = rj.ClosedLoop(plant, STILL)
+    X0, x = rj.Box([1.0], [1.0]), jnp.array([1.0])
+    region = rj.reach(loop, X0, 1, rj.Template.box(1), rj.LinearBounds()).sets[1]
+    found = [loop.simulate(x, 1)[1], jax.device_get(loop).step(np.asarray(x), 0)]
+    if compiled:
+        found.append(jax.jit(lambda x: loop.simulate(x, 1)[1])(x))
+    for state in found:
+        assert np.all(region.A @ np.asarray(state) <= region.b), (state, region.b)
+
+
+@pytest.mark.parametrize("name", CONSTANTS)
+def test_constants_are_rounded_once(name):
+    constant = CONSTANTS[name]
+    assert_simulated(rj.NonlinearPlant(lambda x, u: x * constant(), states=1, inputs=1))
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_what_parameters_make_is_rounded_once(name):
+    made = PARAMETERS[name]
+    function = Partial(lambda d, x, u: x * made(d), jnp.asarray(D))
+    assert_simulated(rj.NonlinearPlant(function, states=1, inputs=1))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        told_apart,
+        lambda x: jax.lax.scan(lambda c, k: (c + jnp.sum(k * jnp.arange(9, dtype=F32)), c), x[0],
+                               jnp.arange(4, dtype=F32) / 7)[1][-1:],
+        lambda x: jax.lax.cond(True, lambda y: y * jnp.mean(jnp.arange(7, dtype=F32) / 7),
+                               lambda y: y, x),
+        jax.jit(lambda y: y + jnp.sum(jnp.full((1000,), 0.1, F32))),
+        jax.checkpoint(lambda y: y + jnp.sum(jnp.full((1000,), 0.1, F32))),
+        jax.vmap(lambda y: y + jnp.sum(jnp.full((1000,), 0.1, F32))),
+    ],
+    ids=["fori_loop", "scan", "cond", "jit", "checkpoint", "vmap"],
+)  # fmt: skip
+def test_constants_inside_of_loops_calls_and_branches_are_rounded_once(function):
+    plant = rj.NonlinearPlant(lambda x, u: jnp.asarray(function(x), float), states=1, inputs=1)
+    assert_simulated(plant)
+
+
+def test_barriers_and_literals_are_passed_on():
+    assert_simulated(
+        rj.NonlinearPlant(lambda x, u: sum(jax.lax.optimization_barrier((x, u))), 1, 1)
+    )
+
+
+def test_constants_of_parameters_have_derivatives():
+    def bound(d):
+        plant = rj.NonlinearPlant(
+            Partial(lambda d, x, u: x * jnp.mean(d**2) + jnp.sin(x) * jnp.std(d), d), 1, 1
+        )
+        X0, template = rj.Box([1.0], [2.0]), rj.Template.box(1)
+        return (
+            rj.reach(rj.ClosedLoop(plant, STILL), X0, 2, template, rj.LinearBounds()).sets[2].b[0]
+        )
+
+    d, step = jnp.array([0.3, 0.2, 0.5]), 1e-6
+    moved = [(bound(d + step * e) - bound(d - step * e)) / (2 * step) for e in jnp.eye(3)]
+    np.testing.assert_allclose(jax.grad(bound)(d), moved, rtol=1e-7)
+    np.testing.assert_allclose(jax.jit(jax.grad(bound))(d), moved, rtol=1e-7)
+
+
+SCANNED = {
+    "as numbers": lambda x: jax.lax.map(lambda m: m.astype(float), x > 0),
+    "as numbers of 32 bits": lambda x: jax.lax.map(lambda m: m.astype(F32), x > 0).astype(float),
+    "times numbers": lambda x: jax.lax.map(lambda m: m * 2.0, x > 0),
+    "summed": lambda x: jax.lax.scan(lambda c, m: (c + m, c), 0.0, x > 0)[1],
+    "indexed": lambda x: (x > 0)[:1].astype(float),
+    "reversed": lambda x: jax.lax.rev(x > 0, (0,)).astype(float),
+    "stacked": lambda x: jnp.concatenate([x > 0])[:1].astype(float),
+    "reshaped": lambda x: (x > 0).reshape(1, 1)[0].astype(float),
+}
+
+
+@pytest.mark.parametrize("name", SCANNED)
+def test_a_comparison_is_no_number(name):
+    function = SCANNED[name]
+    with pytest.raises(TypeError, match="cannot be certified"):
+        rj.NonlinearPlant(lambda x, u: function(x), states=1, inputs=1)
+
+
+class Normalised(nnx.Module):
+    """A network with a layer that keeps means of what it was given."""
+
+    def __init__(self):
+        rngs = nnx.Rngs(0)
+        self.first, self.last = nnx.Linear(2, 4, rngs=rngs), nnx.Linear(4, 1, rngs=rngs)
+        self.normal = nnx.BatchNorm(4, rngs=rngs)
+
+    def __call__(self, x):
+        return self.last(nnx.relu(self.normal(self.first(x))))
+
+
+def test_a_module_in_training_mode_is_refused():
+    network = Normalised()
+    with pytest.raises(ValueError, match="evaluation mode"):
+        rj.Network(network, inputs=2, outputs=1)
+    network.eval()
+    x = jnp.array([0.3, -0.2])
+    np.testing.assert_allclose(rj.Network(network, inputs=2, outputs=1)(x), network(x), rtol=1e-12)

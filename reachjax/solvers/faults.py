@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from reachjax.numerics.budget import TimeOverError, clock
 from reachjax.numerics.checks import described
 from reachjax.programs.lmi import Program
 from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution, SolverStatus
@@ -55,7 +56,11 @@ def proposed(solver: AbstractSolver, program: Program) -> Solution:
         SetupError: the solver was chosen or set up wrongly.
     """
     blank = Solution.blank_for(program)
-    found = _asked(solver, lambda: _solution(solver.solve(program), blank))
+    try:
+        clock().require()
+        found = _asked(solver, lambda: _solution(solver.solve(program), blank))
+    except TimeOverError:
+        return blank._replace(statuses=np.full_like(blank.statuses, int(SolverStatus.LIMIT)))
     return blank if found is None else _repaired(found, type(solver).__name__)
 
 
@@ -68,7 +73,11 @@ def proposed_enclosure(
         SetupError: the solver was chosen or set up wrongly.
     """
     blank = Enclosure.blank(program)
-    found = _asked(solver, lambda: _enclosure(solver.enclose(program, form), blank))
+    try:
+        clock().require()
+        found = _asked(solver, lambda: _enclosure(solver.enclose(program, form), blank))
+    except TimeOverError:
+        return blank._replace(status=np.array(int(SolverStatus.LIMIT)))
     return blank if found is None else _repaired_enclosure(found, blank, type(solver).__name__)
 
 
@@ -117,7 +126,7 @@ def _asked(solver: AbstractSolver, answer: Callable[[], NamedTuple]) -> Any:
     name = type(solver).__name__
     try:
         return answer()
-    except SetupError:
+    except (SetupError, TimeOverError):
         raise
     except _FaultError as fault:
         _warn(name, str(fault))

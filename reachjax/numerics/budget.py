@@ -8,9 +8,17 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Self
 
 from reachjax.numerics.checks import real_number
+
+
+class TimeOverError(Exception):
+    """The budget in force is over: whoever put it in force goes on with what there is."""
+
 
 GRACE = 0.4
 """Seconds that forms, which are solved by nobody, may go on after the end."""
@@ -117,6 +125,24 @@ class Budget:
         found._stopped = self._stopped
         return found
 
+    def require(self) -> None:
+        """Raise an error where the time is over, from deep within what takes long.
+
+        Raises:
+            TimeOverError: that is so.
+        """
+        if self.late:
+            raise TimeOverError
+
+    @contextmanager
+    def in_force(self) -> Iterator[None]:
+        """Let `clock()` be this budget, for solvers, which are given a program and nothing else."""
+        token = _IN_FORCE.set(self)
+        try:
+            yield
+        finally:
+            _IN_FORCE.reset(token)
+
     def spend(self, work: float) -> None:
         """Take so much from the work that is left."""
         self._purse[0] -= work
@@ -128,3 +154,10 @@ class Budget:
 
 ENDLESS = Budget()
 """A budget that is never spent."""
+
+_IN_FORCE: ContextVar[Budget] = ContextVar("budget", default=ENDLESS)
+
+
+def clock() -> Budget:
+    """The budget that is in force: without limits where none is."""
+    return _IN_FORCE.get()

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.host import all_finite
 from reachjax.programs.lmi import Program
@@ -45,8 +45,15 @@ from reachjax.tubes.steps import Step
 T = TypeVar("T")
 
 
-def successors(step: Step, template: AbstractTemplate) -> tuple[AbstractSet, AbstractCertificate]:
+def successors(
+    step: Step, template: AbstractTemplate, budget: Budget = ENDLESS
+) -> tuple[AbstractSet, AbstractCertificate]:
     """The smallest set of a template that surely holds a step's successors, and its proof.
+
+    Args:
+        step: the step.
+        template: what the set looks like.
+        budget: of the time.
 
     Raises:
         TypeError: the template is of an unknown kind.
@@ -56,7 +63,6 @@ def successors(step: Step, template: AbstractTemplate) -> tuple[AbstractSet, Abs
     rows = [goal.rows(step.setting.loop.states) for goal in goals]
     program = _finite(step, step.program(jnp.concatenate(rows)))
     programs = (program.with_objective(where) for where in _slices(rows))
-    budget = step.setting.budget
     parts = [_proved(step, goal, each, budget) for goal, each in zip(goals, programs, strict=True)]
     return _together(program, parts)
 
@@ -89,7 +95,8 @@ def _proved(
         if step.setting.simulations is not None:
             witness = partial(step.attained, goal.rows(step.setting.loop.states))
         rounds = Rounds(step.window.layout, cuts, witness, step.warm_start, budget)
-    program, value, proposal = proved(goal, program, step.setting.solver, rounds)
+    with budget.in_force():
+        program, value, proposal = proved(goal, program, step.setting.solver, rounds)
     region = goal.region(_finite(step, value))
     return region, goal.certificate(program, value, proposal)
 

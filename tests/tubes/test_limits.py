@@ -8,6 +8,7 @@ import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -81,6 +82,27 @@ def test_ctrl_c_ends_a_call_soon_and_keeps_what_was_found(switching, touching, c
         found = pickle.loads(pickle.dumps(stopped.value)).found
         assert type(found) is type(stopped.value.found)
         assert str(stopped.value).startswith("interrupted")
+
+
+WAYS = {
+    "many products": (rj.Template.box(4), rj.PaperQC(), rj.InteriorPoint()),
+    "rounds": (rj.Template.box(4), rj.CuttingPlanes(), rj.Auto()),
+    "Clarabel": (rj.Template.box(4), rj.LocalBounds(), rj.Clarabel()),
+    "SCS": (rj.Template.box(4), rj.LocalBounds(), rj.SCS()),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_programs_in_progress_are_cut_and_what_is_returned_holds(switching, way):
+    (loop, X0), (template, relaxation, solver) = switching, WAYS[way]
+    began = time.process_time()
+    tube = rj.reach(loop, X0, 3, template, relaxation, 1, solver, time_limit=1.0)
+    assert time.process_time() - began < 2 * (1.0 + PATIENCE)  # of two threads
+    states = loop.simulate(X0.sample(jax.random.key(0), 200), 3)
+    for t in (1, 2, 3):
+        assert bool(tube.sets[t].contains(states[:, t], 1e-9).all())
+        statuses = {status.name for status in tube.proof(t).statuses}
+        assert statuses & {"LIMIT", "FAILED"}
 
 
 class Stopping:

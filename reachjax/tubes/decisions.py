@@ -9,6 +9,7 @@ until it is decided.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
 
@@ -183,6 +184,7 @@ class _Decision:
         self._margins = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
+        self._ends: dict[tuple[str, int], np.ndarray] = {}
         self._example: Counterexample | None = None
         self._simulations = simulations
         if simulations is not None:
@@ -203,10 +205,9 @@ class _Decision:
         status = VerdictStatus.UNKNOWN if self._open else VerdictStatus.PROVED
         if self._example is not None:
             status = VerdictStatus.REFUTED
-        certificates = self._certificates
-        return Verdict(
-            status, self._margins, self._simulated, self._example, certificates=certificates
-        )
+        ends = Counter(SolverStatus(int(code)) for codes in self._ends.values() for code in codes)
+        known = status, self._margins, self._simulated, self._example
+        return Verdict(*known, ends=dict(ends), certificates=self._certificates)
 
     def _require_unbroken(self) -> None:
         """Raise an error if a trajectory, as JAX runs it, breaks what is proved."""
@@ -255,6 +256,7 @@ class _Decision:
         margin = float(np.min(-climbed.bounds / units))
         holds = bool(np.all(right))
         self._note(key, holds, margin)
+        self._ends[key] = climbed.codes
         if holds:
             self._certificates[key] = _certificate(climbed, target.simulated, not item.inside)
         if not np.all(right):
@@ -294,7 +296,7 @@ def _certificate(climbed: Climbed, known: Simulated, least: bool) -> BranchCerti
     """The proof of a requirement."""
     count = len(climbed.bounds)
     proof = BranchCertificate(
-        codes=np.full(count, int(SolverStatus.SOLVED)),
+        codes=climbed.codes,
         bounds=climbed.bounds,
         witnesses=known.most,
         witness_states=known.scenarios,

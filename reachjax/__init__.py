@@ -9,15 +9,19 @@ Turn on 64-bit floats before building networks and sets::
 """
 
 from reachjax.loops import (
+    ISRU,
     MLP,
     AbstractActivation,
     AbstractNetwork,
     AbstractPlant,
     AbstractUnit,
     AffinePlant,
+    Asin,
+    Asinh,
     Atan,
     ClosedLoop,
     Cos,
+    Erf,
     Exp,
     HardTanh,
     LeakyReLU,
@@ -32,6 +36,7 @@ from reachjax.loops import (
     Sqrt,
     Square,
     Tanh,
+    XLogX,
     runge_kutta,
     zero_order_hold,
 )
@@ -83,11 +88,12 @@ from reachjax.training import (
     volume_penalty,
 )
 from reachjax.tubes.decisions import decide
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.largest import LargestSet, largest_set
 from reachjax.tubes.loading import load
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
 from reachjax.tubes.plotting import plot_cells, plot_set, plot_tube
-from reachjax.tubes.reach import Interrupted, ReachTube, reach, reach_step
+from reachjax.tubes.reach import ReachTube, reach, reach_step
 from reachjax.tubes.requirements import shortfall
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.tubes.soundness import UnsoundError
@@ -111,6 +117,7 @@ def __dir__() -> list[str]:
 
 
 __all__ = [
+    "ISRU",
     "MLP",
     "SCS",
     "AbstractActivation",
@@ -125,6 +132,8 @@ __all__ = [
     "AbstractUnit",
     "AffinePlant",
     "AllProducts",
+    "Asin",
+    "Asinh",
     "Atan",
     "Auto",
     "Box",
@@ -143,6 +152,7 @@ __all__ = [
     "Ellipsoid",
     "EllipsoidCertificate",
     "EllipsoidTemplate",
+    "Erf",
     "Exp",
     "HardTanh",
     "InteriorPoint",
@@ -180,6 +190,7 @@ __all__ = [
     "Verdict",
     "VerdictStatus",
     "WinningSet",
+    "XLogX",
     "change_of_basis",
     "decide",
     "failures",

@@ -91,7 +91,7 @@ def quadrotor() -> Question:
     layers = he_network((12, 32, 4), seed=0)
     layers[-1] = 0.05 * layers[-1][0], 0.0 * layers[-1][1]
     net = rj.MLP.from_layers(layers, activation=rj.Tanh())
-    return _around(rj.ClosedLoop(rj.NonlinearPlant(f, 12, 4), net), 0.1, 5, 0.5)
+    return _around(rj.ClosedLoop(rj.NonlinearPlant(f, 12, 4), net), 0.3, 5, 0.35)
 
 
 def pendulum() -> Question:
@@ -206,9 +206,9 @@ class Compilations:
         self.seconds: list[float] = []
         jax.monitoring.register_event_duration_secs_listener(self._heard)
 
-    def _heard(self, event: str, seconds: float, **_: Any) -> None:
+    def _heard(self, event: str, duration_secs: float, **_: Any) -> None:
         if event.endswith("backend_compile_duration"):
-            self.seconds.append(seconds)
+            self.seconds.append(duration_secs)
 
 
 def limited(loop: str, call: str, settings: Settings) -> dict:

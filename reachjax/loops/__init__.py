@@ -6,10 +6,14 @@ from reachjax.loops.networks import MLP, AbstractNetwork, Network
 from reachjax.loops.plants import AbstractPlant, AffinePlant, NonlinearPlant
 from reachjax.loops.residual import Residual
 from reachjax.loops.units import (
+    ISRU,
     AbstractActivation,
     AbstractUnit,
+    Asin,
+    Asinh,
     Atan,
     Cos,
+    Erf,
     Exp,
     HardTanh,
     LeakyReLU,
@@ -21,18 +25,23 @@ from reachjax.loops.units import (
     Sqrt,
     Square,
     Tanh,
+    XLogX,
 )
 
 __all__ = [
+    "ISRU",
     "MLP",
     "AbstractActivation",
     "AbstractNetwork",
     "AbstractPlant",
     "AbstractUnit",
     "AffinePlant",
+    "Asin",
+    "Asinh",
     "Atan",
     "ClosedLoop",
     "Cos",
+    "Erf",
     "Exp",
     "HardTanh",
     "LeakyReLU",
@@ -47,6 +56,7 @@ __all__ = [
     "Sqrt",
     "Square",
     "Tanh",
+    "XLogX",
     "runge_kutta",
     "zero_order_hold",
 ]

@@ -19,7 +19,7 @@ from reachjax.loops.interpreter import require_traced, walked
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import Sizes, Trace
 from reachjax.loops.units import AtUnit, evaluate
-from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value
+from reachjax.loops.values import Comparison, Operand, Parameter, UnsupportedError, Value
 from reachjax.numerics.checks import described, is_concrete
 from reachjax.numerics.pytrees import pytree, static
 
@@ -174,7 +174,8 @@ class Function:
         recorder = Recorder([(size,) for size in sizes])
         try:
             require_traced(closed)
-            (wanted,) = walked(recorder, closed, [*self.parameters, *recorder.inputs])
+            given = [*map(Parameter.of, self.parameters), *recorder.inputs]
+            (wanted,) = walked(recorder, closed, given)
         except UnsupportedError as error:
             raise TypeError(
                 f"the primitive {error.primitive!r}{error.line} cannot be certified: {error}"

@@ -16,7 +16,7 @@ from jax.extend import core
 from reachjax.loops.primitives import Equation, recorded
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import equations
-from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value, is_known
+from reachjax.loops.values import Comparison, Operand, Parameter, UnsupportedError, Value, is_known
 
 CALLS = (
     "jit",
@@ -145,6 +145,8 @@ def _equation(recorder: Recorder, equation: Any, operands: Sequence[Operand]) ->
 
 def _called(equation: Any, operands: Sequence[Any]) -> list[Any]:
     """A function with derivatives of its own, of plain arrays."""
+    if any(isinstance(each, Parameter) for each in operands):
+        return [*map(Parameter.of, _called(equation, [*map(np.asarray, operands)]))]
     given = dict(zip(equation.invars, operands, strict=True))
     given = {each: value for each, value in given.items() if not isinstance(each, core.Literal)}
     jaxpr = core.Jaxpr([], [*given], equation.outvars, [equation])

@@ -15,9 +15,13 @@ from typing import Any
 import numpy as np
 
 from reachjax.loops.units import (
+    ISRU,
     AbstractUnit,
+    Asin,
+    Asinh,
     Atan,
     Cos,
+    Erf,
     Exp,
     Log,
     Reciprocal,
@@ -26,6 +30,7 @@ from reachjax.loops.units import (
     Sqrt,
     Square,
     Tanh,
+    XLogX,
 )
 from reachjax.numerics.checks import is_concrete
 
@@ -55,6 +60,11 @@ VALUES: dict[type[AbstractUnit], Callable[[Fraction], Rational]] = {
     Sin: _at(0, 0),
     Cos: _at(0, 1),
     Atan: _at(0, 0),
+    Asin: _at(0, 0),
+    Asinh: _at(0, 0),
+    Erf: _at(0, 0),
+    ISRU: _at(0, 0),
+    XLogX: lambda y: Fraction(0) if y in (0, 1) else None,
 }
 """Rational values of units at rational points."""
 

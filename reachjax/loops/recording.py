@@ -7,17 +7,33 @@ step is affine (a choice of entries, a matrix, a factor, a sum) or a layer of un
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Container, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Int
 
+from reachjax.loops.limits import ConstantLimits, Limits
 from reachjax.loops.rationals import Rationals
 from reachjax.loops.units import AbstractUnit, AtUnit, ReLU, SmoothUnit, Square, UnboundedError
-from reachjax.loops.values import Operand, Shape, Step, Term, UnsupportedError, Value, is_known
+from reachjax.loops.values import (
+    Fact,
+    Operand,
+    Parameter,
+    Shape,
+    Step,
+    Term,
+    UnsupportedError,
+    Value,
+    is_constant,
+    is_known,
+)
 from reachjax.numerics.rounding import TINY, UNIT, Ball, larger, namespace
+
+NONE = Limits.of(0.0)
+"""Those of zero."""
 
 
 class Recorder:
@@ -40,6 +56,8 @@ class Recorder:
         self.known: dict[Any, tuple[list[Operand], Sequence[Operand]]] = {}
         self.inputs = [Value(place, shape) for place, shape in enumerate(shapes)]
         self.values = [*self.inputs]
+        self._made: dict[Any, Value] = {}
+        self._limits: dict[type[Limits], dict[int, Limits]] = {}
 
     def run(self, numbers: Sequence[Any], unit: AtUnit, wanted: Value) -> Any:
         """The numbers of a value, from those of the inputs, of any one kind.
@@ -53,31 +71,99 @@ class Recorder:
                 found[place] = step.apply(unit, *(found[parent] for parent in step.parents))
         return found[wanted.place]
 
-    def between(self, wanted: Value, first: Value | None = None) -> list[int]:
-        """Places of all that a value depends on, itself the last; back to another one, if given."""
+    def between(
+        self, wanted: Value, first: Value | None = None, done: Container[int] = ()
+    ) -> list[int]:
+        """Places of all that a value depends on, itself the last.
+
+        Args:
+            wanted: the value.
+            first: where to stop, if anywhere: what this one depends on is left out.
+            done: places that are left out, with what these depend on.
+        """
         needed, todo = set(), [wanted.place]
         while todo:
             place = todo.pop()
-            if place not in needed:
+            if place not in needed and place not in done:
                 needed.add(place)
                 step = None if first is not None and place == first.place else self.steps[place]
                 todo += step.parents if step is not None else ()
         return sorted(needed)
 
-    def layer(self, shape: Shape, step: Step, **facts: Any) -> Value:
-        """What a step makes of the values before; the rest is what is known of it."""
+    def layer(self, shape: Shape, step: Step, key: Any = None, **facts: Any) -> Value:
+        """What a step makes of the values before; the rest is what is known of it.
+
+        Args:
+            shape: of the array.
+            step: which one.
+            key: what makes it the step that it is; what is there already is not made again.
+            **facts: of the value.
+        """
+        if key is not None and key in self._made:
+            return self.reshaped(self._made[key], shape)
         made = Value(len(self.steps), shape, **facts)
         self.steps.append(step)
         self.values.append(made)
+        if key is not None:
+            self._made[key] = made
         return made
+
+    def reshaped(self, value: Value, shape: Shape) -> Value:
+        """The same entries as another array."""
+        if value.shape == shape:
+            return value
+        return Value(value.place, shape, value.terms, value.offset, value.source)
+
+    def limits(self, operand: Operand, kind: type[Limits] = Limits) -> Limits:
+        """Between what numbers operands are, whatever the inputs are.
+
+        Args:
+            operand: a value, or plain numbers.
+            kind: what is taken to be known.
+        """
+        if not isinstance(operand, Value):
+            return kind.of(operand)
+        known = self._limits.setdefault(kind, {})
+        for place in self.between(operand, done=known):
+            step, value = self.steps[place], self.values[place]
+            if step is None:
+                known[place] = kind.unknown(value.size)
+                continue
+            given = (known[parent] for parent in step.parents)
+            known[place] = step.apply(lambda unit, y: y.at(unit), *given)
+            if value.fact is not None:
+                also = value.fact(lambda operand: self.limits(operand, kind))
+                known[place] = known[place].meeting(also)
+        return known[operand.place]
+
+    def limited(self, value: Value, fact: Fact) -> Value:
+        """A value of which more is known than how it came about says: limits, from others."""
+        self.values[value.place].fact = fact
+        for known in self._limits.values():
+            known.pop(value.place, None)
+        return value
+
+    def is_nonnegative(self, value: Value) -> bool:
+        """Whether numbers are squares, say, or sums of them: never below zero."""
+        return self.limits(value, ConstantLimits).nonnegative
 
     def picked(self, value: Value, index: Int[np.ndarray, ...]) -> Value:
         """Entries of a value, by their numbers in the flat vector, as an array of that shape."""
-        flat, known = np.asarray(index).ravel(), value.nonnegative
+        flat, shape = np.asarray(index).ravel(), np.shape(index)
         if np.array_equal(flat, np.arange(value.size)):
-            return Value(value.place, np.shape(index), value.terms, value.offset, known)
-        step = Step(lambda unit, y: y[flat], (value.place,), entrywise=False)
-        return self.layer(np.shape(index), step, nonnegative=known)
+            return self.reshaped(value, shape)
+        if value.source is not None:
+            value, before = value.source
+            return self.picked(value, before[flat].reshape(shape))
+        step = Step(
+            lambda unit, y: y[flat],
+            (value.place,),
+            entrywise=False,
+            again=lambda y: self.picked(y, flat),
+            linear=True,
+        )
+        key = "picked", value.place, flat.tobytes()
+        return self.layer(shape, step, key, source=(self.values[value.place], flat))
 
     def broadcast(self, value: Value, shape: Shape) -> Value:
         """The same entries in a larger array."""
@@ -87,9 +173,14 @@ class Recorder:
     def scaled(self, value: Value, factor: Any) -> Value:
         """Each entry times a plain number."""
         factor = _flat(factor, value)
-        known = value.nonnegative and is_known(factor) and bool(np.all(np.asarray(factor) >= 0))
-        step = Step(lambda unit, y: factor * y, (value.place,))
-        return self.layer(value.shape, step, terms=(Term(value, factor),), nonnegative=known)
+        step = Step(
+            lambda unit, y: factor * y,
+            (value.place,),
+            again=lambda y: self.scaled(y, factor),
+            linear=is_constant(factor),
+        )
+        key = _key("scaled", value.place, factor)
+        return self.layer(value.shape, step, key, terms=(Term(value, factor),))
 
     def divided(self, value: Value, divisor: Any) -> Value:
         """Each entry over a plain number: times its inverse, which is rounded.
@@ -106,13 +197,18 @@ class Recorder:
             raise UnsupportedError("it divides by zero, or by what has no inverse in 64 bits")
         xp = namespace(divisor)
         inverse = xp.where(normal, 1.0 / xp.where(normal, divisor, 1.0), np.nan)
-        known = value.nonnegative and is_known(divisor) and bool(np.all(np.asarray(divisor) > 0))
 
         def apply(unit: AtUnit, y: Any) -> Any:
             return y.over(divisor) if isinstance(y, Rationals) else inverse * y
 
-        step, terms = Step(apply, (value.place,)), (Term(value, 1.0, divisor),)
-        return self.layer(value.shape, step, terms=terms, nonnegative=known)
+        step = Step(
+            apply,
+            (value.place,),
+            again=lambda y: self.divided(y, divisor),
+            linear=is_constant(divisor),
+        )
+        key = _key("divided", value.place, divisor)
+        return self.layer(value.shape, step, key, terms=(Term(value, 1.0, divisor),))
 
     def nearly_scaled(self, value: Value, factor: Any) -> Value:
         """Each entry times a number that this factor is off by a few roundings, three at most.
@@ -125,14 +221,20 @@ class Recorder:
         def apply(unit: AtUnit, y: Any) -> Any:
             return y.times_unknown() if isinstance(y, Rationals) else factor * y
 
-        return self.layer(value.shape, Step(apply, (value.place,)))
+        step = Step(apply, (value.place,), again=lambda y: self.nearly_scaled(y, factor))
+        return self.layer(value.shape, step, _key("nearly", value.place, factor))
 
     def shifted(self, value: Value, by: Any) -> Value:
         """Each entry plus a plain number."""
         by = _flat(by, value)
-        known = value.nonnegative and is_known(by) and bool(np.all(np.asarray(by) >= 0))
-        step = Step(lambda unit, y: y + by, (value.place,))
-        return self.layer(value.shape, step, terms=(Term(value),), offset=by, nonnegative=known)
+        step = Step(
+            lambda unit, y: y + by,
+            (value.place,),
+            again=lambda y: self.shifted(y, by),
+            linear=is_constant(by),
+        )
+        key = _key("shifted", value.place, by)
+        return self.layer(value.shape, step, key, terms=(Term(value),), offset=by)
 
     def added(self, one: Operand, other: Operand, sign: int = 1) -> Any:
         """`one + sign other`, both of one shape."""
@@ -140,19 +242,25 @@ class Recorder:
             return self.shifted(one, sign * other) if isinstance(one, Value) else one + sign * other
         if not isinstance(one, Value):
             return self.shifted(other if sign > 0 else self.scaled(other, np.array(-1.0)), one)
-        known = sign > 0 and one.nonnegative and other.nonnegative
         step = Step(
             (lambda unit, y, z: y + z) if sign > 0 else (lambda unit, y, z: y - z),
             (one.place, other.place),
+            again=lambda y, z: self.added(y, z, sign),
+            linear=True,
         )
         terms = Term(one), Term(other, float(sign))
-        return self.layer(one.shape, step, terms=terms, nonnegative=known)
+        return self.layer(one.shape, step, ("added", *step.parents, sign), terms=terms)
 
     def mapped(self, value: Value, matrix: Any, shape: Shape) -> Value:
         """A plain matrix times a value."""
-        known = value.nonnegative and is_known(matrix) and bool(np.all(np.asarray(matrix) >= 0))
-        step = Step(lambda unit, y: matrix @ y, (value.place,), entrywise=False)
-        return self.layer(shape, step, nonnegative=known)
+        step = Step(
+            lambda unit, y: matrix @ y,
+            (value.place,),
+            entrywise=False,
+            again=lambda y: self.mapped(y, matrix, shape),
+            linear=is_constant(matrix),
+        )
+        return self.layer(shape, step, _key("mapped", value.place, matrix))
 
     def joined(self, operands: Sequence[Operand]) -> Value:
         """All of these, one behind the other, as one vector; one of them at least is a value."""
@@ -172,8 +280,12 @@ class Recorder:
         return self.shifted(found, namespace(*constants).concatenate(constants))
 
     def unit(self, unit: AbstractUnit, value: Value) -> Value:
-        """A layer of units."""
+        """A layer of units, of which smooth ones are told between what numbers their inputs are."""
         line = self.line
+        if isinstance(unit, SmoothUnit) and value.size:
+            limits = self.limits(value)
+            ends = {"least": float(limits.least.min()), "most": float(limits.most.max())}
+            unit = dataclasses.replace(unit, **ends)
 
         def applied(at: AtUnit, y: Any) -> Any:
             try:
@@ -181,17 +293,13 @@ class Recorder:
             except UnboundedError as error:
                 raise UnboundedError(*error.given, line=line) from None
 
-        known = isinstance(unit, SmoothUnit) and unit.image[0] >= 0
-        step = Step(applied, (value.place,), unit=unit)
-        return self.layer(value.shape, step, nonnegative=known)
+        again = lambda y: self.unit(unit, y)  # noqa: E731
+        step = Step(applied, (value.place,), unit=unit, again=again)
+        return self.layer(value.shape, step, ("unit", unit, value.place))
 
     def rectified(self, value: Value) -> Value:
         """`max(value, 0)`."""
-        if value.nonnegative:
-            return value
-        found = self.unit(ReLU(), value)
-        found.nonnegative = True
-        return found
+        return value if self.is_nonnegative(value) else self.unit(ReLU(), value)
 
     def loosened(self, value: Value, by: np.ndarray) -> Value:
         """The same, up to an error of so much.
@@ -204,25 +312,48 @@ class Recorder:
         def apply(unit: AtUnit, y: Any) -> Any:
             return y.unknown() if isinstance(y, Rationals) else y + ((0.0 * y + large) - large)
 
-        return self.layer(value.shape, Step(apply, (value.place,)))
+        step = Step(apply, (value.place,), again=lambda y: self.loosened(y, by))
+        return self.layer(value.shape, step)
 
     def absolute(self, value: Value) -> Value:
         """`|value| = 2 max(value, 0) - value`."""
-        if value.nonnegative:
+        if self.is_nonnegative(value):
             return value
         found = self.added(self.scaled(self.rectified(value), np.array(2.0)), value, -1)
-        step = Step(_sized, (found.place, value.place))
-        return self.layer(value.shape, step, terms=(Term(found),), nonnegative=True)
+        again = lambda _, y: self.absolute(y)  # noqa: E731
+        sized = self.met(found, [value], _size, again, terms=(Term(found),))
+        return self.limited(sized, lambda limits: limits(value).larger(-limits(value)).larger(NONE))
+
+    def met(
+        self, value: Value, others: Sequence[Value], held: Any, again: Any, **facts: Any
+    ) -> Value:
+        """A value whose intervals are met with what those of others say of it.
+
+        Args:
+            value: which one.
+            others: the values that more is known from.
+            held: from intervals of these to one that holds the value.
+            again: how the step is recorded of other values.
+            **facts: of the result.
+        """
+
+        def apply(unit: AtUnit, y: Any, *given: Any) -> Any:
+            known = type(y) is Ball and all(type(each) is Ball for each in given)
+            return y.meeting(held(*given)) if known else y
+
+        step = Step(apply, (value.place, *(each.place for each in others)), again=again)
+        return self.layer(value.shape, step, ("met", held, *step.parents), **facts)
 
     def product(self, one: Value, other: Value) -> Value:
         """`one * other = ((one + other)^2 - (one - other)^2) / 4`, entry by entry."""
         if one.place == other.place:
             return self.unit(Square(), one)
+        one, other = sorted((one, other), key=lambda value: value.place)
         parts = self.added(one, other), self.added(one, other, -1)
         more, less = (self.unit(Square(), part) for part in parts)
         places = more.place, less.place, one.place, other.place
-        known = one.nonnegative and other.nonnegative
-        return self.layer(one.shape, Step(_multiplied, places), nonnegative=known)
+        step = Step(_multiplied, places, again=lambda _, __, y, z: self.product(y, z))
+        return self.layer(one.shape, step, ("product", one.place, other.place))
 
     def replaced(self, wanted: Value, old: Value, new: Value, passing: dict[int, bool]) -> Value:
         """A value as it is where another one, of which alone it is made, is changed.
@@ -233,6 +364,7 @@ class Recorder:
             new: what takes its place.
             passing: rectifiers, by their places, that are now known to be their inputs, or zero.
         """
+        new = self.reshaped(new, (new.size,))
         found = {old.place: new}
         for place in self.between(wanted, old):
             step = self.steps[place]
@@ -242,9 +374,16 @@ class Recorder:
             if place in passing:
                 found[place] = parents[0] if passing[place] else self.scaled(new, np.array(0.0))
                 continue
-            changed = step._replace(parents=tuple(parent.place for parent in parents))
-            found[place] = self.layer(wanted.shape, changed)
-        return found[wanted.place]
+            assert step.again is not None  # every step that is made of others can be made again
+            found[place] = step.again(*parents)
+        return self.reshaped(found[wanted.place], wanted.shape)
+
+
+def _key(kind: str, place: int, plain: Any) -> Any:
+    """What makes a step the one that it is, by plain numbers; None if these are traced."""
+    if not isinstance(plain, np.ndarray):
+        return None
+    return kind, place, type(plain), plain.shape, str(plain.dtype), plain.tobytes()
 
 
 def _multiplied(unit: AtUnit, more: Any, less: Any, one: Any, other: Any) -> Any:
@@ -255,18 +394,20 @@ def _multiplied(unit: AtUnit, more: Any, less: Any, one: Any, other: Any) -> Any
     """
     if isinstance(one, np.ndarray | jax.Array | Rationals) or hasattr(one, "values"):
         return one * other
+    if isinstance(one, Limits):
+        return one * other
     squares = 0.25 * (more - less)
     known = type(squares) is Ball and all(type(each) is Ball for each in (one, other))
     return squares.meeting(one.times(other)) if known else squares
 
 
-def _sized(unit: AtUnit, size: Any, y: Any) -> Any:
-    """Sizes `|y|`; of intervals, met with what these know of them."""
-    if type(size) is not Ball:
-        return size
+def _size(y: Ball) -> Ball:
+    """Sizes `|y|` of intervals."""
     least = larger(larger(y.lower, -y.upper), 0.0)
-    return size.meeting(Ball.between(least, larger(larger(-y.lower, y.upper), least)))
+    return Ball.between(least, larger(larger(-y.lower, y.upper), least))
 
 
 def _flat(plain: Any, value: Value) -> Any:
+    if isinstance(plain, Parameter):
+        return np.broadcast_to(plain, value.shape, subok=True).reshape(-1)
     return namespace(plain).broadcast_to(plain, value.shape).reshape(-1)

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.checks import is_concrete
 
@@ -31,7 +33,8 @@ class Value:
         shape: of the array that they are, flattened.
         terms: the sum that they are, entry by entry, of values nearer to the inputs, and
         offset: what is added to it; None where they are no such sum.
-        nonnegative: whether they are squares, say, or sums of them: never below zero.
+        source: what they are entries of, and which, if they are picked.
+        fact: limits that are known besides, from those of other values.
     """
 
     def __init__(
@@ -40,10 +43,11 @@ class Value:
         shape: Shape,
         terms: tuple[Term, ...] | None = None,
         offset: Any = 0.0,
-        nonnegative: bool = False,
+        source: tuple[Value, Any] | None = None,
     ):
         self.place, self.shape, self.terms, self.offset = place, shape, terms, offset
-        self.nonnegative = nonnegative
+        self.source = source
+        self.fact: Fact | None = None
 
     @property
     def size(self) -> int:
@@ -68,6 +72,9 @@ class Comparison(NamedTuple):
 Operand = Any
 """A `Value`, a `Comparison`, or a plain array that depends on no input."""
 
+Fact = Callable[[Callable[[Operand], Any]], Any]
+"""Limits of a value, from a function that gives those of others."""
+
 
 class Step(NamedTuple):
     """How a value comes about.
@@ -77,12 +84,30 @@ class Step(NamedTuple):
         parents: the places of these.
         entrywise: whether each entry is of the same entries of these alone.
         unit: that of a layer of units.
+        again: how it is recorded of other values, flat ones, in place of its parents.
+        linear: whether it is affine, by numbers that are known.
     """
 
     apply: Callable[..., Any]
     parents: tuple[int, ...]
     entrywise: bool = True
     unit: AbstractUnit | None = None
+    again: Callable[..., Any] | None = None
+    linear: bool = False
+
+
+class Parameter(np.ndarray):
+    """The numbers of a parameter, or what is made of them: known here, and traced elsewhere."""
+
+    @classmethod
+    def of(cls, plain: Any) -> Any:
+        """A parameter; one that is traced as it is."""
+        return np.asarray(plain).view(cls) if is_concrete(plain) else plain
+
+
+def is_constant(plain: Any) -> bool:
+    """Whether plain numbers are the same whatever the parameters are."""
+    return is_concrete(plain) and not isinstance(plain, Parameter)
 
 
 def is_known(*plain: Any) -> bool:

@@ -24,6 +24,16 @@ def shapes_of(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype), tree)
 
 
+def in_numpy(tree: Any) -> Any:
+    """A tree of known numbers with numpy arrays for leaves.
+
+    A tree that has these already is returned itself: functions in it keep their recordings.
+    """
+    if all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(tree)):
+        return tree
+    return jax.device_get(tree)
+
+
 def all_finite(tree: Any) -> bool:
     """Whether a tree of numpy arrays holds neither NaN nor infinity."""
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))

@@ -10,11 +10,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit, Line, Lines
-from reachjax.numerics.pytrees import pytree
+from reachjax.numerics.host import in_numpy
+from reachjax.numerics.pytrees import pytree, unchecked
 from reachjax.numerics.rounding import Ball, gamma
 from reachjax.sets import Box
 
@@ -97,7 +99,7 @@ def _image(unit: AbstractUnit, y: Ball) -> tuple[Ball, Ball]:
     """
     rounding = gamma(8) * (abs(y.mid) + y.rad)
     if not unit.nonexpansive:
-        y, rounding = Ball(y.mid, y.rad + 2 * rounding), jnp.zeros_like(rounding)
+        y, rounding = Ball(y.mid, y.rad + 2 * rounding), 0.0 * rounding
     z = Ball.between(*unit.interval(y.lower, y.upper))
     return y, Ball(z.mid, z.rad + rounding)
 
@@ -131,23 +133,27 @@ def _chosen(mask: Array, one: Line, other: Line) -> Line:
     return Line(*(jnp.where(mask, *pair) for pair in zip(one, other, strict=True)))
 
 
-@jax.jit
-def successor_box(
-    loop: ClosedLoop, box: Box, t: int, w: Array | None = None, v: Array | None = None
-) -> Box:
+def successor_box(loop: ClosedLoop, box: Box, t: int, w: Any = None, v: Any = None) -> Box:
     """A box that surely holds the successors of a box of states, rounding included.
 
+    In numpy, where nothing is compiled: it is asked for one trajectory at a time.
+
     Args:
-        loop: the closed loop.
+        loop: of known numbers; of one with numpy arrays the functions are recorded once.
         box: of states.
         t: the time.
         w: the disturbances, where they are known.
         v: the noise, where it is known.
+
+    Returns:
+        A box of numpy arrays, infinite or no numbers where numbers overflow.
     """
-    drawn = (None if part is None else Ball.exact(part) for part in (w, v))
-    state = Ball.between(box.lower, box.upper)
-    successor = loop.step(state, t, lambda unit, y: _image(unit, y)[1], *drawn)
-    return Box(successor.lower, successor.upper)
+    loop, lower, upper = map(in_numpy, (loop, box.lower, box.upper))
+    drawn = (None if part is None else Ball.exact(np.asarray(part)) for part in (w, v))
+    with np.errstate(all="ignore"):
+        state = Ball.between(lower, upper)
+        successor = loop.step(state, t, lambda unit, y: _image(unit, y)[1], *drawn)
+        return unchecked(Box, lower=successor.lower, upper=successor.upper)
 
 
 def _concatenate(*arrays: Any) -> Array:

@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
+from reachjax.numerics.budget import clock
+
 CHUNK = 256
 """Pairs that are treated together: it bounds the memory that products of them take."""
 
@@ -52,6 +54,7 @@ class Generators(NamedTuple):
         by_left, by_right = gram[:, self.left], gram[:, self.right]
         shared = np.zeros((self.size, len(self.left)))
         for first in range(0, len(self.left), CHUNK):
+            clock().require()
             here = slice(first, first + CHUNK)
             crossed = by_left[self.left[here]] * by_right[self.right[here]]
             crossed += by_right[self.left[here]] * by_left[self.right[here]]
@@ -71,6 +74,7 @@ class Generators(NamedTuple):
         A_left, A_right, B_left, B_right = A[:, left], A[:, right], B[:, left], B[:, right]
         shared = np.zeros((self.size, len(self.left)))
         for first in range(0, len(left), CHUNK):
+            clock().require()
             here = slice(first, first + CHUNK)
             p, q = left[here], right[here]
             crossed = A_left[p] * B_right[q]

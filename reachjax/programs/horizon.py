@@ -31,8 +31,8 @@ from reachjax.programs.initial import Ends, InitialColumns, product_facts
 from reachjax.programs.unrolled import FactWeights
 from reachjax.sets import AbstractSet, Box
 
-Multipliers = Callable[[AffineForms], Float[np.ndarray, "k m"]]
-"""Multipliers of the facts so far that bound each of these forms from above."""
+Multipliers = Callable[[AffineForms], Float[np.ndarray, "k m"] | None]
+"""Multipliers of the facts so far that bound each of these forms from above; None if none do."""
 
 
 class Horizon:
@@ -133,7 +133,10 @@ class Horizon:
             lower, upper = (end.copy() for end in ends)
             inputs = y[switching]
             both = joined([inputs, -inputs])
-            found_ends = self.bounds(both, multipliers(both))
+            weights = multipliers(both)
+            if weights is None:
+                return ends
+            found_ends = self.bounds(both, weights)
             better = met(
                 (lower[switching], upper[switching]),
                 (-found_ends[len(switching) :], found_ends[: len(switching)]),

@@ -150,25 +150,50 @@ def _pairs(n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.triu_indices(n)
 
 
+@lru_cache(maxsize=64)
+def _rounds(n: int) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """All pairs of `n` numbers, by rounds in which each number has at most one other.
+
+    As players of a tournament meet: in round `r` those whose sum is `r`, up to `m`, and the last
+    one, if `n` is even, the one that would meet itself.
+
+    Returns:
+        For each round the other of each number, itself where it has none, and the number of their
+        pair in `_pairs`, or how many pairs there are.
+    """
+    m = n - 1 if n % 2 == 0 else n
+    numbers = {pair: k for k, pair in enumerate(zip(*_pairs(n), strict=True))}
+    found = []
+    for r in range(m):
+        other = [(r - i) % m for i in range(m)] + [n - 1] * (n - m)
+        for i in [i for i in range(m) if other[i] == i][: n - m]:
+            other[i], other[n - 1] = n - 1, i
+        pairs = [numbers[min(i, j), max(i, j)] for i, j in enumerate(other)]
+        alone = np.arange(n) == other
+        found.append((np.array(other), np.where(alone, len(numbers), pairs)))
+    return tuple(found)
+
+
 def _highest(rows: Rows, pairs: tuple[np.ndarray, np.ndarray]) -> Any:
-    """The largest value of each row over the box, as above; plain rounding."""
+    """The largest value of each row over the box, as above; plain rounding.
+
+    Products take from linear terms by rounds of pairs that share none: what takes them one by one
+    is compiled for minutes where there are twelve states.
+    """
     xp, n = namespace(rows), int(pairs[1].max(initial=-1)) + 1
-    linear, signs = list(abs(rows[:, :n]).T), xp.where(rows[:, :n] < 0, -1.0, 1.0)
-    total, squares = 0.0, {}
-    for i, j, q in zip(*pairs, rows[:, n:].T, strict=True):
-        if i == j:
-            squares[i] = q
-            continue
-        total = total + abs(q)
-        against = q * signs[:, i] * signs[:, j] < 0
-        taken = xp.where(against, smaller(abs(q), smaller(linear[i], linear[j])), 0.0)
-        linear[i], linear[j] = linear[i] - taken, linear[j] - taken
-    for i, g in enumerate(linear):
-        q = squares[i]
-        inside = (q < 0) & (g < -4 * q)
-        depth = xp.where(inside, -q, 1.0)
-        total = total + xp.where(inside, g**2 / (8 * depth) + depth, g + q)
-    return total
+    i, j = pairs
+    linear, signs = abs(rows[:, :n]), xp.where(rows[:, :n] < 0, -1.0, 1.0)
+    products, mixed = rows[:, n:], i != j
+    against = (products * signs[:, i] * signs[:, j] < 0) & mixed
+    spare = xp.where(against, abs(products), 0.0)
+    spare = xp.concatenate([spare, xp.zeros((len(rows), 1))], axis=1)
+    for other, number in _rounds(n):
+        linear = linear - smaller(spare[:, number], smaller(linear, linear[:, other]))
+    q = products[:, np.flatnonzero(~mixed)]
+    inside = (q < 0) & (linear < -4 * q)
+    depth = xp.where(inside, -q, 1.0)
+    alone = xp.where(inside, linear**2 / (8 * depth) + depth, linear + q)
+    return abs(products[:, np.flatnonzero(mixed)]).sum(axis=1) + alone.sum(axis=1)
 
 
 def _of_box(box: Box, cut: PolyhedralSet | None) -> InitialColumns:

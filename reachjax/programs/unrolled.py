@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit, Mark
+from reachjax.numerics.host import in_numpy
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
 from reachjax.programs.initial import Ends, InitialColumns, constant, product_facts
@@ -88,7 +89,7 @@ def unrolled(
         >>> [step.offsets.round(6).tolist() for step in unrolled(loop, X0, X0, np.ones((2, 1, 1)))]
         [[1.2], [0.72]]
     """
-    loop, X0, box, known = jax.device_get((loop, X0, box, known))
+    loop, X0, box, known = map(in_numpy, (loop, X0, box, known))
     with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
         start = InitialColumns.of(X0, box, loop.curved)
         state = AffineForms.beginning(start)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from reachjax.numerics.budget import clock
 from reachjax.numerics.checks import whole_number
 from reachjax.programs.lmi import Program
 from reachjax.programs.presolve import presolved
@@ -77,7 +78,7 @@ class Auto(AbstractSolver):
         else:  # an inaccurate ellipsoid is centred anyhow
             first, second, enough = self.small, self.large, ANSWERS
         found = proposed_enclosure(first, program, form)
-        if found.status in enough:
+        if found.status in enough or clock().late:
             return found
         other = proposed_enclosure(second, program, form)
         return other if other.status in ANSWERS else found

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon
 from reachjax.solvers.linear_programs import AbstractPrograms, Vertex
@@ -93,6 +94,7 @@ class Tree:
         forms: `r` of them.
         attained: the largest value that is known to be attained, given columns of more solutions.
         enough: whether to stop, given the bound and what is attained.
+        budget: of each program's time.
 
     Attributes:
         nodes: how many linear programs were solved.
@@ -105,11 +107,12 @@ class Tree:
         forms: AffineForms,
         attained: Callable[[list[Float[np.ndarray, " n"]]], float],
         enough: Callable[[float, float], bool],
+        budget: Budget = ENDLESS,
     ):
         forms = forms.widened(horizon.facts.columns.shape[1])
         self._rows, self._constants = np.asarray(forms.columns), np.asarray(forms.rows[:, 0])
         self._horizon, self._programs = horizon, programs
-        self._attained, self._enough = attained, enough
+        self._attained, self._enough, self._budget = attained, enough, budget
         self._serial, self._stuck = itertools.count(), False
         self._heap: list[tuple[float, int, Node]] = []
         self._empty: list[Node] = []
@@ -167,7 +170,7 @@ class Tree:
 
     def _solved(self, phases: dict[int, int], basis: Any = None) -> Vertex | None:
         held = (self._horizon.zero[i, side] for i, side in phases.items())
-        return self._programs.largest(self._rows, self._constants, held, basis=basis)
+        return self._programs.largest(self._rows, self._constants, held, self._budget, basis=basis)
 
     def _split_at(self, node: Node) -> int | None:
         """The pair to be split; None if all that is not held is as it should be."""
@@ -206,6 +209,7 @@ def settled(
     columns: Float[np.ndarray, " n"],
     leaves: Int[np.ndarray, "l p"],
     bound: float,
+    budget: Budget = ENDLESS,
 ) -> Float[np.ndarray, " m"] | None:
     """Multipliers of a bound that is attained, with nothing of the lines that hold units.
 
@@ -220,6 +224,7 @@ def settled(
         columns: where it is attained.
         leaves: phases of the pairs of facts in each leaf, in one of which it is.
         bound: that is proved.
+        budget: of each program's time.
 
     Returns:
         None where the bound is not attained there.
@@ -239,7 +244,7 @@ def settled(
             continue
         there = np.where(both, phases, side)
         held = (zero[i, there[i]] for i in np.flatnonzero(there >= 0))
-        vertex = programs.largest(row, constant, held, reach=reach)
+        vertex = programs.largest(row, constant, held, budget, reach=reach)
         if vertex is not None and abs(vertex.value - attained) <= near:
             return vertex.multipliers
     return None

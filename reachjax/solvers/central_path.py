@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from reachjax.numerics.budget import ENDLESS, TimeOverError, clock
 from reachjax.solvers.barrier import EllipsoidBarrier
 
 FROM_AFAR = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 1e-5)
@@ -61,6 +62,8 @@ def path_end(
     At too low a price `t` stays, and what is found is smaller than the relaxation itself allows.
     """
     for price in prices:
+        if clock().late:
+            return None
         barrier.price = price
         first = start()
         found = None if first is None else follow(barrier, first, weights)
@@ -88,14 +91,20 @@ def minimiser(
     """Newton's method from a point inside: the minimiser and the Hessian there."""
     value, before = barrier.value(y, weight), np.inf
     for _ in range(NEWTON_STEPS if np.isfinite(value) else 0):
-        gradient, hessian = barrier.derivatives(y, weight)
+        if clock().late:
+            return None
+        try:
+            gradient, hessian = barrier.derivatives(y, weight)
+        except TimeOverError:
+            return None
         step = -solved(hessian, gradient)
         decrement = -float(gradient @ step)
         stagnant = before / 2 < decrement <= STAGNANT * weight
         if decrement <= CENTRED * weight or stagnant:
             better = y + step  # by the square of the decrement; the Hessian is to match
             y = better if np.isfinite(barrier.value(better, weight)) else y
-            return y, barrier.derivatives(y, weight)[1]
+            with ENDLESS.in_force():  # it is found
+                return y, barrier.derivatives(y, weight)[1]
         if not np.isfinite(decrement):
             return None
         length, near = 1.0, decrement <= QUADRATIC * weight

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
+from reachjax.numerics.budget import clock
 from reachjax.programs.lmi import Program
 from reachjax.programs.presolve import NormalProgram, presolved
 from reachjax.proofs.proposal import Solution, SolverStatus
@@ -33,6 +34,9 @@ STATUSES = {
     "MaxTime": SolverStatus.LIMIT,
 }
 """Clarabel's words for how it ended; any other is a failure."""
+
+LEAST = 1e-3
+"""Seconds: Clarabel takes no limit of zero."""
 
 ANSWERS = SolverStatus.SOLVED, SolverStatus.INACCURATE, SolverStatus.LIMIT
 
@@ -72,18 +76,22 @@ class Clarabel(AbstractConicSolver):
             **dict.fromkeys(tight, self.tolerance),
             **dict.fromkeys(loose, max(1e-3, self.tolerance)),
             "max_iter": self.max_iterations,
-            "time_limit": self.time_limit,
+            "time_limit": min(self.time_limit, max(clock().left, LEAST)),
             "chordal_decomposition_enable": False,
         }
 
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet, on as many threads as there are cores."""
         reduced, solution = presolved(program), Solution.blank_for(program)
+        budget = clock()  # of this thread; others have none
         cone = FacetCone(reduced, self._options)
 
         def solve(i: int) -> None:
             began, factor, found = time.perf_counter(), 1.0, None
+            solution.statuses[i] = SolverStatus.LIMIT
             for factor in RESCALINGS:
+                if budget.late:
+                    break
                 solution.statuses[i], found = cone.solved(factor * reduced.objective[i])
                 if solution.statuses[i] not in STALLED:
                     break
@@ -101,8 +109,11 @@ class Clarabel(AbstractConicSolver):
 
         facets = range(len(reduced.objective))
         if len(facets) > 1:
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
+            pool = ThreadPoolExecutor(os.cpu_count())
+            try:
                 list(pool.map(solve, facets))
+            finally:  # nobody waits for them after Ctrl-C
+                pool.shutdown(wait=False, cancel_futures=True)
         else:
             for i in facets:
                 solve(i)

@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
+from reachjax.numerics.budget import clock
 from reachjax.programs.lmi import Program
 from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
@@ -78,6 +79,9 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
         for i, (row, center, unit) in enumerate(
             zip(reduced.objective, reduced.centers, reduced.units, strict=True)
         ):
+            if clock().late:
+                solution.statuses[i:] = SolverStatus.LIMIT
+                break
             began = time.perf_counter()
             factor = 1.0
             for factor in RESCALINGS:
@@ -115,7 +119,7 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
             scaled = reduced.with_units(reduced.widths / factor)
             model = EllipsoidModel(scaled, None if form is None else scaled.to_unit_box(form))
             status = _run(model.problem, name, options)
-            if status not in STALLED:
+            if status not in STALLED or clock().late:
                 break
         seconds = time.perf_counter() - began
         assert model is not None

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.programs.affine import AffineForms
 from reachjax.solvers.linear_programs import AbstractPrograms, Vertex
 
@@ -52,6 +53,7 @@ class ConicPrograms(AbstractPrograms):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
+        budget: Budget = ENDLESS,
         reach: float | Float[np.ndarray, " n"] = 1.0,
         basis: Any = None,
     ) -> Vertex | None:
@@ -86,6 +88,7 @@ class ConicPrograms(AbstractPrograms):
             self._clarabel.NonnegativeConeT(sum(map(len, parts[1:-1]))),
             self._clarabel.SecondOrderConeT(len(ball)),
         ]
+        self._settings.time_limit = budget.left
         solver = self._clarabel.DefaultSolver(
             sp.csc_array((n + 1, n + 1)),
             -np.eye(1, n + 1, n)[0],

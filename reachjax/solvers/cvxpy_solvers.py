@@ -6,8 +6,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from reachjax.numerics.budget import clock
 from reachjax.solvers.base import require_positive
 from reachjax.solvers.conic import AbstractConicSolver
+
+LEAST = 1e-3
+"""Seconds: to SCS zero is no limit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +35,7 @@ class SCS(AbstractConicSolver):
             "eps_abs": self.tolerance,
             "eps_rel": self.tolerance,
             "max_iters": self.max_iterations,
-        }
+        } | ({"time_limit_secs": max(clock().left, LEAST)} if clock().timed else {})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from reachjax.numerics.budget import clock
 from reachjax.numerics.host import all_finite
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.lmi import Program, Slopes, form_rows, schur_slopes, with_successor
@@ -125,7 +126,7 @@ class LeastVolume(_AbstractEllipsoid):
         for attempt in range(ATTEMPTS):
             framed = with_successor(program, frame) if attempt else program
             reduced = presolved(framed)
-            if attempt and reduced.is_flat:
+            if attempt and (reduced.is_flat or clock().late):
                 break
             proposed, on_path = _on_path(solver, framed)
             enclosure = proposed._replace(form=proposed.form.of(frame))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, Self
@@ -66,10 +65,10 @@ class Facets(AbstractGoal):
         for facet in range(len(program.objective.mid)):
             one = program.with_objective(slice(facet, facet + 1))
             attained = None if rounds.witness is None else partial(rounds.witness, facet)
-            if time.monotonic() < rounds.deadline:
-                found.append(_facet(one, pool, solver, rounds, attained, used))
-            else:
+            if rounds.budget.late:
                 found.append(_unsolved(one, pool))
+            else:
+                found.append(_facet(one, pool, solver, rounds, attained, used))
             used = found[-1].in_use
         return _joined(program, pool, found)
 

@@ -7,10 +7,11 @@ import time
 
 import numpy as np
 
+from reachjax.numerics.budget import clock
 from reachjax.numerics.checks import whole_number
 from reachjax.programs.lmi import Program
 from reachjax.programs.presolve import presolved
-from reachjax.proofs.proposal import Enclosure, Solution
+from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver, require_positive
 from reachjax.solvers.centring import enclosed
@@ -55,6 +56,9 @@ class InteriorPoint(AbstractSolver):
         reduced = presolved(program)
         used = np.ix_(reduced.columns, reduced.columns)
         for i, row in enumerate(reduced.objective):
+            if clock().late:
+                solution.statuses[i:] = SolverStatus.LIMIT
+                break
             began = time.perf_counter()
             facet = FacetProgram(reduced.generators, reduced.free, row)
             found = minimised(facet, self.tolerance, self.max_iterations)

@@ -15,8 +15,10 @@ from typing import Any, NamedTuple
 
 import highspy
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.programs.affine import AffineForms
 
 TOLERANCE = 1e-9
@@ -25,7 +27,11 @@ TOLERANCE = 1e-9
 DANTZIG, OFF = 0, 0
 """Few pivots lead from a node to its branches: weights of edges and scales take longer."""
 
+BREATH = 0.4
+"""Seconds after which a program lets Ctrl-C through, before it goes on from its basis."""
+
 OPTIMAL, INFEASIBLE = highspy.HighsModelStatus.kOptimal, highspy.HighsModelStatus.kInfeasible
+OUT_OF_TIME = highspy.HighsModelStatus.kTimeLimit
 
 
 class Vertex(NamedTuple):
@@ -67,6 +73,7 @@ class AbstractPrograms(abc.ABC):
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
+        budget: Budget = ENDLESS,
         reach: float | Float[np.ndarray, " n"] = 1.0,
         basis: Any = None,
     ) -> Vertex | None:
@@ -76,6 +83,7 @@ class AbstractPrograms(abc.ABC):
             rows: over the columns.
             constants: of the rows.
             zero: facts that are held at zero.
+            budget: whose time ends it, without an answer.
             reach: what bounds the columns of units, of all or of each column.
             basis: where the search begins; None where the last one ended.
         """
@@ -127,14 +135,14 @@ class LinearPrograms(AbstractPrograms):
         self._rows = np.append(self._rows, self._count + np.arange(len(rows)))
         self._size = np.append(self._size, size)
         self._constant = np.append(self._constant, constants / size)
-        for constant, row in zip(constants / size, rows / size[:, None], strict=True):
-            self._add_row(-constant, highspy.kHighsInf, np.concatenate([[0.0], row]))
+        self._add_rows(-constants / size, rows / size[:, None], 0.0)
 
     def largest(
         self,
         rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
         zero: Iterable[int],
+        budget: Budget = ENDLESS,
         reach: float | Float[np.ndarray, " n"] = 1.0,
         basis: Any = None,
     ) -> Vertex | None:
@@ -154,14 +162,13 @@ class LinearPrograms(AbstractPrograms):
         else:
             objective[0], extra = 1.0, len(rows)
             self._model.changeColBounds(0, -highspy.kHighsInf, highspy.kHighsInf)
-            for row, constant in zip(rows / size, constants / size, strict=True):
-                self._add_row(-constant, highspy.kHighsInf, np.concatenate([[-1.0], row]))
+            self._add_rows(-constants / size, rows / size, -1.0)
         self._model.changeColsCost(width, np.arange(width, dtype=np.int32), objective)
         if np.any(reach != 1.0):
             self._bound_units(reach)
         if basis is not None:
             self._model.setBasis(basis)
-        found = self._solved(rows, constants, size, extra)
+        found = self._solved(rows, constants, size, extra, budget)
         if np.any(reach != 1.0):
             self._bound_units(1.0)
         if extra:
@@ -177,10 +184,9 @@ class LinearPrograms(AbstractPrograms):
         self._model.clearSolver()
 
     def _solved(
-        self, rows: np.ndarray, constants: np.ndarray, size: float, extra: int
+        self, rows: np.ndarray, constants: np.ndarray, size: float, extra: int, budget: Budget
     ) -> Vertex | None:
-        self._model.run()
-        status = self._model.getModelStatus()
+        status = self._run(budget)
         count = len(rows)
         if status == INFEASIBLE:
             _, there, ray = self._model.getDualRay()
@@ -208,6 +214,17 @@ class LinearPrograms(AbstractPrograms):
             self._model.getBasis(),
         )
 
+    def _run(self, budget: Budget) -> Any:
+        """How it ended; nothing reaches it while it runs, so it comes up for air to be stopped."""
+        while True:
+            # the limit is of all runs of a model together
+            ends = self._model.getRunTime() + min(budget.left, BREATH)
+            self._model.setOptionValue("time_limit", ends)
+            self._model.run()
+            status = self._model.getModelStatus()
+            if status != OUT_OF_TIME or budget.late:
+                return status
+
     def _placed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
         """Values of the columns that matter among those of all."""
         found = np.zeros(self._width)
@@ -234,7 +251,14 @@ class LinearPrograms(AbstractPrograms):
         if count > 0:
             self._model.addVars(count, np.full(count, -bound), np.full(count, bound))
 
-    def _add_row(self, lower: float, upper: float, row: np.ndarray) -> None:
-        there = np.flatnonzero(row)
-        self._model.addRow(lower, upper, len(there), there.astype(np.int32), row[there])
-        self._count += 1
+    def _add_rows(self, lowers: np.ndarray, rows: np.ndarray, least: float) -> None:
+        """Add rows that are at least so much, in all of which the least of several counts so much.
+
+        All at once: each time, the model orders all its entries anew.
+        """
+        given = sp.csr_array(np.c_[np.full(len(rows), least), rows])
+        count, starts = len(rows), given.indptr[:-1].astype(np.int32)
+        entries = given.nnz, starts, given.indices.astype(np.int32), given.data
+        if count:
+            self._model.addRows(count, lowers, np.full(count, highspy.kHighsInf), *entries)
+        self._count += count

@@ -30,6 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from reachjax.numerics.budget import TimeOverError, clock
 from reachjax.programs.generators import Generators
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.solvers.factorisations import inverse_cholesky, refined_solver
@@ -194,9 +195,11 @@ def minimised(program: FacetProgram, tolerance: float, max_iterations: int) -> O
     point = best = program.start()
     least, iterations, idle, short, over = np.inf, 0, 0, 0, False
     with np.errstate(all="ignore"):  # what overflows ends the run
-        while not over and iterations < max_iterations:
+        while not over and iterations < max_iterations and not clock().late:
             try:
                 following, missed, length = program.step(point)
+            except TimeOverError:
+                break
             except np.linalg.LinAlgError:  # no factor for any shift: an iterate that is lost
                 over = True
                 break
@@ -210,7 +213,8 @@ def minimised(program: FacetProgram, tolerance: float, max_iterations: int) -> O
     corner = best.X[-1, -1]
     if not (np.isfinite(least) and corner > 0 and all(np.isfinite(part).all() for part in best)):
         blank = np.zeros(len(best.y) - 1), np.full_like(best.X, np.nan)
-        return Optimum(np.nan, *blank, SolverStatus.FAILED, least, iterations)
+        failed = SolverStatus.LIMIT if clock().late else SolverStatus.FAILED
+        return Optimum(np.nan, *blank, failed, least, iterations)
     ended = SolverStatus.INACCURATE if over else SolverStatus.LIMIT
     status = SolverStatus.SOLVED if least <= tolerance else ended
     return Optimum(best.y[-1], best.y[:-1], best.X / corner, status, least, iterations)

@@ -9,13 +9,13 @@ nothing is violated, or they run out.
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.programs.facts import FactLayout
 from reachjax.programs.relaxations import CuttingPlanes
 from reachjax.solvers.cut_pool import NONE, CutPool
@@ -35,14 +35,14 @@ class Rounds(NamedTuple):
         cuts: how many rounds, and of how many products.
         witness: what simulations attain of a facet; rounds do not stop for them if it is None.
         warm_start: products that the first facet begins with, those that may be added.
-        deadline: when to stop, as `time.monotonic` says it.
+        budget: of the time.
     """
 
     layout: FactLayout
     cuts: CuttingPlanes
     witness: Witness | None = None
     warm_start: Int[np.ndarray, "p 2"] = NONE
-    deadline: float = np.inf
+    budget: Budget = ENDLESS
 
 
 class Shown(NamedTuple):
@@ -81,7 +81,7 @@ def in_rounds(
     resting = np.zeros(len(pairs), dtype=bool)
     for number in itertools.count():
         shown = solve(pairs)
-        if time.monotonic() >= rounds.deadline:
+        if rounds.budget.late:
             break
         if not np.isfinite(shown.moment).all():
             if number == 0 and len(missing := pool.missing(pairs)):

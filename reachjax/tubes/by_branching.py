@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops.scenarios import Scenarios
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.programs.unrolled import weighed_at_once
 from reachjax.proofs.branches import BranchCertificate, Rung
@@ -68,11 +69,11 @@ def sets_by_branching(
     gap = setting.gap
     if not is_concrete(setting.loop, X0, template):  # a derivative is that of what is attained
         gap = min(gap, EXACT)
-    timed = np.isfinite(setting.deadline)  # then that is the budget
+    timed = setting.budget.timed  # then that is the budget
     of_programs, work = (np.inf, np.inf) if timed else (WORK, PRODUCTS)
+    budget = setting.budget.with_work(of_programs)
     scenarios = Scenarios.of(loop, begun, horizon, setting.start)
-    limits = nodes, setting.deadline, of_programs
-    ladder = Ladder(loop, begun, around, scenarios, setting.start, *limits, setting.note)
+    ladder = Ladder(loop, begun, around, scenarios, setting.start, nodes, budget, setting.note)
     X, steps = X0, []
     for k, (region, proof, *_) in enumerate(known, start=1):
         steps.append(Step(setting, X, k - 1, tuple(steps)))
@@ -83,20 +84,20 @@ def sets_by_branching(
             work -= len(proof.by_products) * ladder.width**4
         ladder.horizon.narrow(*_ends(*_fixed(X)))
     left = (horizon - len(known)) / horizon
-    ladder.grant(left * of_programs)
+    budget.grant(left * of_programs)
     work = max(work, left * PRODUCTS)
     for k in range(len(known) + 1, horizon + 1):
         began = time.perf_counter()
         steps.append(Step(setting, X, k - 1, tuple(steps)))
         directions = template.at(k).directions
         rows = np.asarray(jax.lax.stop_gradient(directions))
-        end = ladder.until(1 / (horizon - k + 1))
-        ladder.advance(until=end)
+        share = budget.share(1 / (horizon - k + 1))
+        ladder.advance(budget=share)
         simulated = Simulated.nothing(scenarios.middle(around.center), len(rows))
         if setting.simulations is not None:
             simulated = setting.simulations.values(k, rows)
         target, ranges = ladder.facets(rows, simulated, gap)
-        half = (time.monotonic() + end) / 2  # the other one is for products
+        half = share.share(1 / 2)  # the other one is for products
         climbed = ladder.climbed(target, (horizon - k) * len(rows), half)
         if not np.isfinite(climbed.bounds).all():
             raise ValueError(
@@ -113,7 +114,7 @@ def sets_by_branching(
         opened = np.flatnonzero(gaps > setting.gap * ranges)
         opened = opened[np.argsort(-gaps[opened], kind="stable")]
         products = None
-        if ladder.width <= LARGEST and not loop.curved and time.monotonic() < end:
+        if ladder.width <= LARGEST and not loop.curved and not share.late:
             cost = ladder.width**4
             opened = opened[: int(min(work / cost, len(opened)))]
             work -= len(opened) * cost
@@ -121,7 +122,7 @@ def sets_by_branching(
             opened = opened[:0]
         if len(opened):
             setting.note(f"products for {len(opened)} facets, largest gap {gaps.max():.1e}")
-            offsets, products = _with_products(steps[-1], directions, offsets, opened, end)
+            offsets, products = _with_products(steps[-1], directions, offsets, opened, share)
         X = Polytope(directions, offsets)
         seconds = time.perf_counter() - began
         shut = _fixed(X)[1] - climbed.attained <= setting.gap * ranges
@@ -174,10 +175,10 @@ def _with_products(
     directions: Float[Array, "f n_x"],
     offsets: Float[Array, " f"],
     opened: np.ndarray,
-    end: float,
+    budget: Budget,
 ) -> tuple[Float[Array, " f"], Certificate]:
-    """The better of what is proved and what products prove of some facets until a time."""
-    found, proof = facets_by_products(step, directions[opened], end)
+    """The better of what is proved and what products prove of some facets within a budget."""
+    found, proof = facets_by_products(step, directions[opened], budget)
     better = found < offsets[opened]
     return offsets.at[opened].set(jnp.where(better, found, offsets[opened])), proof
 

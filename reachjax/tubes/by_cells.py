@@ -2,12 +2,14 @@
 
 What forms leave out of smooth functions falls with the third power of a cell's width. So the cell
 that decides the facet with the widest gap is halved, all steps being looked at together, until each
-bound is attained by a trajectory up to the gap that may stay open.
+bound is attained by a trajectory up to the gap that may stay open. Cells that have no bounds at all
+are halved first: the initial set is treated like any part of it.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -19,6 +21,8 @@ from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
+from reachjax.loops.units import UnboundedError
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.programs.affine_steps import step_columns
 from reachjax.programs.unrolled import ByForms, unrolled
@@ -53,13 +57,24 @@ class _Node:
 
     Args:
         cell: the part.
-        steps: for each step what forms say.
+        steps: for each step what forms say, as far as they say anything.
+        shape: of the offsets of all steps.
         parent: what it is a half of; None of the initial set.
+        lost: what has no bounds over it after these steps, if anything has not.
     """
 
-    def __init__(self, cell: Cell, steps: list[ByForms], parent: _Node | None = None):
-        self.cell, self.steps, self._parent = cell, steps, parent
-        self.offsets = np.array([step.offsets for step in steps])
+    def __init__(
+        self,
+        cell: Cell,
+        steps: list[ByForms],
+        shape: tuple[int, ...],
+        parent: _Node | None = None,
+        lost: UnboundedError | None = None,
+    ):
+        self.cell, self.steps, self.lost, self._parent = cell, steps, lost, parent
+        self.offsets = np.full(shape, np.inf)
+        for row, step in zip(self.offsets, steps, strict=False):
+            row[:] = np.where(np.isnan(step.offsets), np.inf, step.offsets)
         self.axis, self.halves = -1, list[_Node]()
 
     @property
@@ -71,6 +86,16 @@ class _Node:
             found.append(node.axis)
             left += node.halves[::-1]
         return found
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether all facets have bounds over it."""
+        return bool(np.isfinite(self.offsets).all())
+
+    @property
+    def depth(self) -> int:
+        """How many halvings it is away from the initial set."""
+        return 0 if self._parent is None else 1 + self._parent.depth
 
     def before(self, generations: int) -> _Node | None:
         """What it is left of after so many halvings; None if there were fewer."""
@@ -102,12 +127,14 @@ def sets_by_cells(
 
     Raises:
         KeyboardInterrupt: somebody stopped the search for cells, after all sets but the last.
+        UnboundedError: a unit has no bounds over a cell of the smallest size.
         ValueError: states overflow.
     """
     began, interrupted = time.perf_counter(), False
     directions = jnp.stack([template.at(k).directions for k in range(1, horizon + 1)])
     fixed = jax.lax.stop_gradient((setting.loop, X0, directions))
     search = _Search(setting, *fixed, most, known)
+    search.enclose()
     try:
         search.run()
     except KeyboardInterrupt:
@@ -171,31 +198,25 @@ class _Search:
         sides = np.asarray(cell.box.widths)
         self._sides = np.where(sides > 0, sides, 1.0)  # a side without length is not halved
         self._generations = max(GENERATIONS, 2 * int(np.sum(sides > 0)))
+        self._deepest = 2 * math.ceil(math.log2(most))
         self._root = self._made(cell)
         self.leaves = [self._root]
         self._note()
-        if not np.isfinite(self.bounds).all():
-            k = int(np.argmin(np.isfinite(self.bounds).all(axis=1))) + 1
-            raise ValueError(
-                f"the loop's states at t = {setting.start + k} overflow or are not numbers: check "
-                "the weights of loop.controller and the entries of loop.plant"
-            )
-        budget = (
-            MULTIPLICATIONS / _work(self._loop, len(directions))
-            if np.isinf(setting.deadline)
-            else np.inf
-        )
-        self._left = min(2 * most - 2, budget)
+        self._left = min(2 * most - 2, affordable(self._loop, len(directions), setting.budget))
         self.ended = SolverStatus.UNKNOWN_GAP
         self._open_parts: np.ndarray | None = None
 
     def _made(self, cell: Cell, parent: _Node | None = None) -> _Node:
         given = self._loop, cell.part, cell.box, self._directions, self._setting.start
-        return _Node(cell, list(unrolled(*given)), parent)
+        steps, lost = list[ByForms](), None
+        try:
+            steps.extend(unrolled(*given))
+        except UnboundedError as error:  # of halves there may be bounds
+            lost = error
+        return _Node(cell, steps, self._directions.shape[:2], parent, lost)
 
     def _note(self) -> None:
         every = np.array([leaf.offsets for leaf in self.leaves])
-        every = np.where(np.isnan(every), np.inf, every)
         self.deciding, self.bounds = every.argmax(axis=0), every.max(axis=0)
 
     @property
@@ -203,20 +224,45 @@ class _Search:
         """The tree of all cells."""
         return self._root.axes
 
+    def enclose(self) -> None:
+        """Halve cells that have no bounds until all have.
+
+        Raises:
+            UnboundedError: a unit has none over a cell of the smallest size.
+            ValueError: states overflow.
+        """
+        while True:
+            open_cells = [i for i, leaf in enumerate(self.leaves) if not leaf.is_bounded]
+            if not open_cells:
+                return self._note()
+            number = max(open_cells, key=lambda i: self.leaves[i].depth)  # soon the smallest
+            leaf = self.leaves[number]
+            spent = self._left < 2 or self._setting.budget.late or leaf.depth >= self._deepest
+            if spent or not self._halve(number):
+                break
+            self._setting.note(f"{len(self.leaves)} cells, {len(open_cells)} without bounds")
+        if leaf.lost is not None:
+            raise leaf.lost.after(len(self.leaves), leaf.cell.box.widths.tolist())
+        k = int(np.argmin(np.isfinite(leaf.offsets).all(axis=1))) + 1
+        raise ValueError(
+            f"the loop's states at t = {self._setting.start + k} overflow or are not numbers: "
+            "check the weights of loop.controller and the entries of loop.plant"
+        )
+
     def run(self) -> None:
         """Halve cells until gaps are closed, or nothing is left."""
         simulations = self._setting.simulations
         if simulations is None:
             return
         least, most = self._simulated()
-        floor = self._floor(least, most)
         for count in itertools.count():
             if count % LOOKED == 0:
                 simulations.include(*(self.farthest(k) for k in range(len(self.bounds))))
                 least, most = self._simulated()
-            excess, open_parts = self._open(least, most, floor)
-            if self._left < 2 or self._setting.late:
-                late = self._setting.late
+            # of the bounds so far: those of a wide set say nothing of a range
+            excess, open_parts = self._open(least, most, self._floor(least, most))
+            if self._left < 2 or self._setting.budget.late:
+                late = self._setting.budget.late
                 self.ended = SolverStatus.TIME if late else SolverStatus.BUDGET
                 return
             self.ended = SolverStatus.STALLED
@@ -285,6 +331,8 @@ class _Search:
         if not widths[axis] > 0:
             return False
         halves = [self._made(half, leaf) for half in halves_along(self._X0, leaf.cell.box, axis)]
+        if leaf.is_bounded and not all(half.is_bounded for half in halves):
+            return False
         leaf.axis, leaf.halves, leaf.steps = axis, halves, []
         self.leaves[number : number + 1] = halves
         self._left -= len(halves)
@@ -300,9 +348,11 @@ class _Search:
         return np.concatenate(found)
 
 
-def _work(loop: ClosedLoop, horizon: int) -> float:
-    """The products that one cell costs."""
+def affordable(loop: ClosedLoop, horizon: int, budget: Budget) -> float:
+    """How many cells may be bounded: any number where time is a limit."""
+    if budget.timed:
+        return np.inf
     more, between = step_columns(loop)
     columns = loop.states**2 + between + more * np.arange(1, horizon + 1)
     parameters = sum(np.size(leaf) for leaf in jax.tree.leaves(loop))
-    return float(np.sum(OVERHEAD + parameters * columns))
+    return MULTIPLICATIONS / float(np.sum(OVERHEAD + parameters * columns))

@@ -42,7 +42,8 @@ def sets_by_programs(
             X, proof = known[k].region, _of_programs(known[k].proof)
             continue
         setting.note("semidefinite programs")
-        X, proof = successors(step, template.at(k + 1))
+        share = setting.budget.share(1 / (horizon - k))
+        X, proof = successors(step, template.at(k + 1), share)
         states = np.zeros((0, X0.dimension))
         if len(step.window) == k + 1 and is_concrete(proof.moments):
             states = np.asarray(proof.moments)[:, : X0.dimension, -1]

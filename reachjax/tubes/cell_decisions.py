@@ -2,13 +2,14 @@
 
 Cells are bounded by forms, whose remainders fall with the third power of their widths: many in one
 compiled call once there are as many. Those that are left over are bounded one by one
-(`cell_tasks`). Halves are taken along the coordinate that moves the inputs of units most. Of a cell
-nothing is kept but its box and its margins.
+(`cell_tasks`). What a smooth loop's forms leave out, a half lowers eightfold for the price of a
+form, so its cells get programs only where they are not halved any more. Halves are taken along the
+coordinate that moves the inputs of units most. Of a cell nothing is kept but its box and its
+margins.
 """
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor
@@ -20,12 +21,14 @@ import jax
 import numpy as np
 
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import described, whole_number, wrapped
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, Box
 from reachjax.sets.cells import Cell, grid, halves_along
 from reachjax.tubes.cell_jobs import CellJobs
 from reachjax.tubes.cell_tasks import CellTask, Outcome, Unbounded, outcome_of
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.sieve import TOGETHER, Margins, Sieve, no_margins
 from reachjax.tubes.soundness import require_unbroken_cells
@@ -67,7 +70,7 @@ def decided_by_cells(
     begun: Sequence[Cell],
     most: int | None,
     simulations: Simulations | None,
-    deadline: float,
+    budget: Budget,
     executor: Executor | None = None,
     progress: Callable[[Iterable[Any]], Iterable[Any]] | None = None,
 ) -> Verdict:
@@ -79,18 +82,25 @@ def decided_by_cells(
         begun: the cells to begin with.
         most: how many cells there may be; None: as many as it takes.
         simulations: trajectories from the set.
-        deadline: when to stop, as `time.monotonic` says it.
+        budget: of the call.
         executor: runs the cells; None: here.
         progress: wraps the iteration over cells.
     """
-    run = _Run(task, X0, most, deadline)
+    run = _Run(task, X0, most, budget)
     if simulations is not None:
         run.seen(simulations.runs)
     if run.example is None:
-        with closing(run.results(begun, executor)) as results:  # a bar may end before they do
-            for _ in wrapped(progress, results):
-                if run.example is not None:
-                    break
+        try:
+            with closing(run.results(begun, executor)) as results:  # a bar may end before they do
+                for _ in wrapped(progress, results):
+                    if run.example is not None:
+                        break
+        except KeyboardInterrupt:
+            message = (
+                "interrupted: this exception's `found` is the verdict so far, whose `cells` that "
+                "are not undecided need not be decided again"
+            )
+            raise Interrupted(message, run.verdict(interrupted=True)) from None
     return run.verdict()
 
 
@@ -101,8 +111,8 @@ class _Run:
         example: a counterexample, once one is found.
     """
 
-    def __init__(self, task: CellTask, X0: AbstractSet, most: int | None, deadline: float):
-        self._task, self._X0, self._most, self._deadline = task, X0, most, deadline
+    def __init__(self, task: CellTask, X0: AbstractSet, most: int | None, budget: Budget):
+        self._task, self._X0, self._most, self._budget = task, X0, most, budget
         self._loop = jax.device_put(task.loop)
         self._scenarios = Scenarios.of(self._loop, X0, task.horizon, task.start)
         self._done: list[DecidedCell] = []
@@ -115,7 +125,10 @@ class _Run:
         box = boxed(X0, "X0")
         sides = np.asarray(box.widths)
         self._size, self._sides = _size(box), np.where(sides > 0, sides, 1.0)
-        self._lost: Unbounded | None = None
+        # of a smooth loop programs are the last remedy, of an affine one the next
+        self._first = task._replace(nodes=0) if task.loop.curved else task
+        self._last = deque[Cell]()
+        self._lost: tuple[Unbounded, list[float]] | None = None
         self._bounded = False
 
     @cached_property
@@ -130,37 +143,66 @@ class _Run:
         """How many cells are decided, after each that is bounded."""
         open_cells, left_over = deque(begun), deque[tuple[Cell, Margins | None]]()
         self._count = len(open_cells)
-        jobs = CellJobs[Cell](executor, AHEAD)
+        jobs = CellJobs[tuple[Cell, CellTask]](executor, AHEAD)
         try:
-            while open_cells or left_over or jobs:
+            while open_cells or left_over or self._last or jobs:
                 while (open_cells or left_over) and len(jobs) < jobs.most:
-                    if not left_over and len(open_cells) >= TOGETHER and not self._late:
+                    if self._budget.overdue:
+                        return
+                    if not left_over and len(open_cells) >= TOGETHER and not self._budget.late:
                         some = [open_cells.popleft() for _ in range(TOGETHER)]
-                        left_over.extend(self._sifted(some))
+                        try:
+                            left_over.extend(self._sifted(some))
+                        except KeyboardInterrupt:
+                            open_cells.extend(some)
+                            raise
                         yield len(self._done)
                         continue
                     cell, known = left_over.popleft() if left_over else (open_cells.popleft(), None)
-                    bounded = known is not None and not self._task.by_programs
+                    bounded = known is not None and not self._first.by_programs
                     axis = None if bounded else self._hopeless(cell)
                     if axis is not None:
                         open_cells.extend(self._halved(cell, axis))
                         continue
-                    part = jax.device_get(cell.part)
-                    jobs.submit(cell, outcome_of, self._task, part, self._deadline, known)
-                for cell, outcome in jobs.finished():
-                    open_cells.extend(self._judged(cell, outcome))
+                    self._submit(jobs, cell, self._first, known)
+                while self._last and not (open_cells or left_over) and len(jobs) < jobs.most:
+                    if self._budget.late:
+                        return
+                    self._submit(jobs, self._last.popleft(), self._task)
+                for (cell, task), outcome in jobs.finished():
+                    try:
+                        open_cells.extend(self._judged(cell, outcome, task is self._first))
+                    except KeyboardInterrupt:
+                        open_cells.append(cell)
+                        raise
                     yield len(self._done)
                 if self.example is not None:
                     return
         finally:
-            left = [*open_cells, *(cell for cell, _ in left_over), *jobs.cancelled()]
+            left = [*open_cells, *(cell for cell, _ in (*left_over, *jobs.cancelled()))]
+            left += self._last
             if self.example is None:
                 for cell in left:
                     self._kept(cell, Outcome(False, self._blank, 0), VerdictStatus.UNKNOWN)
 
+    def _submit(
+        self,
+        jobs: CellJobs[tuple[Cell, CellTask]],
+        cell: Cell,
+        task: CellTask,
+        known: Margins | None = None,
+    ) -> None:
+        part = jax.device_get(cell.part)
+        jobs.submit((cell, task), outcome_of, task, part, self._budget, known)
+
     def _sifted(self, cells: Sequence[Cell]) -> list[tuple[Cell, Margins | None]]:
-        """Those of some cells that forms do not prove, with the margins that these say."""
+        """Those of some cells that forms do not prove, with the margins that these say.
+
+        All of them, of which nothing is known, while it pays better to bound them one by one.
+        """
         ends = [(np.asarray(cell.box.lower), np.asarray(cell.box.upper)) for cell in cells]
+        if not self._sieve.pays(ends, self._budget):
+            return [(cell, None) for cell in cells]
         found: list[tuple[Cell, Margins | None]] = []
         for cell, sifted in zip(cells, self._sieve.sifted(ends), strict=True):
             if sifted.proved:
@@ -169,9 +211,13 @@ class _Run:
                 found.append((cell, sifted.margins))
         return found
 
-    def _judged(self, cell: Cell, outcome: Outcome) -> list[Cell]:
-        """The halves of a cell that is not proved, as long as there may be more."""
-        self._lost = outcome.unbounded or self._lost
+    def _judged(self, cell: Cell, outcome: Outcome, first: bool = True) -> list[Cell]:
+        """The halves of a cell that is not proved, as long as there may be more.
+
+        Where there may not, it is left to programs, if it had none at first.
+        """
+        if outcome.unbounded is not None:
+            self._lost = outcome.unbounded, cell.box.widths.tolist()
         self._bounded = self._bounded or outcome.unbounded is None
         if outcome.axis < 0:
             widths = np.asarray(cell.box.widths) / self._sides
@@ -182,18 +228,18 @@ class _Run:
             return []
         self._tried.setdefault(self._depth(cell), deque()).append(outcome.axis)
         self._shoot(cell)
-        if self.example is not None or not self._may_halve(cell, outcome.axis):
+        if self.example is not None or not first or not self._may_halve(cell, outcome.axis):
+            later = first and self._first is not self._task and self._task.by_programs
+            if later and self.example is None and not self._budget.late:
+                self._last.append(cell)
+                return []
             self._kept(cell, outcome, VerdictStatus.UNKNOWN)
             return []
         return self._halved(cell, outcome.axis)
 
-    @property
-    def _late(self) -> bool:
-        return time.monotonic() >= self._deadline
-
     def _may_halve(self, cell: Cell, axis: int) -> bool:
         full = self._most is not None and self._count >= self._most
-        return not (self._late or full) and float(cell.box.widths[axis]) > 0
+        return not (self._budget.late or full) and float(cell.box.widths[axis]) > 0
 
     def _halved(self, cell: Cell, axis: int) -> list[Cell]:
         found = halves_along(self._X0, cell.box, axis)
@@ -254,15 +300,19 @@ class _Run:
             found += suspects(item, rooms, runs)
         self.example = counterexample(self._loop, self._X0, found, self._task.start)
 
-    def verdict(self) -> Verdict:
-        """All of it.
+    def verdict(self, interrupted: bool = False) -> Verdict:
+        """The verdict from all cells that were looked at.
+
+        Args:
+            interrupted: whether somebody stopped that.
 
         Raises:
             UnboundedError: there is no cell over which all units have bounds.
             UnsoundError: a trajectory breaks what is proved.
         """
-        if self._lost and not self._bounded and self.example is None:
-            raise self._lost.error
+        if self._lost and not (self._bounded or self.example or interrupted):
+            unbounded, widths = self._lost
+            raise unbounded.error.after(len(self._done), widths)
         task = self._task
         known = task.horizon, task.start, task.required, self._done
         require_unbroken_cells(self._loop, self._X0, *known, self.example)

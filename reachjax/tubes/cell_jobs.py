@@ -1,15 +1,32 @@
-"""Cells that are bounded by an executor, or one after the other where there is none."""
+"""Cells that are bounded by an executor, or one after the other where there is none.
+
+A worker may die, and an executor with it. Cells that were in flight are taken back then, and
+bounded once more in the calling process, as are all that come after them.
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from typing import Any, Generic, TypeVar
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future
+from concurrent.futures import wait as wait_for
+from typing import Any, Generic, NamedTuple, TypeVar
 
 WORKERS = 4
 """How many an executor has that does not say it."""
 
 Kept = TypeVar("Kept")
+
+DEAD = "KilledWorker", "CommClosedError", "FutureCancelledError"
+"""What dask calls workers that have died: its classes are not imported for their names."""
+
+
+class _Job(NamedTuple, Generic[Kept]):
+    """A job, and what it is of."""
+
+    kept: Kept
+    function: Callable[..., Any]
+    given: tuple[Any, ...]
 
 
 class CellJobs(Generic[Kept]):
@@ -20,35 +37,76 @@ class CellJobs(Generic[Kept]):
         ahead: how many it is given for each of its workers.
 
     Attributes:
+        workers: how many jobs run at a time.
         most: how many there may be at a time.
     """
 
     def __init__(self, executor: Executor | None, ahead: int):
         self._executor = executor
-        self._running: dict[Future, Kept] = {}
-        self.most = 1 if executor is None else ahead * getattr(executor, "_max_workers", WORKERS)
+        self._running: dict[Future, _Job[Kept]] = {}
+        self.workers = 1 if executor is None else getattr(executor, "_max_workers", WORKERS)
+        self.most = 1 if executor is None else ahead * self.workers
 
     def __len__(self) -> int:
         return len(self._running)
 
     def submit(self, kept: Kept, function: Callable[..., Any], *given: Any) -> None:
-        """Begin a job; without an executor it is done at once."""
-        if self._executor is None:
-            future: Future = Future()
-            future.set_result(function(*given))
-        else:
-            future = self._executor.submit(function, *given)
-        self._running[future] = kept
+        """Begin a job; without an executor it is done once it is asked for."""
+        future: Future = Future()
+        if self._executor is not None:
+            try:
+                future = self._executor.submit(function, *given)
+            except BrokenExecutor as error:
+                self._give_up(error)
+        self._running[future] = _Job(kept, function, given)
 
     def finished(self) -> Iterator[tuple[Kept, Any]]:
-        """Those that are done, with their results, once there are any."""
-        done, _ = wait(self._running, return_when=FIRST_COMPLETED)
+        """Those that are done, with their results, once there are any.
+
+        A job stays among those that run until there is a result.
+        """
+        if self._executor is None:
+            done = list(self._running)[:1]
+        else:
+            done, _ = wait_for(self._running, return_when=FIRST_COMPLETED)
         for future in done:
-            yield self._running.pop(future), future.result()
+            job = self._running[future]
+            result = self._result(future, job)
+            del self._running[future]
+            yield job.kept, result
+
+    def _result(self, future: Future, job: _Job[Kept]) -> Any:
+        """The result of a job, here if it has none from elsewhere."""
+        if self._executor is not None or future.done():
+            try:
+                return future.result()
+            except (BrokenExecutor, CancelledError) as error:
+                self._give_up(error)
+            except Exception as error:
+                if type(error).__name__ not in DEAD:
+                    raise
+                self._warn(error)  # dask has others
+        return job.function(*job.given)
+
+    def _give_up(self, error: BaseException) -> None:
+        """Go on in this process."""
+        if self._executor is not None:
+            self._warn(error)
+        self._executor, self.most, self.workers = None, 1, 1
+
+    @staticmethod
+    def _warn(error: BaseException) -> None:
+        reason = str(error) or type(error).__name__
+        warnings.warn(
+            f"a worker of the executor has died ({reason}): nothing that was decided is lost, and "
+            "cells that it was given are bounded in this process",
+            RuntimeWarning,
+            stacklevel=2,
+        )
 
     def cancelled(self) -> list[Kept]:
         """What is left, none of which runs any more than it must."""
-        left = list(self._running.values())
+        left = [job.kept for job in self._running.values()]
         for future in self._running:
             future.cancel()
         self._running.clear()

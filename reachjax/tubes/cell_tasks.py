@@ -17,6 +17,7 @@ from jaxtyping import Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.loops.units import SmoothUnit, UnboundedError
+from reachjax.numerics.budget import Budget
 from reachjax.sets import AbstractSet, Box
 from reachjax.sets.balance import balanced
 from reachjax.tubes.ladder import WORK, Ladder
@@ -58,23 +59,19 @@ class Unbounded(NamedTuple):
 
     Attributes:
         given: what it was made of.
-        message: what it says.
     """
 
     given: tuple[Any, ...]
-    message: str
 
     @classmethod
     def of(cls, error: UnboundedError) -> Unbounded:
         """That of an error."""
-        return cls(error.given, str(error))
+        return cls((*error.given, error.line))
 
     @property
     def error(self) -> UnboundedError:
         """The error, to be raised."""
-        found = UnboundedError(*self.given)
-        found.args = (self.message,)
-        return found
+        return UnboundedError(*self.given)
 
 
 class Outcome(NamedTuple):
@@ -99,27 +96,27 @@ class Outcome(NamedTuple):
 
 
 def outcome_of(
-    task: CellTask, part: AbstractSet, deadline: float, known: Margins | None = None
+    task: CellTask, part: AbstractSet, budget: Budget, known: Margins | None = None
 ) -> Outcome:
     """What is found of one cell, wherever it runs.
 
     Args:
         task: what is decided.
         part: of the initial set, of numpy arrays.
-        deadline: when to stop, as `time.monotonic` says it.
+        budget: of the call.
         known: the margins by forms over the cell's box, which do not prove all; None if unknown.
     """
     begun = known or no_margins(task.required, task.horizon)
     margins = {name: row.copy() for name, row in begun.items()}
     with jax.enable_x64(True):
         try:
-            return _climbed(task, part, deadline, margins, known is not None)
+            return _climbed(task, part, budget, margins, known is not None)
         except UnboundedError as error:
             return Outcome(False, margins, -1, Unbounded.of(error))
 
 
 def _climbed(
-    task: CellTask, part: AbstractSet, deadline: float, margins: Margins, by_forms: bool
+    task: CellTask, part: AbstractSet, budget: Budget, margins: Margins, by_forms: bool
 ) -> Outcome:
     """What is found of a cell, step after step; margins are noted as they are found.
 
@@ -128,7 +125,7 @@ def _climbed(
     """
     around = jax.device_get(boxed(jax.device_put(part), "X0"))
     scenarios = Scenarios.of(task.loop, part, task.horizon, task.start)
-    limits = min(PROGRAMS, task.nodes), deadline, WORK
+    limits = min(PROGRAMS, task.nodes), budget.with_work(WORK)
     ladder = Ladder(task.loop, part, around, scenarios, task.start, *limits)
     if by_forms and isinstance(part, Box) and not task.by_programs:
         ladder.advance(tighten=False)  # nothing but forms could be tried again
@@ -137,6 +134,8 @@ def _climbed(
     for k in range(task.horizon + 1):
         if k:
             ladder.advance(tighten=False)
+        if budget.overdue:
+            return Outcome(False, margins, -1)
         for item in task.required:
             if item.time == k:
                 proved, margin = bounded(item, ladder, part, middle)

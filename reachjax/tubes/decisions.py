@@ -4,11 +4,12 @@ The directions of the requirements themselves, at the times that they speak of. 
 breaks one is looked for first: among samples, then where each linear program is largest. To be
 inside, the excess over each facet must be below zero; to be outside, the depth in the set must be,
 which is the least room to its facets. Each climbs the ladder of `BranchAndCut`, but for products,
-until it is decided.
+until it is decided. Between its forms and its programs a smooth loop is halved into cells.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -18,6 +19,8 @@ import numpy as np
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.loops.units import UnboundedError
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     owned,
     require_bar,
@@ -33,12 +36,13 @@ from reachjax.proofs.branches import BranchCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated, Simulations
 from reachjax.sets import AbstractSet
+from reachjax.tubes.by_cells import affordable
 from reachjax.tubes.cell_decisions import decided_by_cells, roots
 from reachjax.tubes.cell_tasks import CellTask
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.ladder import WORK, Climbed, Ladder
 from reachjax.tubes.propagation import (
     Progress,
-    deadline_of,
     known_numbers,
     require_kinds,
     simulations_from,
@@ -52,6 +56,10 @@ from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
 
 FIRST_PROGRAMS = 50
 """Linear programs that each bound may take at first, while ranges are those of affine forms."""
+
+FOR_CELLS = 0.5
+"""The part of its time that a smooth loop's cells get, by forms; the rest is for programs over the
+whole set, which close what cells do not where much is switched and little is smooth."""
 
 PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
 """How far an initial state is brought towards the middle of the set, so that it surely is in it."""
@@ -96,7 +104,8 @@ def decide(
             begin with. Or a number in all, which begins with the whole set. Cells that stay
             undecided are halved where it matters most, until all are decided or the time is over,
             or there are as many as the number says. None: the whole set is bounded at once, and has
-            certificates.
+            certificates; of a smooth loop of which forms do not prove it, cells of the whole set
+            are tried next, as many as `relaxation` says, before its programs.
         executor: runs the cells: any with the interface of `concurrent.futures`, such as a
             `ProcessPoolExecutor`. None: one after the other, here.
         progress: wraps the iteration over cells to show a progress bar, such as `tqdm.tqdm`.
@@ -106,6 +115,7 @@ def decide(
         with what is known of each cell.
 
     Raises:
+        Interrupted: Ctrl-C; its `found` is the verdict so far.
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind, or a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, `X0` is
@@ -133,7 +143,7 @@ def decide(
     loop.check_horizon(horizon, start)
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
-    deadline, (loop, X0) = deadline_of(time_limit), known_numbers("decide", loop, X0, "X0")
+    budget, (loop, X0) = Budget.of(time_limit), known_numbers("decide", loop, X0, "X0")
     required = requirements(loop.states, horizon, goal, avoid, safe)
     simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     if cells is not None:
@@ -141,17 +151,63 @@ def decide(
         require_executor(executor)
         require_bar(progress)
         task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
-        return decided_by_cells(task, X0, counts, most, simulations, deadline, executor, progress)
-    decision = _Decision(loop, X0, horizon, start, required, simulations)
+        return decided_by_cells(task, X0, counts, most, simulations, budget, executor, progress)
+    decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
+    try:
+        return _by_remedies(decision, loop, X0, horizon, start, required, relaxation, budget)
+    except Interrupted:
+        raise
+    except KeyboardInterrupt:
+        message = "interrupted: this exception's `found` is the verdict so far"
+        raise Interrupted(message, decision.verdict()) from None
+
+
+def _by_remedies(
+    decision: _Decision,
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    horizon: int,
+    start: int,
+    required: list[Requirement],
+    relaxation: BranchAndCut,
+    budget: Budget,
+) -> Verdict:
+    """The verdict by remedies in the order in which they pay.
+
+    Forms; of a smooth loop halves of the set, each of which costs a form and leaves out an eighth;
+    then programs, few of each bound first.
+    """
     decision.at_first()
     on_host, begun, around = jax.device_get((loop, X0, boxed(X0, "X0")))
-    for nodes in dict.fromkeys((min(FIRST_PROGRAMS, relaxation.nodes), relaxation.nodes)):
+
+    def climb(nodes: int) -> None:
         if not decision.ended:
-            work = WORK if time_limit is None else np.inf
             scenarios = Scenarios.of(on_host, begun, horizon, start)
-            ladder = Ladder(on_host, begun, around, scenarios, start, nodes, deadline, work)
+            own = budget.with_work(np.inf if budget.timed else WORK)
+            ladder = Ladder(on_host, begun, around, scenarios, start, nodes, own)
             decision.climb(ladder, tighten=nodes > FIRST_PROGRAMS)
-    return decision.verdict()
+
+    by_cells, most = None, 1
+    if loop.curved:
+        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / 2))
+    if most > 1:
+        with contextlib.suppress(UnboundedError):  # of halves there may be bounds
+            climb(0)
+        if decision.ended:
+            return decision.verdict()
+        task = CellTask(on_host, horizon, start, tuple(required), nodes=0)
+        share = budget.share(FOR_CELLS if relaxation.nodes else 1.0)
+        given = most, decision.simulations, share
+        by_cells = decided_by_cells(task, X0, roots(X0, most)[0], *given)
+        if by_cells.status is not VerdictStatus.UNKNOWN or not relaxation.nodes:
+            return by_cells
+    try:
+        for nodes in dict.fromkeys((min(FIRST_PROGRAMS, relaxation.nodes), relaxation.nodes)):
+            climb(nodes)
+    except UnboundedError:
+        if by_cells is None:
+            raise
+    return decision.verdict() if by_cells is None or decision.ended else by_cells
 
 
 class _Decision:
@@ -164,6 +220,10 @@ class _Decision:
         start: the time of the initial set.
         required: the requirements.
         simulations: trajectories from the set; None if it is too thin for any.
+        budget: of the call.
+
+    Attributes:
+        simulations: as given.
     """
 
     def __init__(
@@ -174,8 +234,9 @@ class _Decision:
         start: int,
         required: list[Requirement],
         simulations: Simulations | None,
+        budget: Budget,
     ):
-        self._loop, self._X0, self._start = loop, X0, start
+        self._loop, self._X0, self._start, self._budget = loop, X0, start, budget
         self._horizon, self._on_host = horizon, jax.device_get(loop)
         self._scenarios = Scenarios.of(loop, X0, horizon, start)
         self._middle = self._scenarios.middle(np.asarray(boxed(X0, "X0").center))
@@ -186,7 +247,7 @@ class _Decision:
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
         self._ends: dict[tuple[str, int], np.ndarray] = {}
         self._example: Counterexample | None = None
-        self._simulations = simulations
+        self.simulations = simulations
         if simulations is not None:
             self._seen(required, simulations.runs)
 
@@ -218,8 +279,8 @@ class _Decision:
         ]
         if claims:
             rows = self._middle[None]
-            if self._simulations is not None:
-                rows = worst_of(self._simulations.runs, [claim.item for claim in claims])
+            if self.simulations is not None:
+                rows = worst_of(self.simulations.runs, [claim.item for claim in claims])
             runs = compiled_runs(self._loop, self._scenarios, rows, self._start)
             require_unbroken(self._loop, self._scenarios, self._start, runs, claims)
 
@@ -241,6 +302,8 @@ class _Decision:
         last = max(time for _, time in self._open)
         for k in range(1, last + 1):
             ladder.advance(tighten)
+            if self._budget.overdue:
+                return
             for key, item in list(self._open.items()):
                 if item.time == k and not self.ended:
                     self._decided(key, item, ladder)
@@ -249,9 +312,10 @@ class _Decision:
 
     def _decided(self, key: tuple[str, int], item: Requirement, ladder: Ladder) -> None:
         """Bound one requirement at the time that the ladder has come to."""
-        target, units = target_of(item, ladder, self._simulations, self._middle)
+        target, units = target_of(item, ladder, self.simulations, self._middle)
         left = sum(other.time >= item.time for other in self._open.values())
-        climbed = ladder.climbed(target, (left - 1) * len(target.forms), ladder.until(1 / left))
+        share = self._budget.share(1 / left)
+        climbed = ladder.climbed(target, (left - 1) * len(target.forms), share)
         right = climbed.bounds <= 0 if item.inside else climbed.bounds < 0
         margin = float(np.min(-climbed.bounds / units))
         holds = bool(np.all(right))
@@ -272,8 +336,8 @@ class _Decision:
 
     def _tried(self, item: Requirement, scenarios: np.ndarray) -> None:
         """Simulate scenarios that may break a requirement."""
-        if self._simulations is not None:
-            self._seen([item], self._simulations.include(scenarios))
+        if self.simulations is not None:
+            self._seen([item], self.simulations.include(scenarios))
         else:
             given = self._on_host, scenarios, self._horizon, self._start
             self._seen([item], Runs(scenarios, self._scenarios.runs(*given)))

@@ -5,7 +5,6 @@ Everything here is numpy on the host. It proposes leaves; what they prove, `proo
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -16,6 +15,7 @@ from scipy.linalg import block_diag
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
+from reachjax.numerics.budget import Budget
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, joined
 from reachjax.proofs.branches import Branches, HorizonFacts, Rung, bounds_of, leaf_bounds
@@ -95,8 +95,7 @@ class Ladder:
         scenarios: all of them, over as many steps as will be climbed, from this set.
         t: the time of the initial set.
         nodes: how many linear programs a bound may take.
-        deadline: after which nothing is solved, as `time.monotonic` says it.
-        work: what all linear programs may take, in rows and columns, squared.
+        budget: what all linear programs may take, work in rows and columns, squared.
         note: is told what happens.
 
     Attributes:
@@ -111,14 +110,12 @@ class Ladder:
         scenarios: Scenarios,
         t: int,
         nodes: int,
-        deadline: float,
-        work: float = WORK,
+        budget: Budget,
         note: Callable[[str], None] = lambda note: None,
     ):
         self._note, self._scenarios = note, scenarios
         self._middle = scenarios.middle(np.asarray(box.center))
-        self._loop, self._t, self._nodes, self._deadline = loop, t, nodes, deadline
-        self._work = work
+        self._loop, self._t, self._nodes, self._budget = loop, t, nodes, budget
         self.horizon = Horizon(loop, X0, box, t)
         start = self.horizon.start
         columns = start.spread.shape[1]
@@ -126,39 +123,31 @@ class Ladder:
             ConicPrograms(columns) if start.round else LinearPrograms(columns, start.cut is None)
         )
 
-    @property
-    def late(self) -> bool:
-        """Whether the time is over."""
-        return time.monotonic() >= self._deadline
-
-    def until(self, share: float) -> float:
-        """When this share of the time that is left is over, as `time.monotonic` says it."""
-        now = time.monotonic()
-        return now + share * (self._deadline - now)
-
-    def advance(self, tighten: bool = True, until: float = np.inf) -> None:
+    def advance(self, tighten: bool = True, budget: Budget | None = None) -> None:
         """One step more.
 
         Args:
             tighten: whether the ranges of units that switch are bounded by linear programs.
-            until: when to stop that, as `time.monotonic` says it.
+            budget: a part of the ladder's, for these; None for all that is left.
         """
         # what a step proves depends on nothing but what it is about
         self._programs.forget()
-        ranges = partial(self._ranges, until) if tighten and self._nodes else None
+        ranges = partial(self._ranges, budget or self._budget) if tighten and self._nodes else None
         self.horizon.advance(ranges)
 
-    def _ranges(self, until: float, forms: AffineForms) -> Float[np.ndarray, "k m"]:
-        """Multipliers that bound the inputs of units from both sides."""
+    def _ranges(self, budget: Budget, forms: AffineForms) -> Float[np.ndarray, "k m"] | None:
+        """Multipliers that bound the inputs of units from both sides; None if there is no time."""
+        if budget.late or budget.work <= 0:
+            return None
         facts = self.horizon.facts
         self._programs.grow(facts, self.horizon.varying)
         self._note(f"ranges of {len(forms.rows) // 2} units")
         found = np.zeros((len(forms.rows), len(facts.rows)))
         for row, constant, multipliers in zip(forms.columns, forms.rows, found, strict=True):
-            if self._work <= 0 or time.monotonic() >= min(self._deadline, until):
+            if budget.work <= 0 or budget.late:
                 break
             self.spend(1)
-            vertex = self._programs.largest(row[None], constant[:1], ())
+            vertex = self._programs.largest(row[None], constant[:1], (), budget)
             if vertex is not None and len(vertex.columns):
                 multipliers[:] = np.maximum(vertex.multipliers, 0.0)
         return found
@@ -175,11 +164,7 @@ class Ladder:
 
     def spend(self, programs: int) -> None:
         """Take so many linear programs of the size that they have now from the work."""
-        self._work -= programs * self._size**2
-
-    def grant(self, work: float) -> None:
-        """Let so much work be left, at least."""
-        self._work = max(self._work, work)
+        self._budget.spend(programs * self._size**2)
 
     def facets(
         self, directions: Float[np.ndarray, "f n_x"], simulated: Simulated, gap: float
@@ -204,16 +189,15 @@ class Ladder:
         each = [forms[i : i + 1] for i in range(len(directions))]
         return Target(each, lambda states: states @ directions.T, enough, simulated), ranges
 
-    def climbed(self, target: Target, left: int = 0, until: float = np.inf) -> Climbed:
+    def climbed(self, target: Target, left: int = 0, budget: Budget | None = None) -> Climbed:
         """Bounds of the state after the steps so far.
 
         Args:
             target: what is sought.
             left: how many bounds are to be sought later.
-            until: when to stop, as `time.monotonic` says it.
+            budget: a part of the ladder's, for these; None for all that is left.
         """
-        horizon = self.horizon
-        self._programs.grow(horizon.facts, horizon.varying)
+        horizon, budget = self.horizon, budget or self._budget
         best, worst = target.simulated.most.copy(), target.simulated.scenarios.copy()
         ended: list[np.ndarray] = []
         trees: dict[int, Tree] = {}
@@ -230,13 +214,14 @@ class Ladder:
                 return float(best[number])
 
             def enough(bound: float, attained: float, number: int = number) -> bool:
-                late = time.monotonic() >= min(self._deadline, until)
-                return late or target.enough(number, bound, attained)
+                return budget.late or target.enough(number, bound, attained)
 
             upper = forms.ends(horizon.start)[1].min()
-            affordable = self._nodes and self._work > 0
+            affordable = self._nodes and budget.work > 0
             if affordable and np.isfinite(upper) and not enough(upper, best[number]):
-                trees[number] = Tree(horizon, self._programs, forms, attained, enough)
+                if not trees:
+                    self._programs.grow(horizon.facts, horizon.varying)
+                trees[number] = Tree(horizon, self._programs, forms, attained, enough, budget)
                 self.spend(1)
         self._grow(list(trees.values()), len(target.forms) / (left + len(target.forms)))
         found = [
@@ -245,28 +230,30 @@ class Ladder:
         ]
         judged = self._judged(target, best, worst, found, ended)
         codes = [
-            self._ended(trees.get(number), min(self._deadline, until))
+            self._ended(trees.get(number), budget)
             if not target.enough(number, float(bound), float(known))
             else SolverStatus.SOLVED
-            for number, (bound, known) in enumerate(zip(judged.bounds, judged.attained, strict=True))
+            for number, (bound, known) in enumerate(
+                zip(judged.bounds, judged.attained, strict=True)
+            )
         ]
         return judged._replace(codes=np.array(codes, int))
 
-    def _ended(self, tree: Tree | None, end: float) -> SolverStatus:
+    def _ended(self, tree: Tree | None, budget: Budget) -> SolverStatus:
         """How the search for a bound ended that leaves more open than it should."""
         if not self._nodes:
             return SolverStatus.AFFINE_FORM
-        if time.monotonic() >= end:
+        if budget.late:
             return SolverStatus.TIME
         if tree is None:
-            return SolverStatus.BUDGET if self._work <= 0 else SolverStatus.FAILED
+            return SolverStatus.BUDGET if budget.work <= 0 else SolverStatus.FAILED
         if tree.found() is None:  # the first linear program had no answer
             return SolverStatus.FAILED
         return SolverStatus.BUDGET if tree.is_open else SolverStatus.STALLED
 
     def _grow(self, trees: list[Tree], share: float) -> None:
         """Grow trees by turns, until all are closed or this share of the work is done."""
-        pool = share * self._work / self._size**2
+        pool = share * self._budget.work / self._size**2
         count = len(trees)
         while trees := [tree for tree in trees if tree.is_open and tree.nodes < self._nodes]:
             largest = max(tree.gap for tree in trees)
@@ -341,13 +328,13 @@ class Ladder:
         columns, owner = climbed.columns.copy(), climbed.branches.owner
         phases = np.asarray(climbed.branches.phases)
         for facet in range(len(found)):
-            if self.late:
+            if self._budget.late:
                 break
             form = climbed.about.rows[facet : facet + 1]
             worst, n = climbed.worst[facet], len(self.horizon.start.center)
             at = self.horizon.columns_at(worst[:n], self._scenarios.units_at(worst))
             leaves, bound = phases[owner == facet], climbed.bounds[facet]
-            given = settled(self.horizon, self._programs, form, at, leaves, bound)
+            given = settled(self.horizon, self._programs, form, at, leaves, bound, self._budget)
             if given is not None:
                 found[facet], columns[facet] = given, at
         return columns, found

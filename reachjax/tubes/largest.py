@@ -8,16 +8,16 @@ not said: neither is the problem concave, nor is what a relaxation proves all th
 
 from __future__ import annotations
 
-import time
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     require_bar,
     require_double_precision,
@@ -25,11 +25,13 @@ from reachjax.numerics.checks import (
     whole_number,
     wrapped,
 )
-from reachjax.programs.relaxations import BranchAndCut, LinearBounds
-from reachjax.sets import Box, Ellipsoid, Template
+from reachjax.numerics.host import in_numpy
+from reachjax.programs.relaxations import BranchAndCut
+from reachjax.programs.unrolled import unrolled
+from reachjax.sets import Box, Ellipsoid
 from reachjax.tubes.decisions import decide
-from reachjax.tubes.propagation import deadline_of, known_numbers
-from reachjax.tubes.reach import reach
+from reachjax.tubes.interruptions import Interrupted
+from reachjax.tubes.propagation import known_numbers
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
 from reachjax.tubes.shapes import Kind, Shape
 from reachjax.tubes.verdicts import Verdict, VerdictStatus
@@ -45,6 +47,9 @@ LONGEST, SHORTEST = 0.3, 1e-4
 
 FARTHEST = 2.0**20
 """How many times as long as one of `X0` a side may get: where nothing limits it, it ends there."""
+
+TURN = 0.3
+"""The part of the time that is left that a set may take: others are to be tried after it."""
 
 GROWTHS = 0.3, 0.1, 0.03, 0.01, 0.003
 """By which parts of itself a set or one of its sides is enlarged, as long as that is proved."""
@@ -100,6 +105,7 @@ def largest_set(
         `X0`, and no longer.
 
     Raises:
+        Interrupted: Ctrl-C; its `found` is the largest set so far.
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or
@@ -124,15 +130,28 @@ def largest_set(
     required = requirements(loop.states, horizon, goal, avoid, safe)
 
     def decided(region: Kind) -> Verdict:
-        left = None if np.isinf(deadline) else max(deadline - time.monotonic(), 0.0)
-        limits = {"relaxation": relaxation, "start": start, "samples": 200, "time_limit": left}
+        limits = {
+            "relaxation": dataclasses.replace(relaxation, cells=1),  # what is tried fails often
+            "start": start,
+            "samples": 200,
+            "time_limit": budget.share(TURN).limit,
+        }
         return decide(loop, region, horizon, goal, safe, avoid, **limits)
 
-    deadline = deadline_of(time_limit)
-    search = _Search(loop, X0, required, horizon, start, decided, deadline)
-    for _ in wrapped(progress, search.tried(rounds)):
-        if time.monotonic() >= deadline:
-            break
+    budget = Budget.of(time_limit)
+    search = _Search(loop, X0, required, horizon, start, decided, budget)
+    try:
+        for _ in wrapped(progress, search.tried(rounds)):
+            if budget.late:
+                break
+    except KeyboardInterrupt:
+        if search.best is None:
+            raise
+        message = (
+            "interrupted: this exception's `found` is the largest set so far, and "
+            "largest_set(loop, found.region, ...) goes on"
+        )
+        raise Interrupted(message, search.best) from None
     if search.best is None:
         raise ValueError(
             "nothing is proved around the center of X0: give another one, or see "
@@ -156,9 +175,9 @@ class _Search:
         horizon: int,
         start: int,
         decided: Callable[[Kind], Verdict],
-        deadline: float,
+        budget: Budget,
     ):
-        self._decided, self._deadline = decided, deadline
+        self._decided, self._budget = decided, budget
         self._shape = Shape.of(X0)
         self._farthest = FARTHEST * self._shape.lengths
         self._margins = _margins(loop, required, horizon, start)
@@ -188,7 +207,7 @@ class _Search:
 
     def _too_long(self, shape: Shape) -> bool:
         """Whether a side is longer than any shall be."""
-        return bool(jnp.any(shape.lengths > self._farthest))
+        return bool(np.any(shape.lengths > self._farthest))
 
     def _shrunk(self) -> Iterator[float]:
         for _ in range(SMALLEST):
@@ -200,16 +219,14 @@ class _Search:
 
     def _climbed(self, rounds: int) -> Iterator[float]:
         """Climb along the gradient of affine forms, whose margins stay positive."""
-        shape, weight, length = self._shape, BARRIER, LONGEST
+        shape, weight, length, budget = self._shape, BARRIER, LONGEST, self._budget.share(1 / 2)
 
-        @jax.jit
-        def value(shape: Shape, weight: Array) -> Array:
-            margins = self._margins(shape)
-            inside = jnp.all(margins > 0)
-            logs = jnp.log(jnp.where(margins > 0, margins, 1.0))
-            return jnp.where(inside, shape.log_volume() + weight * logs.sum(), -jnp.inf)
+        def value(shape: Shape, weight: float) -> float:
+            margins = np.full(1, -np.inf) if budget.late else self._margins(shape)
+            if not np.all(margins > 0):
+                return -np.inf
+            return shape.log_volume() + weight * float(np.log(margins).sum())
 
-        slope = jax.jit(jax.grad(value))
         for _ in range(SMALLEST):
             if np.isfinite(value(shape, weight)):
                 break
@@ -217,7 +234,10 @@ class _Search:
         else:
             return
         for _ in range(rounds):
-            here, along = value(shape, weight), slope(shape, weight).preconditioned(shape)
+            here = value(shape, weight)
+            along = shape.uphill(partial(value, weight=weight), here)
+            if budget.late:
+                break
             while length > SHORTEST:
                 other = shape.moved(along, length)
                 better = value(other, weight) > here  # not if it is no number
@@ -236,7 +256,7 @@ class _Search:
         for by in GROWTHS:
             while self._attempt(self._shape.enlarged(by)):
                 yield self._shape.volume()
-                if time.monotonic() >= self._deadline:
+                if self._budget.late:
                     return
             for side in self._shape.sides:
                 while self._attempt(self._shape.extended(side, by)):
@@ -246,17 +266,20 @@ class _Search:
 
 def _margins(
     loop: ClosedLoop, required: list[Requirement], horizon: int, start: int
-) -> Callable[[Shape], Float[Array, " r"]]:
+) -> Callable[[Shape], Float[np.ndarray, " r"]]:
     """The margins of all requirements by affine forms, as a function of a shape."""
     facets = [[np.asarray(part) for part in item.region.facets_in_units()] for item in required]
     rows = [C / norms[:, None] for C, _, norms in facets] + [np.eye(loop.states)]
     directions = np.unique(np.concatenate([*rows, *(-each for each in rows)]), axis=0)
-    template, every = Template(directions), jnp.asarray(directions)
+    on_host, rows_of = in_numpy(loop), np.tile(directions, (horizon, 1, 1))
 
-    def margins(shape: Shape) -> Float[Array, " r"]:
-        tube = reach(loop, shape.set(), horizon, template, LinearBounds(), start=start)
-        later = (X.bounds_along(every) for X in tube.sets[1:])
-        offsets = [shape.support(every), *later]
+    def margins(shape: Shape) -> Float[np.ndarray, " r"]:
+        try:
+            region = in_numpy(shape.set())
+            steps = unrolled(on_host, region, in_numpy(region.bounding_box()), rows_of, start)
+            offsets = [shape.support(directions), *(step.offsets for step in steps)]
+        except ValueError:  # a unit has no bounds, or there is no set
+            return np.full(1, -np.inf)
         found = []
         for item, (C, d, norms) in zip(required, facets, strict=True):
             rows, limits = C / norms[:, None], d / norms
@@ -264,8 +287,8 @@ def _margins(
                 found.append(limits - offsets[item.time][_places(directions, rows)])
             else:
                 room = -offsets[item.time][_places(directions, -rows)] - limits
-                found.append(jnp.max(room)[None])
-        return jnp.concatenate(found)
+                found.append(np.max(room, keepdims=True))
+        return np.concatenate(found)
 
     return margins
 

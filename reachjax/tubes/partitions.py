@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -17,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     described,
     is_concrete,
@@ -32,20 +35,25 @@ from reachjax.numerics.checks import (
 from reachjax.numerics.files import writable
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
-from reachjax.sets import AbstractSet, Template
+from reachjax.sets import AbstractSet, Box, Template
 from reachjax.sets.cells import grid, halves
 from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.cell_jobs import CellJobs
 from reachjax.tubes.displays import SAMPLES as SHOWN
 from reachjax.tubes.displays import display, picture, table
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.kept import keep
-from reachjax.tubes.propagation import GAP, SAMPLES
-from reachjax.tubes.reach import ReachTube, reach
+from reachjax.tubes.propagation import GAP, SAMPLES, Options, Task
+from reachjax.tubes.reach import ReachTube, tube_of
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
 from reachjax.tubes.tables import frame, rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pandas import DataFrame
+
+AHEAD = 1
+"""How many cells an executor is given for each of its workers: they share what time is left."""
 
 Bar = Callable[[Iterable[Any]], Iterable[Any]]
 """Wraps an iteration over cells, such as `tqdm.tqdm`."""
@@ -179,6 +187,8 @@ def reach_partitioned(
     seed: int = 0,
     progress: Bar | None = None,
     gap: float = GAP,
+    time_limit: float | None = None,
+    known: Sequence[ReachTube] = (),
 ) -> PartitionedTube:
     """Tubes from cells of an initial set, which together hold every state.
 
@@ -201,11 +211,17 @@ def reach_partitioned(
         progress: wraps the iteration over tubes to show a progress bar, such as `tqdm.tqdm`.
         gap: what may be left open of a facet, as a part of its half-range: in each cell, as `reach`
             takes it, and in the union, where it ends the halving of cells.
+        time_limit: seconds for the whole call, shared out among the cells. Cells that there is no
+            time for are not halved, or one tube from all of the set stands for them.
+        known: tubes of cells that an interrupted call of the same question had done by then: these
+            cells are not bounded again.
 
     Raises:
+        Interrupted: Ctrl-C; its `found` has the tubes of the cells that were done.
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind.
-        ValueError: as `reach`; or the arguments are traced.
+        ValueError: as `reach`; or the arguments are traced, or what is known is of another loop,
+            template, horizon or start.
 
     Example:
         >>> from reachjax import MLP, AffinePlant, Box
@@ -234,29 +250,47 @@ def reach_partitioned(
         "seed": seed,
         "gap": real_number("gap", gap, 0.0),
     }
+    budget = Budget.of(time_limit)
     own = ThreadPoolExecutor() if executor is None else None
+    run = _Run(loop, template, options, own or executor, progress, budget)
+    run.remember(known)
     try:
-        run = _Run(loop, template, options, own or executor, progress)
         counts: Any = cells
         if isinstance(cells, np.ndarray | jax.Array) and cells.ndim < 2:
             counts = cells.tolist()
         if isinstance(counts, int | np.integer):
             tubes = _guided(run, X0, whole_number("cells", counts, 1), gap)
         elif isinstance(counts, Sequence) and not isinstance(counts, str):
-            tubes = run.tubes([cell.part for cell in grid(X0, counts)])
+            parts = [cell.part for cell in grid(X0, counts)]
+            tubes = [tube for tube in run.tubes(parts, len(parts)) if tube is not None]
+            if len(tubes) < len(parts):  # one tube from all of the set stands for the others
+                tubes.append(run.whole(X0))
         else:
             raise TypeError(
                 "cells must be a whole number, or one for each coordinate, but "
                 f"{described(cells)} arrived"
             )
+    except KeyboardInterrupt:
+        budget.stop()  # threads look at the clock, and end by themselves
+        if not run.done:
+            raise
+        message = (
+            f"interrupted with {len(run.done)} cells done: this exception's `found` has their "
+            "tubes, and reach_partitioned(..., known=found) goes on"
+        )
+        raise Interrupted(message, tuple(run.done)) from None
     finally:
         if own is not None:
-            own.shutdown(cancel_futures=True)
+            own.shutdown(wait=False, cancel_futures=True)
     return PartitionedTube.sealed(X0, tuple(tubes))
 
 
 class _Run:
-    """Tubes of one loop, computed by an executor, cell by cell."""
+    """Tubes of one loop, computed by an executor, cell by cell.
+
+    Attributes:
+        done: the tubes so far.
+    """
 
     def __init__(
         self,
@@ -265,43 +299,110 @@ class _Run:
         options: dict,
         executor: Any,
         progress: Bar | None,
+        budget: Budget,
     ):
         self._loop, self._template = jax.device_get((loop, template))
-        self._options = options
+        self._options, self._budget = options, budget
         self._executor, self._progress = executor, progress
+        self._known: dict[bytes, ReachTube] = {}
 
-    def tubes(self, cells: Sequence[AbstractSet]) -> list[ReachTube]:
-        """One for each cell, in their order; the first error ends the run."""
-        given = self._template, self._options
-        arrays = jax.device_get(list(cells))
-        futures = [self._executor.submit(_tube, self._loop, cell, *given) for cell in arrays]
-        try:
-            done = _results(futures)
-            for _ in wrapped(self._progress, done):
+    @property
+    def done(self) -> list[ReachTube]:
+        """The tubes so far."""
+        return list(self._known.values())
+
+    def remember(self, tubes: Sequence[ReachTube]) -> None:
+        """Take tubes for those of their cells.
+
+        Raises:
+            TypeError: one is no tube.
+            ValueError: one was changed, or is of another question.
+        """
+        own = self._loop, self._template, self._options["horizon"], self._options["start"]
+        for tube in tubes:
+            require_kind("known", tube, ReachTube, "the tubes that an interrupted call had done")
+            tube.require_sealed()
+            theirs = tube.loop, tube.template, tube.horizon, tube.start
+            if _question(*own) != _question(*theirs):
+                raise ValueError(
+                    "known must be tubes of the same loop, template, horizon and start, but one of "
+                    "another question arrived: what was proved of that says nothing of this one"
+                )
+            self._known[_question(tube.sets[0])] = tube
+
+    def tubes(self, cells: Sequence[AbstractSet], later: int) -> list[ReachTube | None]:
+        """One for each cell, in their order; None of those that there was no time for.
+
+        Args:
+            cells: the cells.
+            later: how many there will be in all, these included; they share the time.
+
+        Raises:
+            Exception: the first error of a cell ends the run.
+        """
+        names = [_question(cell) for cell in cells]
+        left = deque(i for i, name in enumerate(names) if name not in self._known)
+        with closing(self._results(cells, names, left, later)) as results:
+            for _ in wrapped(self._progress, results):
                 pass
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            raise
-        return [jax.device_put(future.result()) for future in futures]
+            for _ in results:  # what a bar left out
+                pass
+        return [self._known.get(name) for name in names]
+
+    def _results(
+        self, cells: Sequence[AbstractSet], names: Sequence[bytes], left: deque[int], later: int
+    ) -> Generator[ReachTube, None, None]:
+        """Each tube as it comes."""
+        given = self._loop, self._template, self._options
+        jobs = CellJobs[int](self._executor, AHEAD)
+        try:
+            while (left and not self._budget.late) or jobs:
+                while left and len(jobs) < jobs.most and not self._budget.late:
+                    part = min(1.0, jobs.workers / max(later, 1))
+                    later -= 1
+                    number = left.popleft()
+                    cell = jax.device_get(cells[number])
+                    jobs.submit(number, _tube, cell, *given, self._budget, part)
+                for number, tube in jobs.finished():
+                    found = self._known[names[number]] = jax.device_put(tube)
+                    yield found
+        finally:
+            jobs.cancelled()
+
+    def whole(self, X0: AbstractSet) -> ReachTube:
+        """The tube from all of a set, here and whatever the time."""
+        given = jax.device_get(X0), self._loop, self._template, self._options
+        return jax.device_put(_tube(*given, self._budget, 1.0))
 
 
-def _results(futures: list[Future]) -> Iterator[Any]:
-    """Each result as it comes."""
-    for future in as_completed(futures):
-        yield future.result()
+def _question(*parts: Any) -> bytes:
+    """What tells one question from another: a hash of all arrays and of what holds them."""
+    return np.asarray(seal_of(*jax.device_put(parts))).tobytes()
 
 
-def _tube(loop: ClosedLoop, cell: AbstractSet, template: Template, options: dict) -> ReachTube:
-    """One cell's tube, from numpy arrays to numpy arrays, wherever it runs."""
+def _tube(
+    cell: AbstractSet,
+    loop: ClosedLoop,
+    template: Template,
+    options: dict,
+    budget: Budget,
+    part: float,
+) -> ReachTube:
+    """One cell's tube, from numpy arrays to numpy arrays, wherever it runs.
+
+    It takes this part of the time that is left when it begins.
+    """
     with jax.enable_x64(True):
         loop, cell, template = jax.device_put((loop, cell, template))
-        return jax.device_get(reach(loop, cell, template=template, **options))
+        task = Task(loop, cell, options["horizon"], template, options["start"])
+        others = {name: options[name] for name in Options._fields if name in options}
+        return jax.device_get(tube_of(task, Options(**others, time_limit=budget.share(part))))
 
 
 def _guided(run: _Run, X0: AbstractSet, count: int, gap: float) -> list[ReachTube]:
     """Halve the cells at which the union's gap is widest, along their longest side."""
-    boxes, tubes = [X0.bounding_box()], run.tubes([X0])
+    first, *_ = run.tubes([X0], 2 * count - 1)
+    boxes, tubes = [X0.bounding_box()], [first or run.whole(X0)]
     sides = np.asarray(boxes[0].widths)
     sides = np.where(sides > 0, sides, np.inf)  # a side without length is not halved
     widths = _widths(tubes[0])
@@ -310,10 +411,19 @@ def _guided(run: _Run, X0: AbstractSet, count: int, gap: float) -> list[ReachTub
         worst = _worst(X0, tubes, widths, gap)[:some]
         if not worst:
             break
-        parts = [half for i in worst for half in halves(X0, boxes[i], sides)]
-        others = [i for i in range(len(tubes)) if i not in worst]
-        boxes = [boxes[i] for i in others] + [half.box for half in parts]
-        tubes = [tubes[i] for i in others] + run.tubes([half.part for half in parts])
+        parts = [halves(X0, boxes[i], sides) for i in worst]
+        flat = [half.part for pair in parts for half in pair]
+        found = iter(run.tubes(flat, 2 * (count - len(tubes))))
+        kept = dict(enumerate(zip(boxes, tubes, strict=True)))
+        done = list[tuple[Box, ReachTube]]()
+        for i, pair in zip(worst, parts, strict=True):
+            those = [(half.box, tube) for half in pair if (tube := next(found)) is not None]
+            if len(those) == len(pair):  # else the cell stays as it is: the time is over
+                del kept[i]
+                done += those
+        if not done:
+            break
+        boxes, tubes = map(list, zip(*kept.values(), *done, strict=True))
     return tubes
 
 

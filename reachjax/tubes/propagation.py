@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +10,7 @@ import jax
 import numpy as np
 
 from reachjax.loops import ClosedLoop
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     is_concrete,
     owned,
@@ -65,7 +65,7 @@ class Options(NamedTuple):
     seed: int = 0
     progress: Progress | None = None
     gap: float = GAP
-    time_limit: float | None = None
+    time_limit: float | Budget | None = None
 
     @classmethod
     def named(cls, options: dict[str, Any]) -> Options:
@@ -134,7 +134,7 @@ def propagated(
         ValueError: the initial set is empty or unbounded, states overflow, or the progress bar
             leaves out steps.
     """
-    deadline = deadline_of(options.time_limit)
+    budget = Budget.of(options.time_limit)
     loop, X0, template = first_order((task.loop, task.X0, task.template))
     task = task._replace(loop=loop, X0=X0, template=template)
     fixed, horizon, simulations = task.fixed, task.horizon, None
@@ -153,13 +153,15 @@ def propagated(
         drop_columns=options.window != 1 and is_concrete((fixed.loop, fixed.X0, fixed.template)),
         simulations=simulations,
         gap=options.gap,
-        deadline=deadline,
+        budget=budget,
         note=getattr(bar, "set_postfix_str", _unheard),
     )
     steps, interrupted = list(before), False
     try:
         for _, step in zip(bar, _following(task, options, setting, before), strict=False):
             steps.append(step)
+            if budget.stopped:
+                raise KeyboardInterrupt
     except KeyboardInterrupt:
         if not steps or not is_concrete([step.proof for step in steps]):
             raise
@@ -241,18 +243,6 @@ def _with_witnesses(steps: list[Reached], simulations: Simulations) -> list[Abst
     ]
 
 
-def deadline_of(time_limit: float | None) -> float:
-    """When to stop, as `time.monotonic` says it.
-
-    Raises:
-        TypeError: the limit is no number.
-        ValueError: it is negative.
-    """
-    if time_limit is None:
-        return np.inf
-    return time.monotonic() + real_number("time_limit", time_limit, 0.0)
-
-
 def known_numbers(call: str, loop: ClosedLoop, X: AbstractSet, name: str) -> tuple[Any, Any]:
     """A loop and a set without derivatives.
 
@@ -310,7 +300,7 @@ def check_task(task: Task, options: Options) -> None:
     whole_number("samples", options.samples, 1)
     whole_number("seed", options.seed, 0)
     real_number("gap", options.gap, 0.0)
-    deadline_of(options.time_limit)
+    Budget.of(options.time_limit)
     if window is not None:
         whole_number("window", window, 1)
     elif not (relaxation.by_forms or is_concrete(jax.lax.stop_gradient((loop, X0, template)))):

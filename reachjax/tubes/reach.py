@@ -25,6 +25,7 @@ from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.displays import SAMPLES as SHOWN
 from reachjax.tubes.displays import display, picture, table
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.kept import keep
 from reachjax.tubes.propagation import (
     GAP,
@@ -210,7 +211,7 @@ class ReachTube(Replaceable):
         horizon = self.horizon + whole_number("steps", steps, 1)
         task = Task(self.loop, self.sets[0], horizon, self.template, self.start)
         proofs = [self.proof(t) for t in range(1, self.horizon + 1)]
-        return _tube(task, Options.named(options), list(zip(self.sets[1:], proofs, strict=True)))
+        return tube_of(task, Options.named(options), list(zip(self.sets[1:], proofs, strict=True)))
 
 
 def _shown(tube: ReachTube, t: int) -> list[Any]:
@@ -219,31 +220,16 @@ def _shown(tube: ReachTube, t: int) -> list[Any]:
     gaps = np.asarray(proof.gaps, float)
     known = gaps[~np.isnan(gaps)]
     widest = float(known.max()) if len(known) else np.nan
-    return [t, widest, told(proof.ends), float(np.sum(np.asarray(proof.seconds))), type(proof).__name__]
+    return [
+        t,
+        widest,
+        told(proof.ends),
+        float(np.sum(np.asarray(proof.seconds))),
+        type(proof).__name__,
+    ]
 
 
-class Interrupted(KeyboardInterrupt):
-    """A tube was interrupted (Ctrl-C): what was proved by then is not lost.
-
-    Attributes:
-        tube: the tube of the steps that were done. `tube.extended(steps)` goes on, in another
-            process too: a tube can be pickled.
-    """
-
-    def __init__(self, tube: ReachTube, horizon: int):
-        left = horizon - tube.horizon
-        super().__init__(
-            f"interrupted after {tube.horizon} of {horizon} steps. They are proved: this "
-            f"exception's `tube` has them, and tube.extended({left}) goes on"
-        )
-        self.tube, self._horizon = tube, horizon
-
-    def __reduce__(self) -> tuple[type, tuple[ReachTube, int]]:
-        """How it is pickled, as when it comes from another process."""
-        return type(self), (self.tube, self._horizon)
-
-
-def _tube(
+def tube_of(
     task: Task, options: Options, known: Sequence[tuple[AbstractSet, AbstractProof]] = ()
 ) -> ReachTube:
     """The tube of a task, some of whose first sets may be known."""
@@ -253,7 +239,12 @@ def _tube(
     sets, certificates = (X0, *found.sets), (None, *found.proofs)
     tube = ReachTube.sealed(loop, template, sets, certificates, start=task.start)
     if found.interrupted:
-        raise Interrupted(tube, task.horizon)
+        done, left = tube.horizon, task.horizon - tube.horizon
+        message = (
+            f"interrupted after {done} of {task.horizon} steps. They are proved: this exception's "
+            f"`tube` has them, and tube.extended({left}) goes on"
+        )
+        raise Interrupted(message, tube)
     return tube
 
 
@@ -373,4 +364,4 @@ def reach(
         True
     """
     options = Options(relaxation, window, solver, samples, seed, progress, gap, time_limit)
-    return _tube(Task(loop, X0, horizon, template, start), options)
+    return tube_of(Task(loop, X0, horizon, template, start), options)

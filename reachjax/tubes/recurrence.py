@@ -10,7 +10,6 @@ there, or along the directions of the tube; simulation says how large and after 
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -20,11 +19,13 @@ from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.numerics.budget import Budget
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope
 from reachjax.tubes.decisions import decide
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.recurrent_sets import TRAJECTORIES, Candidate, candidate_sets, periods, within
 from reachjax.tubes.refutations import SUSPECTS, counterexample, suspects
@@ -36,7 +37,8 @@ LONG = 500
 """So many steps are simulated to see where trajectories end, and whether they break anything."""
 
 PROGRAMS = 0, 10, 10_000
-"""How many linear programs a bound may take, by turns: there are other sets to try."""
+"""How many linear programs a bound may take, by turns: there are other sets to try. Of smooth loops
+there are a tenth as many cells."""
 
 
 class Wanted(NamedTuple):
@@ -58,7 +60,7 @@ def for_ever(
     safe: Region | None,
     avoid: AvoidSets | None,
     seed: int,
-    deadline: float,
+    budget: Budget,
 ) -> Verdict:
     """The same verdict for all time.
 
@@ -69,7 +71,7 @@ def for_ever(
         safe: where every state must be.
         avoid: closed sets in which no state may be.
         seed: of simulations.
-        deadline: after which no other set is tried, as `time.monotonic` says it.
+        budget: after whose time no other set is tried.
 
     Raises:
         ValueError: the loop varies in time, or nothing is required at all times.
@@ -94,7 +96,15 @@ def for_ever(
         return dataclasses.replace(verdict, status=refuted, counterexample=example)
     if verdict.status is VerdictStatus.UNKNOWN:
         return verdict
-    found = recurrence(tubes, X0, wanted, runs.states, deadline)
+    try:
+        found = recurrence(tubes, X0, wanted, runs.states, budget)
+    except KeyboardInterrupt:
+        message = (
+            "interrupted: this exception's `found` is the verdict until the horizon; verify(..., "
+            "forever=True) looks again for a set that states come back to"
+        )
+        unknown = dataclasses.replace(verdict, status=VerdictStatus.UNKNOWN)
+        raise Interrupted(message, unknown) from None
     proved = found is not None and found.proved
     if proved:
         _require_unbroken(loop, X0, wanted, runs, start)
@@ -149,7 +159,7 @@ def recurrence(
     X0: AbstractSet,
     wanted: Wanted,
     runs: Float[np.ndarray, "c T n"],
-    deadline: float,
+    budget: Budget,
 ) -> Recurrence | None:
     """A set that all states of some tubes come into and come back to, or what comes nearest to it.
 
@@ -158,7 +168,7 @@ def recurrence(
         X0: the initial set.
         wanted: what must hold at all times.
         runs: many steps of trajectories from it.
-        deadline: after which no other set is tried, as `time.monotonic` says it.
+        budget: after whose time no other set is tried.
 
     Returns:
         With a margin that is not negative if it is proved, of which the requirements are a part;
@@ -175,13 +185,14 @@ def recurrence(
     loop, candidates = tubes[0].loop, list(candidate_sets(tubes, runs, _flat(wanted.safe)))
     tries = [(each, period) for each in candidates for period in periods(loop, each)]
     tries.sort(key=lambda each: each[0].step + each[1])  # what takes fewer steps is cheaper
+    many = len(PROGRAMS) * len(tries)
     for nodes in PROGRAMS:
         for candidate, period in tries:
-            left = deadline - time.monotonic()
-            if left <= 0:
+            if budget.late:
                 return nearest
-            limits = BranchAndCut(nodes=nodes), None if np.isinf(left) else left
-            found = _tried(tubes, candidate, period, wanted, *limits)
+            share, many = budget.share(1 / many), many - 1
+            limits = BranchAndCut(nodes=nodes, cells=max(1, nodes // 10))
+            found = _tried(tubes, candidate, period, wanted, limits, share)
             if found.proved:
                 return found
             nearest = _nearer(nearest, found)
@@ -201,12 +212,15 @@ def _tried(
     period: int,
     wanted: Wanted,
     relaxation: BranchAndCut,
-    seconds: float | None,
+    budget: Budget,
 ) -> Recurrence:
     """What is proved of a set that shall be entered, and left only to come back."""
     loop, step, region = tubes[0].loop, candidate.step, candidate.region
+    calls = 1 + len(tubes)
 
     def arrives(begun: AbstractSet, steps: int) -> tuple[bool, float]:
+        nonlocal calls
+        seconds, calls = budget.share(1 / calls).limit, calls - 1
         required = {"goal": region, "safe": wanted.safe, "avoid": wanted.avoid or None}
         limits = {"relaxation": relaxation, "samples": TRAJECTORIES, "time_limit": seconds}
         found = decide(loop, begun, steps, **required, **limits)

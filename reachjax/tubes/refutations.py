@@ -6,13 +6,13 @@ import itertools
 from collections.abc import Iterable
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.closed_loop import Scenario
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
 from reachjax.sets import AbstractSet, Box, Ellipsoid
@@ -58,10 +58,10 @@ def counterexample(
     if not ordered:
         return None
     scenarios = Scenarios.of(loop, X0, len(ordered[0].states) - 1, start)
+    on_host = in_numpy(loop)
     for room, item, scenario, states in ordered:
         drawn = loop.split(scenario)
-        if scenarios.surely_contains(scenario) and surely_broken(loop, item, drawn, start):
-            on_host = jax.device_get(loop)
+        if scenarios.surely_contains(scenario) and surely_broken(on_host, item, drawn, start):
             _, w, v = drawn
             noises = [None] * (len(states) - 1) if v is None else v
             inputs = [
@@ -81,7 +81,7 @@ def surely_broken(loop: ClosedLoop, item: Requirement, scenario: Scenario, start
 
 def enclosures(loop: ClosedLoop, scenario: Scenario, steps: int, start: int) -> list[Box]:
     """Boxes around the states of the exact trajectory of a scenario, rounding accounted for."""
-    x0, w, v = scenario
+    loop, (x0, w, v) = in_numpy(loop), scenario
     found = [Box(x0, x0)]
     for t in range(steps):
         drawn = (None if part is None else part[t] for part in (w, v))
@@ -97,7 +97,7 @@ def deviates(
     Each step is enclosed from the state that was simulated, so that nothing adds up. Then what was
     simulated is another loop than what is bounded.
     """
-    _, w, v = scenario
+    loop, (_, w, v) = in_numpy(loop), scenario
     for t, (x, following) in enumerate(itertools.pairwise(states)):
         drawn = (None if part is None else part[t] for part in (w, v))
         reached = successor_box(loop, Box(x, x), start + t, *drawn)

@@ -1,13 +1,15 @@
 """Which of many cells affine forms decide, all in one compiled call.
 
-What one cell takes in numpy, hundreds take together. Cells that are left over are for whoever can
-do more: linear programs, or halving them.
+What one cell takes in numpy, ten take together, but only once the call is compiled: that is done
+beside cells that are bounded one by one, once there were so many of these that it pays. Cells that
+are left over are for whoever can do more: linear programs, or halving them.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +17,20 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.units import UnboundedError
+from reachjax.numerics.budget import Budget
+from reachjax.numerics.compilations import CompiledBeside
+from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import gamma
-from reachjax.programs.unrolled import unrolled_from_boxes
+from reachjax.programs.unrolled import unrolled, unrolled_from_boxes
+from reachjax.sets import Box
 from reachjax.sets.balance import balanced
 from reachjax.tubes.requirements import Requirement
 
 TOGETHER = 32
 """So many cells are a call: fewer are filled up, so that one shape is compiled."""
+
+SIFT = CompiledBeside(unrolled_from_boxes)
 
 Margins = dict[str, Float[np.ndarray, " h+1"]]
 
@@ -124,7 +133,7 @@ class Sieve:
     """
 
     def __init__(self, loop: ClosedLoop, horizon: int, start: int, required: Sequence[Requirement]):
-        self._loop, self._start = jax.device_put(loop), start
+        self._loop, self._on_host, self._start = jax.device_put(loop), in_numpy(loop), start
         ends = np.zeros(horizon + 1, dtype=int)
         self._rows: list[_Rows] = []
         for item in required:
@@ -133,15 +142,45 @@ class Sieve:
         directions = np.zeros((horizon + 1, int(ends.max()), loop.states))
         for rows in self._rows:
             directions[rows.item.time, rows.first : rows.end] = rows.directions
-        self._directions = directions
+        self._directions, self._later = directions, jnp.asarray(directions[1:])
+
+    def pays(self, cells: Sequence[Ends], budget: Budget) -> bool:
+        """Whether the compiled call is there, and faster than what these cells take one by one.
+
+        Args:
+            cells: that may be bounded so, or else will be one by one.
+            budget: of the whole call.
+        """
+        steps = max(len(self._directions) - 1, 1)
+        return SIFT.pays(
+            *self._given(cells),
+            seconds=lambda: self._measured(cells[0]),
+            evaluations=TOGETHER * steps,
+            left=budget.left,
+            t=self._start,
+        )
+
+    def _measured(self, cell: Ends) -> float | None:
+        """The seconds that a call takes one by one; None where this cell has no bounds."""
+        box, began = in_numpy(Box(*cell)), time.perf_counter()
+        try:
+            list(unrolled(self._on_host, box, box, self._directions[1:], self._start))
+        except UnboundedError:
+            return None
+        return TOGETHER * (time.perf_counter() - began)
+
+    def _given(self, cells: Sequence[Ends]) -> tuple[Any, ...]:
+        """The arguments of the compiled call."""
+        filled = [*cells, *[cells[-1]] * (TOGETHER - len(cells))]
+        lower, upper = (np.stack(ends) for ends in zip(*filled, strict=True))
+        return self._loop, lower, upper, self._later
 
     def sifted(self, cells: Sequence[Ends]) -> list[Sifted]:
         """What is found of each cell, at most `TOGETHER` of them."""
-        filled = [*cells, *[cells[-1]] * (TOGETHER - len(cells))]
-        lower, upper = (np.stack(ends) for ends in zip(*filled, strict=True))
-        first, later = self._directions[0], jnp.asarray(self._directions[1:])
-        bounds = unrolled_from_boxes(self._loop, lower, upper, later, self._start)
-        bounds = np.concatenate([_at_first(first, lower, upper)[:, None], bounds], axis=1)
+        _, lower, upper, _ = given = self._given(cells)
+        bounds = SIFT(*given, t=self._start)
+        first = _at_first(self._directions[0], lower, upper)
+        bounds = np.concatenate([first[:, None], bounds], axis=1)
         with np.errstate(invalid="ignore"):
             return [self._judged(uppers) for uppers in bounds[: len(cells)]]
 

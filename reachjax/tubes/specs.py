@@ -13,12 +13,12 @@ import jax
 import numpy as np
 
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, require_kind, whole_number
 from reachjax.numerics.rounding import TINY
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet
 from reachjax.tubes.partitions import BESIDE, PartitionedTube
-from reachjax.tubes.propagation import deadline_of
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.recurrence import for_ever
 from reachjax.tubes.refutations import counterexample, suspects
@@ -89,7 +89,7 @@ def verify(
         verdict = _decided(tube, required, samples, seed, X0)
     if not forever:
         return verdict
-    return for_ever(verdict, tubes, X0, safe, avoid, seed, deadline_of(time_limit))
+    return for_ever(verdict, tubes, X0, safe, avoid, seed, Budget.of(time_limit))
 
 
 def _decided(

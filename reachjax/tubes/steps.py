@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple
@@ -14,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import Program
 from reachjax.programs.preactivations import first_inputs, first_rows
@@ -68,7 +68,7 @@ class Setting:
         drop_columns: whether units that are affine take no columns of the basis.
         simulations: trajectories from the initial set; None where numbers are traced.
         gap: what is left open, as a part of a facet's range.
-        deadline: when to stop, as `time.monotonic` says it.
+        budget: of the time.
         note: is told what happens within a step.
     """
 
@@ -80,13 +80,8 @@ class Setting:
     drop_columns: bool
     simulations: Simulations | None
     gap: float = 1e-4
-    deadline: float = np.inf
+    budget: Budget = ENDLESS
     note: Callable[[str], None] = lambda note: None
-
-    @property
-    def late(self) -> bool:
-        """Whether the time is over."""
-        return time.monotonic() >= self.deadline
 
     @property
     def cuts(self) -> CuttingPlanes | None:

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.host import all_finite
 from reachjax.programs.lmi import Program
@@ -44,8 +45,15 @@ from reachjax.tubes.steps import Step
 T = TypeVar("T")
 
 
-def successors(step: Step, template: AbstractTemplate) -> tuple[AbstractSet, AbstractCertificate]:
+def successors(
+    step: Step, template: AbstractTemplate, budget: Budget = ENDLESS
+) -> tuple[AbstractSet, AbstractCertificate]:
     """The smallest set of a template that surely holds a step's successors, and its proof.
+
+    Args:
+        step: the step.
+        template: what the set looks like.
+        budget: of the time.
 
     Raises:
         TypeError: the template is of an unknown kind.
@@ -55,40 +63,40 @@ def successors(step: Step, template: AbstractTemplate) -> tuple[AbstractSet, Abs
     rows = [goal.rows(step.setting.loop.states) for goal in goals]
     program = _finite(step, step.program(jnp.concatenate(rows)))
     programs = (program.with_objective(where) for where in _slices(rows))
-    end = step.setting.deadline
-    parts = [_proved(step, goal, each, end) for goal, each in zip(goals, programs, strict=True)]
+    parts = [_proved(step, goal, each, budget) for goal, each in zip(goals, programs, strict=True)]
     return _together(program, parts)
 
 
 def facets_by_products(
-    step: Step, directions: Float[Array, "f n_x"], deadline: float
+    step: Step, directions: Float[Array, "f n_x"], budget: Budget
 ) -> tuple[Float[Array, " f"], Certificate]:
     """The smallest offsets of some facets of a step's successors, and their proof.
 
     Args:
         step: the step.
         directions: of the facets.
-        deadline: when to stop, as `time.monotonic` says it.
+        budget: of the time.
 
     Raises:
         ValueError: the set of states is empty or unbounded, or states overflow.
     """
     program = _finite(step, step.program(directions))
-    region, proof = _proved(step, Facets(directions), program, deadline)
+    region, proof = _proved(step, Facets(directions), program, budget)
     assert isinstance(proof, Certificate)  # as facets have it
     return region.facets[1], proof
 
 
 def _proved(
-    step: Step, goal: AbstractGoal, program: Program, deadline: float
+    step: Step, goal: AbstractGoal, program: Program, budget: Budget
 ) -> tuple[AbstractSet, AbstractCertificate]:
     """The set of one goal, and its proof."""
     cuts, witness, rounds = step.setting.cuts, None, None
     if cuts is not None:
         if step.setting.simulations is not None:
             witness = partial(step.attained, goal.rows(step.setting.loop.states))
-        rounds = Rounds(step.window.layout, cuts, witness, step.warm_start, deadline)
-    program, value, proposal = proved(goal, program, step.setting.solver, rounds)
+        rounds = Rounds(step.window.layout, cuts, witness, step.warm_start, budget)
+    with budget.in_force():
+        program, value, proposal = proved(goal, program, step.setting.solver, rounds)
     region = goal.region(_finite(step, value))
     return region, goal.certificate(program, value, proposal)
 

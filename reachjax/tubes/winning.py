@@ -10,7 +10,6 @@ outer one.
 from __future__ import annotations
 
 import heapq
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
@@ -23,6 +22,7 @@ from jaxtyping import Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.loops.units import UnboundedError
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     require_bar,
     require_double_precision,
@@ -36,8 +36,9 @@ from reachjax.programs.relaxations import BranchAndCut
 from reachjax.sets import Box
 from reachjax.tubes.cell_jobs import CellJobs
 from reachjax.tubes.cell_tasks import CellTask, bounded, fails_everywhere
+from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.ladder import WORK, Ladder
-from reachjax.tubes.propagation import deadline_of, known_numbers
+from reachjax.tubes.propagation import known_numbers
 from reachjax.tubes.requirements import AvoidSets, Region, Timed, requirements
 from reachjax.tubes.seals import seal_of
 from reachjax.tubes.sieve import TOGETHER, Ends, Margins, Sieve, Sifted, no_margins
@@ -65,7 +66,7 @@ LONGEST = 256
 """A side that is so many times as long as another one, in parts of the domain's, is cut first."""
 
 ENOUGH = 8
-"""So many cells are worth a compiled call; fewer are bounded one by one."""
+"""So many cells are worth a call that is compiled; fewer are bounded one by one."""
 
 
 class Sorted(NamedTuple):
@@ -125,6 +126,7 @@ def winning_set(
         All cells; of a loop with disturbances, proved for all of them, and refuted for all.
 
     Raises:
+        Interrupted: Ctrl-C; its `found` is the winning set so far.
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind, or a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or what
@@ -170,10 +172,18 @@ def winning_set(
                 "another question arrived: what was proved of that says nothing of this one"
             )
         cells_so_far = list(known.cells)
-    run = _Run(task, domain, cells_so_far, most, deadline_of(time_limit))
-    with closing(run.results(executor)) as results:  # a bar may end before they do
-        for _ in wrapped(progress, results):
-            pass
+    run = _Run(task, domain, cells_so_far, most, Budget.of(time_limit))
+    try:
+        with closing(run.results(executor)) as results:  # a bar may end before they do
+            for _ in wrapped(progress, results):
+                pass
+    except KeyboardInterrupt:
+        found = WinningSet(domain, tuple(run.done), seal)
+        message = (
+            f"interrupted with {len(found.cells)} cells: this exception's `found` is the winning "
+            "set so far, and winning_set(..., known=found) goes on"
+        )
+        raise Interrupted(message, found) from None
     require_unbroken_cells(loop, domain, horizon, start, required, run.done)
     return WinningSet(domain, tuple(run.done), seal)
 
@@ -192,9 +202,9 @@ class _Run:
         domain: Box,
         cells: Sequence[DecidedCell],
         most: int,
-        deadline: float,
+        budget: Budget,
     ):
-        self._task, self._most, self._deadline = task, most, deadline
+        self._task, self._most, self._budget = task, most, budget
         self._scale = np.asarray(domain.upper) - np.asarray(domain.lower)
         self._scale = np.where(self._scale > 0, self._scale, 1.0)
         self.done = [cell for cell in cells if cell.status is not VerdictStatus.UNKNOWN]
@@ -228,21 +238,23 @@ class _Run:
         """How many cells are decided, after each batch of some, the largest first."""
         jobs = CellJobs[list[DecidedCell]](executor, AHEAD)
         try:
-            while (cells and not self._late) or jobs:
-                while cells and len(jobs) < jobs.most and not self._late:
+            while (cells and not self._budget.late) or jobs:
+                while cells and len(jobs) < jobs.most and not self._budget.late:
                     batch = [heapq.heappop(cells)[2] for _ in range(min(together, len(cells)))]
                     boxes = [(cell.lower, cell.upper) for cell in batch]
-                    jobs.submit(batch, sorted_cells, task, boxes, self._scale)
+                    jobs.submit(batch, sorted_cells, task, boxes, self._scale, self._budget)
                 for batch, results in jobs.finished():
-                    for cell, found in zip(batch, results, strict=True):
-                        self._judged(cell, found, task.by_programs)
+                    left = list(zip(batch, results, strict=True))
+                    try:
+                        while left:
+                            self._judged(*left[-1], task.by_programs)
+                            left.pop()
+                    except KeyboardInterrupt:
+                        self.done += [cell for cell, _ in left]
+                        raise
                     yield len(self.done)
         finally:
             self.done += [cell for batch in jobs.cancelled() for cell in batch]
-
-    @property
-    def _late(self) -> bool:
-        return time.monotonic() >= self._deadline
 
     def _judged(self, cell: DecidedCell, found: Sorted, last: bool) -> None:
         """Keep a cell, or halve it as long as there may be more, or leave it to programs."""
@@ -260,7 +272,7 @@ class _Run:
 
 
 def sorted_cells(
-    task: CellTask, boxes: Sequence[Ends], scale: Float[np.ndarray, " n"]
+    task: CellTask, boxes: Sequence[Ends], scale: Float[np.ndarray, " n"], budget: Budget
 ) -> list[Sorted]:
     """What is found of each of some boxes, wherever it runs.
 
@@ -268,6 +280,7 @@ def sorted_cells(
         task: what is decided.
         boxes: of the domain.
         scale: the unit in which each coordinate is measured.
+        budget: of the call; of boxes that it is too late for, trajectories alone are known.
     """
     with jax.enable_x64(True):
         points = [_points(*box) for box in boxes]
@@ -278,9 +291,11 @@ def sorted_cells(
         sifted: dict[int, Sifted] = {}
         if len(alike) >= ENOUGH:
             sieve = Sieve(task.loop, task.horizon, task.start, task.required)
-            sifted = dict(zip(alike, sieve.sifted([boxes[i] for i in alike]), strict=True))
+            some = [boxes[number] for number in alike]
+            if sieve.pays(some, budget):
+                sifted = dict(zip(alike, sieve.sifted(some), strict=True))
         return [
-            _sorted(task, box, scale, part, sifted.get(number))
+            _sorted(task, box, scale, part, sifted.get(number), budget)
             for number, (box, part) in enumerate(zip(boxes, each, strict=True))
         ]
 
@@ -327,10 +342,13 @@ def _sorted(
     scale: Float[np.ndarray, " n"],
     rooms: Float[np.ndarray, "r c"],
     sifted: Sifted | None,
+    budget: Budget,
 ) -> Sorted:
     """What is found of one box, given what trajectories from it do, and forms say of it."""
     least, widths = rooms.min(axis=0), (ends[1] - ends[0]) / scale
     if (least < 0).any() and (least >= 0).any():
+        return Sorted(VerdictStatus.UNKNOWN, np.nan, _axis(least, widths))
+    if sifted is None and budget.late:
         return Sorted(VerdictStatus.UNKNOWN, np.nan, _axis(least, widths))
     if sifted is None:
         sifted = _bounded(task, Box(*ends), rooms)
@@ -365,7 +383,7 @@ def _climbed(
         UnboundedError: a unit has no bounds over it.
     """
     scenarios = Scenarios.of(task.loop, box, task.horizon, task.start)
-    ladder = Ladder(task.loop, box, box, scenarios, task.start, task.nodes, np.inf, WORK)
+    ladder = Ladder(task.loop, box, box, scenarios, task.start, task.nodes, Budget(work=WORK))
     broken = [bool(np.all(row < 0)) for row in rooms]
     middle, proved = scenarios.middle(np.asarray(box.center)), not any(broken)
     for k in range(task.horizon + 1):

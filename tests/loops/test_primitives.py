@@ -8,6 +8,7 @@ from flax import nnx
 from jax import lax
 
 import reachjax as rj
+from reachjax.loops.units import UnboundedError
 from tests.loops.traced import LOWER, UPPER, assert_sound, interval, network
 
 A = jnp.array([[2.0, -1.0], [0.5, 3.0]])
@@ -59,6 +60,19 @@ FUNCTIONS = {
     "powers by entry": lambda x: (x + 2) ** jnp.array([2.0, 3.0]),
     "hyperbolic": lambda x: jnp.concatenate([jnp.sinh(x), jnp.cosh(x)]),
     "angle": lambda x: jnp.arctan2(x[:1], x[1:] + 3),
+    "angle on the left": lambda x: jnp.arctan2(x[1:] + 1, x[:1] - 2),
+    "angle below": lambda x: jnp.arctan2(x[1:] - 2, x[:1]),
+    "angle of a constant": lambda x: jnp.arctan2(jnp.array([1.0, 2.0]), x),
+    "angle of an exponential": lambda x: jnp.arctan2(x, jnp.exp(x)),
+    "angle from a constant": lambda x: jnp.arctan2(x + 2, -1.5),
+    "arcsine and arccosine": lambda x: jnp.concatenate([jnp.arcsin(x / 2), jnp.arccos(x / 2)]),
+    "arccosine near its end": lambda x: jnp.arccos(1 - (x / 2) ** 2),
+    "inverse hyperbolic": lambda x: jnp.arcsinh(x) + jnp.arccosh(x + 2.5) - jnp.arctanh(x / 2),
+    "error function": lambda x: jax.lax.erf(3 * x) + jax.lax.erfc(-2 * x),
+    "order": jnp.sort,
+    "order of five": lambda x: jnp.sort(jnp.append(jnp.append(x, x * x - 0.3), 0.2))[::-1],
+    "order in columns": lambda x: lax.sort(jnp.stack([x, -x]), dimension=0).ravel(),
+    "median": lambda x: jnp.median(jnp.append(x, 0.25))[None],
     "product": lambda x: jnp.prod(x + 1)[None],
     "products so far": lambda x: jnp.cumprod(jnp.append(x, 2.0)),
     "largest so far": lambda x: lax.cummax(jnp.append(x, 0.25)),
@@ -130,7 +144,11 @@ REFUSED = {
         "'reduce'.* no bounds for it",
     ),
     "a solver": (lambda x: jnp.linalg.solve(A, x), r"multiply by jnp\.linalg\.inv"),
-    "order": (jnp.sort, "'sort'.* no bounds for it"),
+    "places in an order": (lambda x: x[jnp.argsort(x)], "'sort'.* order of other numbers jumps"),
+    "the order of many": (
+        lambda x: jnp.sort(jnp.outer(jnp.arange(1.0, 6.0), x).ravel()),
+        "'sort'.* sorts 10 numbers, but 8 at most",
+    ),
     "an endless loop": (
         lambda x: lax.while_loop(lambda c: c[0] >= 0, lambda c: (c[0] * 1, 0.5 * c[1]), (0, x))[1],
         "not ended after",
@@ -145,7 +163,7 @@ REFUSED = {
         lambda x: jnp.ones(2).at[jnp.array([0, 0])].set(2 * x),
         "'scatter'.* more than once",
     ),
-    "angles all around": (lambda x: jnp.arctan2(x, 0.0), "'atan2'.* must be positive"),
+    "angles all around": (lambda x: jnp.arctan2(x, 0.0), "'atan2'.* must not be zero"),
 }
 
 
@@ -156,10 +174,43 @@ def test_what_has_no_bounds_is_named(name):
         network(function)
 
 
-def test_an_angle_has_bounds_in_front_only():
-    net = network(lambda x: jnp.arctan2(x[:1], x[1:]))
-    low, high = interval(net, np.array([-1.0, -2.0]), np.array([1.0, -1.0]))
-    assert not np.isfinite([low, high]).any()
+def turning(x, u):
+    return jnp.array([x[0] + 0.1 * u[0], x[1] + 0.1 * jnp.arctan2(x[1], x[0])])
+
+
+def test_angles_have_bounds_in_all_quadrants_but_on_their_cut():
+    loop = rj.ClosedLoop(rj.NonlinearPlant(turning, 2, 1), rj.Network(lambda x: -x[:1], 2, 1))
+    rng = np.random.default_rng(0)
+    for middle in ([1.1, 1.1], [-1.1, 1.1], [-1.1, -1.1], [1.1, -1.1], [0.0, 1.1], [0.0, -1.1]):
+        X0 = rj.Box(np.subtract(middle, 0.1), np.add(middle, 0.1))
+        for method in ([rj.LinearBounds()], []):
+            tube = rj.reach(loop, X0, 1, rj.Template.box(2), *method)
+            x = rng.uniform(X0.lower, X0.upper, size=(5000, 2))
+            reached = x[:, 1] + 0.1 * np.arctan2(x[:, 1], x[:, 0])
+            _, _, high, low = tube.sets[1].b
+            assert -low <= reached.min()
+            assert high >= reached.max()
+            assert high + low - np.ptp(reached) <= 0.02  # of 0.2 and more
+    with pytest.raises(UnboundedError, match=r"arctan2\(y, x\) \(in turning.*jump by 2 pi"):
+        rj.reach(loop, rj.Box([-1.2, -0.1], [-1.0, 0.1]), 1, rj.Template.box(2))
+
+
+def test_the_tangent_of_an_angle_is_told_from_the_angle():
+    f = lambda x, u: x + 0.1 * jnp.arctan(x[1] / x[0]) + u  # noqa: E731
+    loop = rj.ClosedLoop(rj.NonlinearPlant(f, 2, 1), rj.Network(lambda x: -x[:1], 2, 1))
+    with pytest.raises(UnboundedError, match=r"inputs in .*away from zero .*arctan2\(y, x\)"):
+        rj.reach(loop, rj.Box([-0.1, 1.0], [0.1, 2.0]), 1, rj.Template.box(2))
+
+
+def test_what_is_recorded_does_not_depend_on_numbers_of_parameters():
+    def largest(p):
+        f = Partial(lambda p, x: jax.nn.relu(x - 0.1) - jax.nn.relu(p * x**2), p)
+        loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[0.1]]), rj.Network(f, 1, 1))
+        return rj.reach(loop, rj.Box([-1.0], [1.0]), 2, rj.Template.box(1)).sets[2].b.sum()
+
+    p, step = jnp.array(2.0), 1e-3
+    difference = (largest(p + step) - largest(p - step)) / (2 * step)
+    np.testing.assert_allclose(jax.grad(largest)(p), difference, rtol=1e-5)
 
 
 def test_results_are_real_numbers_and_parameters_finite():

@@ -1,13 +1,17 @@
-"""Compilations outlive a process."""
+"""Compilations outlive a process, and go on beside those who do without them."""
 
 import os
 import subprocess
 import sys
+import time
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.numerics.compilations import CompiledBeside
 
 RUN = """
 import sys
@@ -58,3 +62,41 @@ def test_bad_folders_are_named(tmp_path):
     with pytest.raises(TypeError, match="folder must be a path, but 3 arrived"):
         rj.keep_compilations(3)  # pyright: ignore[reportArgumentType]
     assert jax.config.values["jax_compilation_cache_dir"] == kept
+
+
+def beside(size):
+    """A function that is compiled beside its callers, and what they give it."""
+    return CompiledBeside(jax.jit(lambda x, by: by * x, static_argnames="by")), jnp.ones(size)
+
+
+def test_what_is_cheap_to_compile_is_there_at_once():
+    found, x = beside(3)
+    given = {"seconds": lambda: 1e-3, "evaluations": 1000, "left": np.inf}
+    assert found.pays(x, by=2.0, **given)
+    assert found(x, by=2.0).tolist() == [2.0, 2.0, 2.0]
+
+
+def test_what_takes_longer_than_is_left_is_not_compiled():
+    found, x = beside(4)
+    given = {"seconds": lambda: 1e-3, "evaluations": 1, "left": 2.0}  # three seconds
+    assert not any(found.pays(x, by=2.0, **given) for _ in range(10_000))
+
+
+def test_what_is_dear_is_compiled_once_as_much_was_spent():
+    found, x = beside(5)
+    given = {"seconds": lambda: 1.0, "evaluations": 100, "left": np.inf}  # thirty seconds
+    asked = [found.pays(x, by=2.0, **given) for _ in range(10)]
+    assert not any(asked)
+    for _ in range(1000):
+        if found.pays(x, by=2.0, **given):
+            break
+        time.sleep(0.05)
+    else:
+        pytest.fail("it was not compiled after fifteen seconds had been spent")
+
+
+def test_what_is_slower_than_numpy_or_cannot_be_measured_is_not_used():
+    found, x = beside(6)
+    given = {"evaluations": 1000, "left": np.inf}
+    assert not found.pays(x, by=2.0, seconds=lambda: None, **given)
+    assert not found.pays(x, by=2.0, seconds=lambda: 1e-12, **given)

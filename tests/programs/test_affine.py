@@ -1,5 +1,6 @@
 """Affine forms are what ten lines of numpy say, rounded outwards, and the same compiled."""
 
+import itertools
 from fractions import Fraction
 
 import jax
@@ -262,3 +263,21 @@ def test_branches_that_began_alike_have_columns_of_their_own():
     _, layers, _ = step_forms(jax.device_get(loop), AffineForms.beginning(start), 0, start)
     places = np.concatenate([layer.places for layer in layers])
     assert len(np.unique(places)) == len(places) == 2
+
+
+@pytest.mark.parametrize("n", range(1, 8))
+def test_no_polynomial_of_degree_two_is_beyond_its_bounds_on_a_box(n):
+    box = jax.device_get(rj.Box([-1.0] * n, [1.0] * n))
+    start, rng = InitialColumns.of(box, box, curved=True), np.random.default_rng(n)
+    rows, (i, j) = rng.normal(size=(50, start.count)), start.pairs
+    corners = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=n)))
+    w = np.concatenate([corners, rng.uniform(-1, 1, size=(2000, n))])
+    products = w[:, i] * w[:, j]
+    columns = np.concatenate([w, np.where(i == j, 2 * products - 1, products)], axis=1)
+    values, (lower, upper) = rows @ columns.T, start.curved_ends(rows)
+    assert np.all(values <= upper[:, None])
+    assert np.all(values >= lower[:, None])
+    norms = abs(rows).sum(axis=1)
+    assert np.all(upper <= norms * (1 + 1e-12))
+    assert np.all(-lower <= norms * (1 + 1e-12))
+    assert (upper < norms * 0.99).any()

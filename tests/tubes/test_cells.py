@@ -154,9 +154,9 @@ def test_a_facet_that_never_moves_is_done():
 
 def test_a_tree_may_be_deep():
     axes = [0, -1] * 2000 + [-1]
-    root = node = _Node(None, [])
+    root = node = _Node(None, [], (0, 0))
     for _ in range(2000):
-        node.axis, node.halves = 0, [_Node(None, [], node), _Node(None, [], node)]
+        node.axis, node.halves = 0, [_Node(None, [], (0, 0), node) for _ in range(2)]
         node = node.halves[1]
     assert root.axes == axes
 

@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.primitives import affine, bends, folds, moving, powers
+from reachjax.loops.primitives import affine, angles, bends, folds, moving, powers
 from reachjax.loops.primitives.equations import JUMPS, Equation, Rule, on_host
 from reachjax.loops.recording import Recorder
 from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value, is_known
@@ -39,6 +39,7 @@ RULES: dict[str, Rule] = {
     **moving.RULES,
     **affine.RULES,
     **powers.RULES,
+    **angles.RULES,
     **bends.RULES,
     **folds.RULES,
 }

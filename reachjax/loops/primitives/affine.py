@@ -90,7 +90,6 @@ def _quotient(recorder: Recorder, equation: Equation, operands: Sequence[Operand
     if not isinstance(other, Value):
         return recorder.divided(one, other)
     inverse = recorder.unit(Reciprocal(), other)
-    inverse.nonnegative = other.nonnegative
     if isinstance(one, Value):
         return recorder.product(one, inverse)
     return recorder.scaled(inverse, one)

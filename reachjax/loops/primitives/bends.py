@@ -53,21 +53,12 @@ def _larger(recorder: Recorder, one: Value, other: Operand) -> Value:
     if _is_plain(other) and not np.any(other):
         return recorder.rectified(one)
     found = recorder.added(recorder.rectified(recorder.added(one, other, -1)), other)
-    found.nonnegative = one.nonnegative or _never_negative(other)
-    return found
+    return recorder.limited(found, lambda limits: limits(one).larger(limits(other)))
 
 
 def _smaller(recorder: Recorder, one: Value, other: Operand) -> Value:
     found = recorder.added(one, recorder.rectified(recorder.added(one, other, -1)), -1)
-    found.nonnegative = one.nonnegative and _never_negative(other)
-    return found
-
-
-def _never_negative(operand: Operand) -> bool:
-    """Whether that is known of a value, or of plain numbers."""
-    if isinstance(operand, Value):
-        return operand.nonnegative
-    return _is_plain(operand) and bool(np.all(np.asarray(operand) >= 0))
+    return recorder.limited(found, lambda limits: limits(one).smaller(limits(other)))
 
 
 def largest(recorder: Recorder, one: Operand, other: Operand) -> Operand:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.recording import Recorder
-from reachjax.loops.values import Operand, Value, is_known
+from reachjax.loops.values import Operand, Parameter, Value, is_known
 
 Rule = Callable[[Recorder, "Equation", Sequence[Operand]], Any]
 """From the operands, of which one at least is no plain array, to the value, or to several."""
@@ -35,6 +35,9 @@ class Equation:
     def evaluate(self, *operands: Any, **changes: Any) -> Any:
         """Plain arrays in, plain arrays out: numpy's if all are. Some parameters may be changed."""
         params = self.params | changes
+        if any(isinstance(each, Parameter) for each in operands):
+            plain = (np.asarray(e) if isinstance(e, Parameter) else e for e in operands)
+            return jax.tree.map(Parameter.of, self.evaluate(*plain, **changes))
         if not is_known(operands):
             return self._primitive.bind(*operands, **params)
         with jax.ensure_compile_time_eval():  # known numbers stay known where others are traced
@@ -55,7 +58,7 @@ def shaped(recorder: Recorder, operand: Operand, shape: tuple[int, ...]) -> Oper
     if isinstance(operand, Value):
         return operand if operand.shape == shape else recorder.broadcast(operand, shape)
     if on_host(operand):
-        return np.broadcast_to(np.asarray(operand, float), shape)
+        return np.broadcast_to(np.asanyarray(operand, float), shape, subok=True)
     return jnp.broadcast_to(operand, shape)
 
 

@@ -1,4 +1,4 @@
-"""Maxima, minima and products of many numbers, by two at a time."""
+"""Maxima, minima, products and the order of many numbers, by two at a time."""
 
 from __future__ import annotations
 
@@ -80,11 +80,35 @@ def _over_windows(pair: Pair) -> Rule:
     return rule
 
 
+SORTED = 8
+"""As many numbers are sorted at most: each pair of them is a rectifier."""
+
+
+def _sorted(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> list[Value]:
+    """The numbers along an axis by their size: neighbours trade places, until none need to."""
+    (value, *others), axis = operands, equation.params["dimension"]
+    if others:
+        raise UnsupportedError(
+            "what is moved by the order of other numbers jumps where that changes"
+        )
+    index = np.moveaxis(np.arange(value.size).reshape(value.shape), axis, 0)
+    if len(index) > SORTED:
+        raise UnsupportedError(f"it sorts {len(index)} numbers, but {SORTED} at most have bounds")
+    parts = [recorder.picked(value, each) for each in index]
+    for turn in range(len(parts)):
+        for k in range(turn % 2, len(parts) - 1, 2):
+            both = parts[k], parts[k + 1]
+            parts[k : k + 2] = [smallest(recorder, *both), largest(recorder, *both)]
+    order = np.moveaxis(np.arange(value.size).reshape(index.shape), 0, axis)
+    return [recorder.picked(recorder.joined(parts), order)]
+
+
 def _product(recorder: Recorder, one: Value, other: Value) -> Value:
     return recorder.product(one, other)
 
 
 RULES: dict[str, Rule] = {
+    "sort": _sorted,
     "reduce_max": _over_axes(largest),
     "reduce_min": _over_axes(smallest),
     "reduce_prod": _over_axes(_product),

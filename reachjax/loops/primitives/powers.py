@@ -1,4 +1,4 @@
-"""Powers, exponentials and angles: units, and what is made of them."""
+"""Powers, exponentials and their kin: units, and what is made of them."""
 
 from __future__ import annotations
 
@@ -13,28 +13,26 @@ from reachjax.loops.primitives.equations import Equation, Rule, entrywise
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import (
     AbstractUnit,
-    Atan,
-    Cos,
+    Asinh,
+    Erf,
     Exp,
     Log,
     Reciprocal,
-    Sin,
     Sqrt,
     Tanh,
 )
 from reachjax.loops.values import Operand, UnsupportedError, Value, is_known
 
 
-def _by(unit: AbstractUnit) -> Rule:
+def by(unit: AbstractUnit) -> Rule:
+    """A unit."""
     return lambda recorder, equation, operands: recorder.unit(unit, operands[0])
 
 
 def _raised(recorder: Recorder, value: Value, power: int) -> Any:
     """A whole power, by squares and products."""
     if power < 0:
-        inverse = recorder.unit(Reciprocal(), value)
-        inverse.nonnegative = value.nonnegative
-        return _raised(recorder, inverse, -power)
+        return _raised(recorder, recorder.unit(Reciprocal(), value), -power)
     if power == 0:
         return np.ones(value.shape)
     half = value if power < 2 else _raised(recorder, value, power // 2)
@@ -44,16 +42,12 @@ def _raised(recorder: Recorder, value: Value, power: int) -> Any:
     return square if power % 2 == 0 else recorder.product(square, value)
 
 
-def _rooted(recorder: Recorder, value: Value) -> Value:
-    return recorder.unit(Sqrt(nonnegative=value.nonnegative), value)
-
-
 def _to_the(recorder: Recorder, value: Value, exponent: float) -> Any:
     """A real power."""
     if exponent.is_integer():
         return _raised(recorder, value, int(exponent))
     if (2 * exponent).is_integer():
-        return _raised(recorder, _rooted(recorder, value), int(2 * exponent))
+        return _raised(recorder, recorder.unit(Sqrt(), value), int(2 * exponent))
     return recorder.unit(Exp(), recorder.scaled(recorder.unit(Log(), value), np.array(exponent)))
 
 
@@ -101,34 +95,16 @@ def _square(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
 
 
 def _root(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    return _rooted(recorder, operands[0])
+    return recorder.unit(Sqrt(), operands[0])
 
 
 def _inverse_root(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    return recorder.unit(Reciprocal(), _rooted(recorder, operands[0]))
+    return recorder.unit(Reciprocal(), recorder.unit(Sqrt(), operands[0]))
 
 
 def _logistic(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
     half = recorder.unit(Tanh(), recorder.scaled(operands[0], np.array(0.5)))
     return recorder.shifted(recorder.scaled(half, np.array(0.5)), np.array(0.5))
-
-
-def _tangent(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    sine, cosine = (recorder.unit(unit, operands[0]) for unit in (Sin(), Cos()))
-    return recorder.product(sine, recorder.unit(Reciprocal(), cosine))
-
-
-@entrywise
-def _angle(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    """`atan2(y, x) = arctan(y / x)` where `x > 0`: elsewhere it has no bounds."""
-    y, x = operands
-    if not isinstance(x, Value):
-        if not is_known(x) or not np.all(np.asarray(x) > 0):
-            raise UnsupportedError("its second operand must be positive: elsewhere angles jump")
-        return recorder.unit(Atan(), recorder.divided(y, x))
-    inverse = recorder.unit(Reciprocal(positive=True), x)
-    slope = recorder.product(y, inverse) if isinstance(y, Value) else recorder.scaled(inverse, y)
-    return recorder.unit(Atan(), slope)
 
 
 def _log_of_more(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
@@ -151,18 +127,33 @@ def _hyperbolic(sign: int) -> Rule:
     return rule
 
 
+def _rest_of_erf(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    """`1 - erf y`."""
+    return recorder.added(np.ones(operands[0].shape), recorder.unit(Erf(), operands[0]), -1)
+
+
+def _inverse_cosine(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    """`arcosh y = 2 arsinh sqrt((y - 1) / 2)`."""
+    half = recorder.scaled(recorder.shifted(operands[0], np.array(-1.0)), np.array(0.5))
+    return recorder.scaled(recorder.unit(Asinh(), recorder.unit(Sqrt(), half)), np.array(2.0))
+
+
+def _inverse_tangent(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    """`artanh y = (log(1 + y) - log(1 - y)) / 2`."""
+    one = np.ones(operands[0].shape)
+    more, less = (recorder.unit(Log(), recorder.added(one, operands[0], sign)) for sign in (1, -1))
+    return recorder.scaled(recorder.added(more, less, -1), np.array(0.5))
+
+
 def multiplied(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
     """The product of two values."""
     return reduce(recorder.product, operands)
 
 
 RULES: dict[str, Rule] = {
-    "tanh": _by(Tanh()),
-    "sin": _by(Sin()),
-    "cos": _by(Cos()),
-    "atan": _by(Atan()),
-    "exp": _by(Exp()),
-    "log": _by(Log()),
+    "tanh": by(Tanh()),
+    "exp": by(Exp()),
+    "log": by(Log()),
     "sqrt": _root,
     "rsqrt": _inverse_root,
     "square": _square,
@@ -172,8 +163,11 @@ RULES: dict[str, Rule] = {
     "expm1": _exp_less_one,
     "log1p": _log_of_more,
     "logistic": _logistic,
-    "tan": _tangent,
-    "atan2": _angle,
+    "erf": by(Erf()),
+    "erfc": _rest_of_erf,
+    "asinh": by(Asinh()),
+    "acosh": _inverse_cosine,
+    "atanh": _inverse_tangent,
     "cosh": _hyperbolic(1),
     "sinh": _hyperbolic(-1),
 }

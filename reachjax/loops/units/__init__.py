@@ -14,25 +14,30 @@ from reachjax.loops.units.base import (
 )
 from reachjax.loops.units.clip import clipped
 from reachjax.loops.units.disturbance import Constraint, Disturbance
-from reachjax.loops.units.exponential import Exp, Log
+from reachjax.loops.units.exponential import Exp, Log, XLogX
 from reachjax.loops.units.hard_tanh import HardTanh
 from reachjax.loops.units.hyperbolic import Sigmoid, Tanh
 from reachjax.loops.units.leaky_relu import LeakyReLU
 from reachjax.loops.units.powers import Reciprocal, Sqrt, Square
 from reachjax.loops.units.projection import ProjectionSlack, projected
 from reachjax.loops.units.relu import ReLU
-from reachjax.loops.units.smooth import Quadratic, SmoothUnit, UnboundedError
+from reachjax.loops.units.saturating import ISRU, Asin, Asinh, Erf
+from reachjax.loops.units.smooth import Origin, Quadratic, SmoothUnit, UnboundedError
 from reachjax.loops.units.trigonometric import Atan, Cos, Sin
 
 __all__ = [
+    "ISRU",
     "AbstractActivation",
     "AbstractUnit",
+    "Asin",
+    "Asinh",
     "AtUnit",
     "Atan",
     "Block",
     "Constraint",
     "Cos",
     "Disturbance",
+    "Erf",
     "Exp",
     "Facts",
     "HardTanh",
@@ -41,6 +46,7 @@ __all__ = [
     "Lines",
     "Log",
     "Mark",
+    "Origin",
     "Product",
     "ProjectionSlack",
     "Quadratic",
@@ -53,6 +59,7 @@ __all__ = [
     "Square",
     "Tanh",
     "UnboundedError",
+    "XLogX",
     "clipped",
     "evaluate",
     "projected",

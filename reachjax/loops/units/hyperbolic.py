@@ -24,6 +24,7 @@ class Tanh(SmoothUnit):
     """
 
     image = (-1.0, 1.0)
+    rises = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`tanh y`."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from reachjax.loops.units.base import Lines
-from reachjax.loops.units.smooth import POLE, SLACK, Quadratic, SmoothUnit, nearest
+from reachjax.loops.units.smooth import POLE, SLACK, Quadratic, SmoothUnit, farthest, nearest
 from reachjax.numerics.rounding import TINY, constant, gamma, larger, namespace, settled, smaller
 
 
@@ -38,6 +38,11 @@ class Square(SmoothUnit):
         """`2 y = s` at `s / 2`."""
         return (slope / 2,)
 
+    def limits(self, least: Any, most: Any) -> tuple[Any, Any]:
+        """Squares of the nearest and of the farthest number."""
+        near, far = nearest(least, most), farthest(least, most)
+        return near * near * (1 - gamma(1)), far * far * (1 + gamma(1)) + TINY
+
     def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
         """`f''' = 0`."""
         return namespace(lower, upper).zeros_like(lower)
@@ -45,6 +50,7 @@ class Square(SmoothUnit):
     @np.errstate(all="ignore")
     def quadratic(self, lower: Array, upper: Array) -> Quadratic:
         """`c^2 + 2 c (y - c) + (y - c)^2`, of which only `c^2` is rounded."""
+        lower, upper = self.met(lower, upper)
         xp, center = namespace(lower, upper), settled(lower / 2 + upper / 2)
         offset = settled(center * center)
         gap = gamma(1) * constant(offset) + TINY
@@ -57,49 +63,30 @@ class Square(SmoothUnit):
 class Sqrt(SmoothUnit):
     """`sqrt y` where `y >= 0`.
 
-    Args:
-        nonnegative: whether its inputs are known never to be negative, as sums of squares are; what
-            bounds of them say below zero then says nothing.
-
     Example:
         >>> import numpy as np
         >>> [end.round(3).tolist() for end in Sqrt().interval(np.array([0.0]), np.array([4.0]))]
         [[0.0], [2.0]]
     """
 
-    nonnegative: bool = False
-
     nonexpansive = False
     image = (0.0, math.inf)
+    rises = True
+    advice = (
+        "keep them away from negative numbers, or write jnp.sqrt(jnp.maximum(y, 0.0)), which "
+        "is defined everywhere"
+    )
     flushed = 2.0**-510  # roots of what compiled code takes for 0
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`sqrt y`, with derivative 0 at 0, where it has none."""
         xp = namespace(y)
-        y = larger(y, 0.0) if self.nonnegative else y  # rounding alone takes it below
+        y = larger(y, 0.0) if self.least >= 0 else y  # rounding alone takes it below
         return xp.where(y == 0, 0.0, xp.sqrt(xp.where(y == 0, 1.0, y)))
 
     def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
         """Where no input is negative."""
         return (lower >= 0) & (upper < math.inf)
-
-    def _met(self, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """What inputs can be, of those between bounds."""
-        if not self.nonnegative:
-            return lower, upper
-        return larger(lower, 0.0), larger(upper, 0.0)
-
-    def remainder(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """As of any smooth unit, of what inputs can be."""
-        return super().remainder(slope, *self._met(lower, upper))
-
-    def lines(self, lower: Array, upper: Array) -> Lines:
-        """The same."""
-        return super().lines(*self._met(lower, upper))
-
-    def quadratic(self, lower: Array, upper: Array) -> Quadratic:
-        """The same."""
-        return super().quadratic(*self._met(lower, upper))
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`1 / (2 sqrt y)`."""
@@ -122,9 +109,6 @@ class Sqrt(SmoothUnit):
 class Reciprocal(SmoothUnit):
     """`1 / y`, on intervals on either side of 0.
 
-    Args:
-        positive: whether it is asked for positive inputs only: of others it has no bounds.
-
     Example:
         >>> import numpy as np
         >>> lower, upper = np.array([-2.0, -1.0]), np.array([-1.0, 1.0])
@@ -132,9 +116,10 @@ class Reciprocal(SmoothUnit):
         [[-1.0, -inf], [-0.5, inf]]
     """
 
-    positive: bool = False
-
     nonexpansive = False
+    advice = (
+        "keep them away from zero (an angle of y / x is jnp.arctan2(y, x), which crosses x = 0)"
+    )
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`1 / y`."""
@@ -142,8 +127,14 @@ class Reciprocal(SmoothUnit):
 
     def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
         """Where all inputs are positive, or all are negative."""
-        size = lower if self.positive else nearest(lower, upper)
-        return (size >= TINY) & super().defined(lower, upper)
+        return (nearest(lower, upper) >= TINY) & super().defined(lower, upper)
+
+    def limits(self, least: Any, most: Any) -> tuple[Any, Any]:
+        """Inverses of the ends, where all inputs are positive, or all are negative."""
+        right, left = (least >= 0) & (most > 0), (most <= 0) & (least < 0)
+        low = np.where(right | (left & (most < 0)), 1 / most, -math.inf)
+        high = np.where(left | (right & (least > 0)), 1 / least, math.inf)
+        return low - gamma(1) * abs(low), high + gamma(1) * abs(high)
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`-1 / y^2`."""

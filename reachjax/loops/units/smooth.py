@@ -11,7 +11,9 @@ are used: no bound relies on how a slope, a stationary point or a coefficient wa
 from __future__ import annotations
 
 import abc
+import dataclasses
 import math
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any, ClassVar, NamedTuple
 
@@ -63,6 +65,20 @@ ENDLESS = 1e100
 """Inputs of this size are no matter of a domain."""
 
 
+class Origin(NamedTuple):
+    """What a unit is a part of, for errors: that which a user wrote.
+
+    Attributes:
+        name: of the function.
+        trouble: what is in a range on which the unit has no bounds: a verb, and up to the range.
+        advice: how to avoid that.
+    """
+
+    name: str
+    trouble: str
+    advice: str
+
+
 class UnboundedError(ValueError):
     """That a unit has no bounds on the range of its inputs.
 
@@ -72,33 +88,92 @@ class UnboundedError(ValueError):
         lower: of the range.
         upper: the same.
         line: where a user wrote it; nothing where that is not known.
+        cells: how small the cells are that were tried; nothing where none were.
     """
 
-    def __init__(self, unit: AbstractUnit, t: int, lower: float, upper: float, line: str = ""):
-        name = type(unit).__name__
-        advice = (
-            "keep them away from what is outside of its domain, or take smaller cells of X0 "
-            "(reach_partitioned, or decide(..., cells=...))"
+    def __init__(
+        self,
+        unit: AbstractUnit,
+        t: int,
+        lower: float,
+        upper: float,
+        line: str = "",
+        cells: str = "",
+    ):
+        name, trouble, advice = (isinstance(unit, SmoothUnit) and unit.origin) or Origin(
+            type(unit).__name__, "has inputs in", getattr(unit, "advice", SmoothUnit.advice)
         )
+        parts = (
+            "a smaller X0, or more time or cells for it"
+            if cells
+            else "smaller cells of X0 (reach_partitioned, or decide(..., cells=...))"
+        )
+        advice = f"{advice}, or take {parts}"
         if max(-lower, upper) > ENDLESS:
-            advice = "states, or their bounds, grow without end: see whether the loop is stable"
+            advice = (
+                "bounds grow without end. Take a shorter step of integration in the plant's "
+                f"function, or {parts}; and see whether the loop is stable"
+            )
         super().__init__(
-            f"{name}{line} at t = {t} has inputs in [{lower:g}, {upper:g}], on which it has no "
-            f"bounds: {advice}"
+            f"{name}{line} at t = {t} {trouble} [{lower:g}, {upper:g}], on which it has no "
+            f"bounds{cells}: {advice}"
         )
-        self.given = unit, t, lower, upper
+        self.given, self.line = (unit, t, lower, upper), line
+
+    def after(self, cells: int, widths: Sequence[float]) -> UnboundedError:
+        """The error where it is of one of so many cells, of these widths."""
+        sides = ", ".join(f"{width:.3g}" for width in widths)
+        tried = f", even over one of {cells} cells, with sides of {sides}"
+        return UnboundedError(*self.given, line=self.line, cells=tried)
 
 
+@dataclasses.dataclass(frozen=True)
 class SmoothUnit(AbstractUnit):
     """A unit three times differentiable where it is defined.
+
+    Args:
+        least: what its inputs are known never to be below, as sums of squares are never below zero;
+            what bounds of them say beneath it then says nothing.
+        most: what they are known never to be above.
+        origin: what it is a part of, for errors; None if it is what a user wrote.
 
     Attributes:
         image: bounds of all its values.
         flushed: what numbers too small for floats may add to an error of its value.
+        rises: whether it increases wherever it is defined.
+        advice: what to do where inputs leave its domain.
     """
+
+    least: float = dataclasses.field(default=-math.inf, repr=False, kw_only=True)
+    most: float = dataclasses.field(default=math.inf, repr=False, kw_only=True)
+    origin: Origin | None = dataclasses.field(default=None, repr=False, kw_only=True)
 
     image: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
     flushed: ClassVar[float] = 1024 * TINY
+    rises: ClassVar[bool] = False
+    advice: ClassVar[str] = "keep them away from what is outside of its domain"
+
+    def met(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """What inputs can be of those between bounds."""
+        if self.least > -math.inf:
+            lower, upper = larger(lower, self.least), larger(upper, self.least)
+        if self.most < math.inf:
+            lower, upper = smaller(lower, self.most), smaller(upper, self.most)
+        return lower, upper
+
+    def limits(self, least: Any, most: Any) -> tuple[Any, Any]:
+        """Bounds of the value for inputs in `[least, most]`, one end or both of which may be
+        infinite.
+        """
+        ends: Any = [np.where(np.isfinite(end), end, 1.0) for end in (least, most)]
+        low, high = ends
+        if self.rises:
+            first, last = self.interval(low, low)[0], self.interval(high, high)[1]
+        else:
+            first, last = self.interval(low, high)
+            least = most = np.where(np.isfinite(least) & np.isfinite(most), 0.0, math.inf)
+        known = np.isfinite(least), np.isfinite(most)
+        return np.where(known[0], first, self.image[0]), np.where(known[1], last, self.image[1])
 
     @abc.abstractmethod
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
@@ -136,7 +211,7 @@ class SmoothUnit(AbstractUnit):
         They hold for any slope, and are infinite where the unit is not defined.
         """
         xp = namespace(slope, lower, upper)
-        slope, lower, upper = settled((slope, lower, upper))
+        slope, lower, upper = settled((slope, *self.met(lower, upper)))
         fine = self.defined(lower, upper) & (abs(slope) < math.inf)
         slope = xp.where(fine, slope, 0.0)
         lower, upper = (xp.where(fine, end, 1.0) for end in (lower, upper))
@@ -159,6 +234,7 @@ class SmoothUnit(AbstractUnit):
 
         Where the unit is not defined they are infinitely far from each other.
         """
+        lower, upper = self.met(lower, upper)
         slope = settled(self._chord(lower, upper))
         low, high = self.remainder(slope, lower, upper)
         return Lines(below=Line(slope, low), above=Line(slope, high))
@@ -184,7 +260,7 @@ class SmoothUnit(AbstractUnit):
         Lebesgue constant), here 2, beside the error of an exact interpolant.
         """
         xp = namespace(lower, upper)
-        lower, upper = settled((lower, upper))
+        lower, upper = settled(self.met(lower, upper))
         center = settled(lower / 2 + upper / 2)
         linear = self.linear(lower, upper)
         fine = self.defined(lower, upper)
@@ -218,6 +294,7 @@ class SmoothUnit(AbstractUnit):
 
     def linear(self, lower: Array, upper: Array) -> Quadratic:
         """The lines as a quadratic without curvature."""
+        lower, upper = self.met(lower, upper)
         (slope, low), (_, high) = self.lines(lower, upper)
         center = settled(lower / 2 + upper / 2)
         start, half = slope * center, low / 2 + high / 2

@@ -116,6 +116,7 @@ class Atan(SmoothUnit):
     """
 
     image = (-1.5707963267948968, 1.5707963267948968)  # next to pi/2, outwards
+    rises = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`arctan y`."""

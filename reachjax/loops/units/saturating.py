@@ -1,0 +1,210 @@
+"""Functions that bend once and flatten, and inverses of such: erf, arcsin, arsinh, y / |(1, y)|."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from reachjax.loops.units.smooth import POLE, SLACK, SmoothUnit, farthest, nearest
+from reachjax.numerics.rounding import TINY, larger, namespace, smaller
+
+SLOPE = 2 / math.sqrt(math.pi)
+"""The derivative of the error function at zero."""
+
+LARGE = 1e150
+"""Squares of larger numbers overflow; the functions here are flat by then, or logarithms."""
+
+
+def _largest(low: Array, high: Array, size, tops: tuple[tuple[float, float], ...]) -> Array:
+    """The largest `size(y)` of the sizes `y` in `[low, high]`, whose inner maxima are known.
+
+    Args:
+        low: the least size.
+        high: the largest size.
+        size: a function of sizes.
+        tops: where it has maxima inside, and what it is there.
+    """
+    found = larger(size(low), size(high))
+    for at, top in tops:
+        within = (low <= at * (1 + SLACK)) & (high >= at * (1 - SLACK))
+        found = larger(found, namespace(low, high).where(within, top, 0.0))
+    return found * (1 + SLACK) + TINY
+
+
+@dataclasses.dataclass(frozen=True)
+class Erf(SmoothUnit):
+    """The error function `erf y`, of which the exact GELU is made.
+
+    Example:
+        >>> [end.round(3).tolist() for end in Erf().interval(np.array([-1.0]), np.array([2.0]))]
+        [[-0.843], [0.995]]
+    """
+
+    nonexpansive = False
+    image = (-1.0, 1.0)
+    rises = True
+
+    def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`erf y`."""
+        if namespace(y) is np:
+            from scipy.special import erf
+        else:
+            from jax.scipy.special import erf
+        return erf(y)
+
+    def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`2 / sqrt(pi) exp(-y^2)`."""
+        return SLOPE * namespace(y).exp(-y * y)
+
+    def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
+        """`2 / sqrt(pi) exp(-y^2) = s` where `y^2 = log(2 / (sqrt(pi) s))`."""
+        xp, slope = namespace(slope, lower), smaller(larger(slope, TINY), SLOPE)
+        point = xp.sqrt(larger(xp.log(SLOPE / slope), 0.0))
+        return point, -point
+
+    def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
+        """`f''' = 2 / sqrt(pi) (4 y^2 - 2) exp(-y^2)`, extreme at 0 and at `y^2 = 3/2`."""
+        xp, ends = namespace(lower, upper), (nearest(lower, upper), farthest(lower, upper))
+        low, high = (smaller(end, 100.0) for end in ends)
+
+        def size(y: Array) -> Array:
+            square = y * y
+            # an exponential is off by what its argument is: by 1e-13 until it is zero
+            return SLOPE * (abs(4 * square - 2) + 8 * SLACK) * xp.exp(-square) * (1 + 1e-12)
+
+        return _largest(low, high, size, ((math.sqrt(1.5), SLOPE * 4 * math.exp(-1.5)),))
+
+
+@dataclasses.dataclass(frozen=True)
+class Asin(SmoothUnit):
+    """`arcsin y` where `-1 <= y <= 1`.
+
+    Example:
+        >>> [end.round(3).tolist() for end in Asin().interval(np.array([-1.0]), np.array([0.5]))]
+        [[-1.571], [0.524]]
+    """
+
+    nonexpansive = False
+    image = (-1.5707963267948968, 1.5707963267948968)  # next to pi/2, outwards
+    rises = True
+    advice = (
+        "keep them in [-1, 1], or clip them, jnp.clip(y, -1.0, 1.0), which is defined everywhere"
+    )
+
+    def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`arcsin y`, with derivative 0 at the ends, where it has none."""
+        xp, edge = namespace(y), abs(y) == 1
+        inner = xp.arcsin(xp.where(edge, 0.0, y))
+        return xp.where(edge, xp.where(y > 0, math.pi / 2, -math.pi / 2), inner)
+
+    def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
+        """Where no input is larger than 1 in size."""
+        return farthest(lower, upper) <= 1
+
+    def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`1 / sqrt(1 - y^2)`."""
+        xp, rest = namespace(y), (1 - y) * (1 + y)
+        return xp.where(rest <= 0, math.inf, 1 / xp.sqrt(xp.where(rest <= 0, 1.0, rest)))
+
+    def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
+        """`1 / sqrt(1 - y^2) = s` where `y^2 = 1 - 1/s^2`."""
+        slope = larger(slope, 1.0)
+        point = namespace(slope, lower).sqrt((slope - 1) * (slope + 1)) / slope
+        return point, -point
+
+    def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
+        """`f''' = (1 + 2 y^2) / (1 - y^2)^(5/2)`, which grows with the size of `y`."""
+        xp, far = namespace(lower, upper), farthest(lower, upper)
+        rest = (1 - far) * (1 + far)
+        known = rest > POLE
+        rest = xp.where(known, rest, 1.0)
+        bound = (1 + 2 * far * far) / (rest * rest * xp.sqrt(rest))
+        return xp.where(known, bound * (1 + SLACK) + TINY, math.inf)
+
+
+@dataclasses.dataclass(frozen=True)
+class Asinh(SmoothUnit):
+    """The inverse hyperbolic sine, `log(y + sqrt(1 + y^2))`.
+
+    Example:
+        >>> [end.round(3).tolist() for end in Asinh().interval(np.array([-1.0]), np.array([2.0]))]
+        [[-0.881], [1.444]]
+    """
+
+    rises = True
+
+    def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`arsinh y`."""
+        return namespace(y).arcsinh(y)
+
+    def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`1 / sqrt(1 + y^2)`; beyond 1e150, where squares overflow, as there."""
+        size = smaller(abs(y), LARGE)
+        return 1 / namespace(y).sqrt(1 + size * size)
+
+    def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
+        """`1 / sqrt(1 + y^2) = s` where `y^2 = 1/s^2 - 1`."""
+        slope = smaller(larger(slope, TINY), 1.0)
+        point = namespace(slope, lower).sqrt((1 - slope) * (1 + slope)) / slope
+        return point, -point
+
+    def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
+        """`f''' = (2 y^2 - 1) / (1 + y^2)^(5/2)`, extreme at 0 and at `y^2 = 3/2`."""
+        xp, ends = namespace(lower, upper), (nearest(lower, upper), farthest(lower, upper))
+        low, high = (smaller(end, 1e60) for end in ends)
+
+        def size(y: Array) -> Array:
+            square = y * y
+            more = 1 + square
+            return (abs(2 * square - 1) + 4 * SLACK) / (more * more * xp.sqrt(more))
+
+        return _largest(low, high, size, ((math.sqrt(1.5), 2 / 2.5**2.5),))
+
+
+@dataclasses.dataclass(frozen=True)
+class ISRU(SmoothUnit):
+    """`y / sqrt(1 + y^2)`, the inverse square root unit: a number over its norm with another one.
+
+    Source: Carlile, Delamarter, Kinney, Marti, Whitney, Improving deep learning by inverse square
+    root linear units (2017).
+
+    Example:
+        >>> [end.round(3).tolist() for end in ISRU().interval(np.array([-1.0]), np.array([9.0]))]
+        [[-0.707], [0.994]]
+    """
+
+    image = (-1.0, 1.0)
+    rises = True
+
+    def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`y / sqrt(1 + y^2)`."""
+        y = smaller(larger(y, -LARGE), LARGE)
+        return y / namespace(y).sqrt(1 + y * y)
+
+    def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`(1 + y^2)^(-3/2)`."""
+        size = smaller(abs(y), 1e100)
+        more = 1 + size * size
+        return 1 / (more * namespace(y).sqrt(more))
+
+    def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
+        """`(1 + y^2)^(-3/2) = s` where `y^2 = s^(-2/3) - 1`."""
+        xp, slope = namespace(slope, lower), smaller(larger(slope, TINY), 1.0)
+        root = xp.cbrt(slope)
+        point = xp.sqrt((1 - root) * (1 + root)) / root
+        return point, -point
+
+    def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
+        """`f''' = (12 y^2 - 3) / (1 + y^2)^(7/2)`, extreme at 0 and at `y^2 = 3/4`."""
+        xp, ends = namespace(lower, upper), (nearest(lower, upper), farthest(lower, upper))
+        low, high = (smaller(end, 1e40) for end in ends)
+
+        def size(y: Array) -> Array:
+            square = y * y
+            more = 1 + square
+            return (abs(12 * square - 3) + 24 * SLACK) / (more * more * more * xp.sqrt(more))
+
+        return _largest(low, high, size, ((math.sqrt(0.75), 6 / 1.75**3.5),))

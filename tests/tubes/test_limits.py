@@ -1,0 +1,263 @@
+"""A limit is a limit, Ctrl-C keeps what was found, and dead workers lose nothing."""
+
+import os
+import pickle
+import signal
+import threading
+import time
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from tests.networks import he_network
+
+PATIENCE = 3.0
+"""Times that something may take beyond what is promised, on a machine that does more."""
+
+
+@pytest.fixture(scope="module")
+def switching():
+    """Four states under ReLUs that all switch: programs of which there is no end."""
+    layers = he_network((4, 48, 48, 1), 0)
+    layers[-1] = 0.2 * layers[-1][0], layers[-1][1]
+    A = 0.9 * np.eye(4) + 0.1 * np.eye(4, k=1)
+    plant = rj.AffinePlant(A, 0.1 * np.ones((4, 1)))
+    one = np.ones(4)
+    return rj.ClosedLoop(plant, rj.MLP.from_layers(layers)), rj.Box(-0.5 * one, 0.5 * one)
+
+
+@pytest.fixture(scope="module")
+def touching(switching):
+    """A set so close around what is simulated that much has to be tried."""
+    loop, X0 = switching
+    states = np.asarray(loop.simulate(jnp.asarray(X0.corners()), 6))
+    sizes = 1.02 * abs(states).max(axis=(0, 1))
+    return rj.Box(-sizes, sizes)
+
+
+CALLS = {
+    "reach": lambda loop, X0, safe, **given: rj.reach(loop, X0, 6, rj.Template.box(4), **given),
+    "reach_partitioned": lambda loop, X0, safe, **given: rj.reach_partitioned(
+        loop, X0, 6, rj.Template.box(4), cells=(2, 2, 2, 2), **given
+    ),
+    "decide": lambda loop, X0, safe, **given: rj.decide(loop, X0, 6, safe=safe, **given),
+    "decide, cells": lambda loop, X0, safe, **given: rj.decide(
+        loop, X0, 6, safe=safe, cells=5000, **given
+    ),
+    "winning_set": lambda loop, X0, safe, **given: rj.winning_set(
+        loop, X0, 6, safe=safe, cells=5000, **given
+    ),
+    "largest_set": lambda loop, X0, safe, **given: rj.largest_set(loop, X0, 6, safe=safe, **given),
+}
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_a_limit_is_kept(switching, touching, call):
+    began = time.monotonic()
+    CALLS[call](*switching, touching, time_limit=2.0)
+    assert time.monotonic() - began < 2.0 + PATIENCE
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_ctrl_c_ends_a_call_soon_and_keeps_what_was_found(switching, touching, call):
+    CALLS[call](*switching, touching, time_limit=0.5)  # what is compiled is compiled
+    pressed = []
+
+    def press():
+        pressed.append(time.monotonic())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    timer = threading.Timer(2.0, press)
+    timer.start()
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        CALLS[call](*switching, touching)
+    late = time.monotonic() - pressed[0]
+    assert late < 1.0 + PATIENCE
+    if isinstance(stopped.value, rj.Interrupted):
+        found = pickle.loads(pickle.dumps(stopped.value)).found
+        assert type(found) is type(stopped.value.found)
+        assert str(stopped.value).startswith("interrupted")
+
+
+WAYS = {
+    "many products": (rj.Template.box(4), rj.PaperQC(), rj.InteriorPoint()),
+    "rounds": (rj.Template.box(4), rj.CuttingPlanes(), rj.Auto()),
+    "Clarabel": (rj.Template.box(4), rj.LocalBounds(), rj.Clarabel()),
+    "SCS": (rj.Template.box(4), rj.LocalBounds(), rj.SCS()),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_programs_in_progress_are_cut_and_what_is_returned_holds(switching, way):
+    (loop, X0), (template, relaxation, solver) = switching, WAYS[way]
+    began = time.process_time()
+    tube = rj.reach(loop, X0, 3, template, relaxation, 1, solver, time_limit=1.0)
+    assert time.process_time() - began < 2 * (1.0 + PATIENCE)  # of two threads
+    states = loop.simulate(X0.sample(jax.random.key(0), 200), 3)
+    for t in (1, 2, 3):
+        assert bool(tube.sets[t].contains(states[:, t], 1e-9).all())
+        statuses = {status.name for status in tube.proof(t).statuses}
+        assert statuses & {"LIMIT", "FAILED"}
+
+
+class Stopping:
+    """A progress bar whose user presses Ctrl-C after so many items."""
+
+    def __init__(self, after):
+        self.after = after
+
+    def __call__(self, items):
+        for number, item in enumerate(items):
+            if number == self.after:
+                raise KeyboardInterrupt
+            yield item
+
+
+@pytest.fixture(scope="module")
+def small():
+    net = rj.MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+    return rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net, rj.Box([-1.0], [1.0]))
+
+
+def test_partitions_go_on_from_the_cells_that_were_done(small):
+    given = small, rj.Box([-3.0], [3.0]), 2, rj.Template.box(1)
+    with pytest.raises(rj.Interrupted, match="known=found") as stopped:
+        rj.reach_partitioned(*given, cells=(6,), progress=Stopping(2))
+    done = stopped.value.found
+    assert 2 <= len(done) < 6
+    seen = []
+    whole = rj.reach_partitioned(
+        *given,
+        cells=(6,),
+        known=done,
+        progress=lambda bar: (seen.append(each) or each for each in bar),
+    )
+    assert len(whole) == 6
+    assert len(seen) == 6 - len(done)
+    np.testing.assert_array_equal(
+        whole.bounds(2), rj.reach_partitioned(*given, cells=(6,)).bounds(2)
+    )
+    with pytest.raises(ValueError, match="another question"):
+        rj.reach_partitioned(*given[:2], 3, given[3], cells=(6,), known=done)
+
+
+def test_verdicts_and_winning_sets_hold_what_was_decided(small):
+    domain, safe = rj.Box([-8.0], [8.0]), rj.Box([-4.0], [4.0])
+    with pytest.raises(rj.Interrupted) as stopped:
+        rj.decide(small, rj.Box([-3.9], [3.9]), 2, safe=safe, cells=(16,), progress=Stopping(4))
+    verdict = stopped.value.found
+    assert verdict.status is rj.VerdictStatus.UNKNOWN
+    statuses = [cell.status for cell in verdict.cells]
+    assert statuses.count(rj.VerdictStatus.PROVED) >= 4
+    assert sum(float(np.prod(cell.upper - cell.lower)) for cell in verdict.cells) == pytest.approx(
+        7.8
+    )
+    given = small, domain, 2
+    options = {"safe": safe, "cells": 64}
+    with pytest.raises(rj.Interrupted, match="known=found") as stopped:
+        rj.winning_set(*given, **options, progress=Stopping(2))
+    found = stopped.value.found
+    assert sum(map(found.volume, rj.VerdictStatus)) == pytest.approx(16.0)
+    on = rj.winning_set(*given, **options, known=found)
+    assert on.volume(rj.VerdictStatus.PROVED) == pytest.approx(
+        rj.winning_set(*given, **options).volume(rj.VerdictStatus.PROVED)
+    )
+
+
+def test_of_a_partition_that_has_no_time_one_tube_stands_for_the_rest(small):
+    X0 = rj.Box([-3.0], [3.0])
+    tube = rj.reach_partitioned(small, X0, 2, rj.Template.box(1), cells=(6,), time_limit=0.0)
+    states = small.simulate(jnp.linspace(-3.0, 3.0, 101)[:, None], 2)
+    for t in (1, 2):
+        inside = [np.asarray(X.contains(states[:, t], 1e-9)) for X in tube.sets(t)]
+        assert np.any(inside, axis=0).all()
+    guided = rj.reach_partitioned(small, X0, 2, rj.Template.box(1), cells=6, time_limit=0.0)
+    assert len(guided) == 1
+
+
+class Dying(ThreadPoolExecutor):
+    """An executor whose worker dies after so many jobs, and takes those in flight with it."""
+
+    def __init__(self, after):
+        super().__init__(2)
+        self.after = after
+
+    def submit(self, fn, /, *given, **named):
+        if self.after < 0:
+            raise BrokenProcessPool("a process was terminated abruptly")
+        self.after -= 1
+        if self.after >= 0:
+            return super().submit(fn, *given, **named)
+        future = Future()
+        future.set_exception(BrokenProcessPool("a process was terminated abruptly"))
+        return future
+
+
+ANSWERS = {
+    "reach_partitioned": lambda loop, executor: rj.reach_partitioned(
+        loop, rj.Box([-3.0], [3.0]), 2, rj.Template.box(1), cells=(6,), executor=executor
+    ).bounds(2),
+    "winning_set": lambda loop, executor: [
+        rj.winning_set(
+            loop,
+            rj.Box([-8.0], [8.0]),
+            2,
+            safe=rj.Box([-4.0], [4.0]),
+            cells=200,
+            executor=executor,
+        ).volume(rj.VerdictStatus.PROVED)
+    ],
+    "decide": lambda loop, executor: [
+        rj.decide(
+            loop,
+            rj.Box([-3.9], [3.9]),
+            2,
+            safe=rj.Box([-4.0], [4.0]),
+            cells=(16,),
+            executor=executor,
+        ).status.value
+        == "proved"
+    ],
+}
+
+
+@pytest.mark.parametrize("call", ANSWERS)
+@pytest.mark.parametrize("after", [0, 2])
+def test_a_dead_worker_loses_nothing(small, call, after):
+    with pytest.warns(RuntimeWarning, match="a worker of the executor has died"):
+        found = ANSWERS[call](small, Dying(after))
+    np.testing.assert_allclose(found, ANSWERS[call](small, None))
+
+
+def test_a_process_that_is_killed_loses_nothing(small):
+    import multiprocessing
+
+    killed = threading.Event()
+
+    def bar(cells):
+        for cell in cells:
+            if not killed.is_set():
+                killed.set()
+                for process in list(pool._processes.values()):
+                    os.kill(process.pid, signal.SIGKILL)
+            yield cell
+
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=spawn) as pool:
+        assert isinstance(pool, Executor)
+        with pytest.warns(RuntimeWarning, match="has died"):
+            tube = rj.reach_partitioned(
+                small,
+                rj.Box([-3.0], [3.0]),
+                2,
+                rj.Template.box(1),
+                cells=(6,),
+                executor=pool,
+                progress=bar,
+            )
+    assert len(tube) == 6

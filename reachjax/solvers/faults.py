@@ -19,7 +19,7 @@ import numpy as np
 from reachjax.numerics.budget import TimeOverError, clock
 from reachjax.numerics.checks import described
 from reachjax.programs.lmi import Program
-from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution, SolverStatus
+from reachjax.proofs.proposal import ANSWERS, OF_SOLVERS, Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def _repaired(solution: Solution, name: str) -> Solution:
         name: what warnings call the solver.
     """
     statuses, multipliers = np.asarray(solution.statuses), np.asarray(solution.multipliers)
-    known = np.isin(statuses, list(SolverStatus))
+    known = np.isin(statuses, OF_SOLVERS)
     finite = np.isfinite(multipliers).all(axis=1)
     broken = ~known | (np.isin(statuses, CLAIMING) & ~finite)
     for facet in np.flatnonzero(broken)[:1]:
@@ -107,7 +107,7 @@ def _repaired(solution: Solution, name: str) -> Solution:
 
 
 def _repaired_enclosure(found: Enclosure, blank: Enclosure, name: str) -> Enclosure:
-    known = int(found.status) in list(SolverStatus)
+    known = int(found.status) in OF_SOLVERS
     finite = bool(np.isfinite(found.multipliers).all())
     if not known or (int(found.status) in CLAIMING and not finite):
         _warn(name, _why(known, found.status))
@@ -149,7 +149,7 @@ def _warn(name: str, why: str) -> None:
 
 def _why(known: bool, status: Any, where: str = "") -> str:
     if not known:
-        return f"the status{where} is {int(status)}, which SolverStatus does not have"
+        return f"the status{where} is {int(status)}, which no solver's SolverStatus is"
     called = SolverStatus(int(status)).name
     return f"the status{where} is {called}, but its multipliers contain NaN or infinity"
 

@@ -327,6 +327,7 @@ class Ladder:
         found = climbed.multipliers.copy()
         columns, owner = climbed.columns.copy(), climbed.branches.owner
         phases = np.asarray(climbed.branches.phases)
+        self._programs.grow(self.horizon.facts, self.horizon.varying)
         for facet in range(len(found)):
             if self._budget.late:
                 break

@@ -57,7 +57,7 @@ class Settings:
     """Warm calls of which the median is taken."""
     patience: float = 60.0
     """Seconds after which a method is not called again, and cvxpy rebuilt for no more facets;
-    `rivals`, `decisions`: after which a call is ended."""
+    `rivals`, `decisions`, `limits`: after which a call is ended."""
     clock: Literal["wall", "cpu"] = "wall"
     """What a second is; with one thread, the processor's own are immune to other jobs."""
     samples: int = 500

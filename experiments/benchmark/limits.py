@@ -4,6 +4,7 @@ Each call has a process of its own, in which nothing is compiled yet and no comp
 is made twice: what the second one takes less is what was compiled.
 """
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from rich.table import Table
 import reachjax as rj
 from experiments import report
 from experiments.benchmark.cases import Settings, he_network
-from experiments.benchmark.growth import in_new_process
+from experiments.benchmark.rivals.processes import Stopped, from_process
 
 GRACE = 1.3
 """So many times its limit a call may take."""
@@ -25,7 +26,7 @@ GRACE = 1.3
 LIMITS_NOTE = """\
 first, second: wall seconds of the first call of a process, and of one more
 compiled: seconds of XLA in the first call;  longest: of one compilation
-! longer than 1.3 times the limit"""
+! longer than 1.3 times the limit; such as --patience ended are 'ended'"""
 
 STEP = 0.05
 """Seconds of a step of the pendulum and of the quadrotor."""
@@ -145,7 +146,7 @@ CALLS: dict[str, Callable[[Question, float], Any]] = {
         asked.horizon,
         rj.Template.box(asked.loop.states),
         cells=8,
-        time_limit=limit,  # type: ignore
+        time_limit=limit,
     ),
     "decide": lambda asked, limit: rj.decide(*asked[:3], safe=asked.safe, time_limit=limit),
     "decide, cells": lambda asked, limit: rj.decide(
@@ -211,25 +212,23 @@ class Compilations:
             self.seconds.append(duration_secs)
 
 
-def limited(loop: str, call: str, settings: Settings) -> dict:
-    """One row of the table, in a process in which nothing is compiled yet."""
+def limited(loop: str, call: str, limit: float) -> Iterator[dict]:
+    """What is seen of two calls, in a process in which nothing is compiled yet."""
     logging.getLogger("jax").setLevel(logging.ERROR)
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", None)
-    asked, seconds, said = LOOPS[loop](), [], ""
-    heard = Compilations()
-    compiled: list[float] = []
-    for number in range(2):
-        began = time.perf_counter()
+    asked, heard = LOOPS[loop](), Compilations()
+    for name in ("first", "second"):
+        before, began = len(heard.seconds), time.perf_counter()
         try:
-            said = _said(CALLS[call](asked, settings.limit))
-        except (ValueError, RuntimeError, TypeError) as error:
-            said = f"{type(error).__name__}: {error}"
-        seconds.append(time.perf_counter() - began)
-        compiled = compiled if number else [*heard.seconds]
-    names = {"loop": loop, "call": call, "limit": settings.limit, "said": said[:200]}
-    first = {"compiled": sum(compiled), "longest": max(compiled, default=0.0)}
-    return names | {"first": seconds[0], "second": seconds[1]} | first
+            said = _said(CALLS[call](asked, limit))
+        except (ValueError, RuntimeError) as error:
+            said = f"{type(error).__name__}: {error}"[:200]
+        seconds, compiled = time.perf_counter() - began, heard.seconds[before:]
+        found: dict[str, Any] = {name: seconds, "said": said}
+        if name == "first":
+            found |= {"compiled": sum(compiled), "longest": max(compiled, default=0.0)}
+        yield found
 
 
 def _said(found: Any) -> str:
@@ -245,9 +244,16 @@ def too_long(row: dict) -> bool:
 
 
 def limit_rows(settings: Settings) -> Iterator[dict]:
-    """The rows, one after the other."""
+    """The rows, one after the other; a call that patience ends has that for its seconds."""
     for loop, call in chosen(settings):
-        yield in_new_process(limited, loop, call, settings)
+        row = {"loop": loop, "call": call, "limit": settings.limit, "said": "ended"}
+        row |= dict.fromkeys(("compiled", "longest"), 0.0)
+        row |= dict.fromkeys(("first", "second"), settings.patience)
+        given = loop, call, settings.limit
+        with contextlib.suppress(Stopped):
+            for found in from_process(limited, *given, patience=settings.patience):
+                row |= found
+        yield row
 
 
 def limits_table(rows: list[dict]) -> Table:

@@ -242,19 +242,20 @@ def require_kind(name: str, value: Any, kind: type | tuple[type, ...], expected:
 def wrapped(progress: Any, items: Iterable[Any]) -> Iterable[Any]:
     """The items as a progress bar passes them on; as they are where there is none.
 
+    The bar itself is returned, which may show notes: an iterator over it does not.
+
     Raises:
         TypeError: the bar returns nothing that can be iterated over.
     """
     if progress is None:
         return items
     shown = progress(items)
-    try:
-        return iter(shown)
-    except TypeError:
+    if not (hasattr(shown, "__iter__") or hasattr(shown, "__getitem__")):
         raise TypeError(
             "progress must return an iterable over what it wraps, as tqdm.tqdm does, but "
             f"{described(shown)} arrived"
-        ) from None
+        )
+    return shown
 
 
 def require_bar(progress: Any) -> None:

@@ -99,6 +99,7 @@ class Generators(NamedTuple):
         """The flattened matrices, sparse `(n * n, K)`."""
         n, blocks = self.rows.shape[1], []
         for first in range(0, len(self.left) or 1, CHUNK):
+            clock().require()
             here = slice(first, first + CHUNK)
             outer = self.rows[self.left[here], :, None] * self.rows[self.right[here], None, :]
             symmetric = (outer + outer.transpose(0, 2, 1)) / 2

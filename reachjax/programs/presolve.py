@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float
 
 from reachjax.numerics.rounding import Ball
-from reachjax.programs.generators import Generators
+from reachjax.programs.generators import CHUNK, Generators
 from reachjax.programs.lmi import Program
 from reachjax.programs.relaxations import Products
 from reachjax.sets import NormalForm
@@ -137,7 +137,10 @@ def _solid(rows: Ball) -> Bool[np.ndarray, "k n"]:
 def _sizes(products: Products, facts: np.ndarray) -> Float[np.ndarray, " K"]:
     """The root of the sum of `|sym(p' q)|^2` over the pairs of each multiplier."""
     squares = (facts**2).sum(axis=1)
-    inner = (facts[products.left] * facts[products.right]).sum(axis=1)
+    inner = np.zeros(len(products.left))
+    for first in range(0, len(inner), CHUNK):
+        here = slice(first, first + CHUNK)
+        inner[here] = (facts[products.left[here]] * facts[products.right[here]]).sum(axis=1)
     of_pairs = (squares[products.left] * squares[products.right] + inner**2) / 2
     return np.sqrt(np.bincount(products.multiplier, of_pairs, len(products.free)))
 

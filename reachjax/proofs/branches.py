@@ -19,7 +19,7 @@ from reachjax.numerics.rounding import gamma
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import upper_bounds
 from reachjax.programs.initial import InitialColumns
-from reachjax.proofs.certificates import AbstractProof
+from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.proofs.facets import Certificate
 
 
@@ -111,7 +111,10 @@ class BranchCertificate(AbstractProof):
         counts = np.bincount(np.asarray(self.rungs), minlength=len(Rung))
         ways = ", ".join(f"{rung.name.lower()}={counts[rung]}" for rung in Rung if counts[rung])
         columns = self.about.facts.columns.shape[1]
-        return f"BranchCertificate(facets={len(self.bounds)}, columns={columns}, {ways})"
+        return (
+            f"BranchCertificate(facets={len(self.bounds)}, columns={columns}, {ways}, "
+            f"ended: {told(self.ends)})"
+        )
 
     @property
     def ways(self) -> tuple[Rung, ...]:

@@ -10,7 +10,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import floats_of, require_double_precision
 from reachjax.numerics.pytrees import pytree, static
 from reachjax.programs.unrolled import unrolled
-from reachjax.proofs.certificates import AbstractProof
+from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.sets import AbstractSet
 from reachjax.sets.cells import from_tree
 
@@ -40,7 +40,10 @@ class CellCertificate(AbstractProof):
     start: int = static()
 
     def __repr__(self) -> str:
-        return f"CellCertificate(facets={len(self.bounds)}, cells={self.cells}, steps={self.k})"
+        return (
+            f"CellCertificate(facets={len(self.bounds)}, cells={self.cells}, steps={self.k}, "
+            f"ended: {told(self.ends)})"
+        )
 
     @property
     def cells(self) -> int:

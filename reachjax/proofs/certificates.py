@@ -8,6 +8,8 @@ trajectories; the true support of the reachable set lies between witness and bou
 from __future__ import annotations
 
 import abc
+from collections import Counter
+from collections.abc import Mapping
 
 import jax
 import numpy as np
@@ -19,12 +21,23 @@ from reachjax.programs.lmi import Program
 from reachjax.proofs.proposal import SolverStatus
 
 
+def told(ends: Mapping[SolverStatus, int]) -> str:
+    """How many ended in which way, the most frequent first.
+
+    Example:
+        >>> told({SolverStatus.TIME: 1, SolverStatus.SOLVED: 3})
+        '3 SOLVED, 1 TIME'
+    """
+    counted = sorted(ends.items(), key=lambda each: (-each[1], each[0]))
+    return ", ".join(f"{count} {status.name}" for status, count in counted)
+
+
 @pytree
 class AbstractProof(Replaceable, abc.ABC):
     """What every proof of one step's set says, whatever it rests on.
 
     Attributes:
-        codes: `(f,)`, how what found it ended, as values of `SolverStatus`.
+        codes: `(f,)`, how the search for each bound ended, as values of `SolverStatus`.
         bounds: `(f,)`, what was proved.
         witnesses: `(f,)`, the largest simulated values of what is bounded.
         witness_states: `(f, n_x)`, the initial states that attain them. Of a loop with disturbances
@@ -40,8 +53,13 @@ class AbstractProof(Replaceable, abc.ABC):
 
     @property
     def statuses(self) -> tuple[SolverStatus, ...]:
-        """How the solver ended on each program; each has a sentence of `advice`."""
+        """How the search for each bound ended; each has a sentence of `advice`."""
         return tuple(SolverStatus(int(code)) for code in self.codes)
+
+    @property
+    def ends(self) -> dict[SolverStatus, int]:
+        """How many bounds ended in each way."""
+        return dict(Counter(self.statuses))
 
     @property
     def gaps(self) -> Float[Array | np.ndarray, " f"]:

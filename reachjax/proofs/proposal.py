@@ -1,5 +1,7 @@
 """What a solver gives back: how it ended, and a proposal for facets or for an ellipsoid.
 
+Bounds that no semidefinite program is solved for end in other ways, and say so too.
+
 Whatever the status, a solution is only a proposal: bounds come from `recheck`. A solver that fails
 proposes zero multipliers, which prove the interval bound and no more.
 """
@@ -17,7 +19,11 @@ from reachjax.sets import NormalForm
 
 
 class SolverStatus(enum.IntEnum):
-    """How a solver ended. "Almost solved" is not solved, and "solved" is not proof."""
+    """How the search for a bound ended. "Almost solved" is not solved, and "solved" is not proof.
+
+    The first six are ends of solvers of programs, the others of searches by forms, linear programs,
+    splits and cells: there `SOLVED` means that no more is left open than was asked for.
+    """
 
     SOLVED = 0
     INACCURATE = 1
@@ -25,12 +31,24 @@ class SolverStatus(enum.IntEnum):
     UNBOUNDED = 3
     LIMIT = 4
     FAILED = 5
+    TIME = 6
+    BUDGET = 7
+    AFFINE_FORM = 8
+    STALLED = 9
+    INTERRUPTED = 10
+    UNKNOWN_GAP = 11
 
     @property
     def advice(self) -> str:
         """One sentence on what this means and what to do."""
         return _ADVICE[self]
 
+
+OF_SOLVERS = tuple(SolverStatus)[: SolverStatus.FAILED + 1]
+"""The ends that a solver of programs may report."""
+
+AS_ASKED = (SolverStatus.SOLVED, SolverStatus.AFFINE_FORM)
+"""The ends after which a bound is as tight as the method that was asked for makes it."""
 
 ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
 """The ends after which there is a proposal."""
@@ -47,6 +65,20 @@ _ADVICE = {
     "loose; raise the limit",
     SolverStatus.FAILED: "broke down without an answer: the interval bound was used; "
     "try another solver or relaxation",
+    SolverStatus.TIME: "the time was over before the gap was closed: the bound is sound, perhaps "
+    "loose; raise time_limit",
+    SolverStatus.BUDGET: "the budget of linear programs or cells was used up before the gap was "
+    "closed: the bound is sound, perhaps loose; give a time_limit, or raise BranchAndCut(nodes=) "
+    "or BranchAndCut(cells=)",
+    SolverStatus.AFFINE_FORM: "bounded by its affine form, as the relaxation asks for, without a "
+    "program: the bound is sound, perhaps loose; BranchAndCut() closes the gap",
+    SolverStatus.STALLED: "neither splits nor smaller cells close the gap any further: the bound "
+    "is sound, and what is open may be left by disturbances, by rounding, or by a relaxation; cut "
+    "X0 into cells, or allow BranchAndCut(cells=)",
+    SolverStatus.INTERRUPTED: "interrupted before the gap was closed: the bound is sound, perhaps "
+    "loose; call again to go on",
+    SolverStatus.UNKNOWN_GAP: "no trajectory could be simulated, so that what is left open is not "
+    "known: the bound is sound; give a set X0 that states can be drawn from",
 }
 
 

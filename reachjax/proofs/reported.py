@@ -78,8 +78,10 @@ def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
 
     The optimal value is no smaller (weak duality), but for what they miss their constraints by.
     """
+    values = np.full(len(program.objective.mid), -np.inf)
+    if not np.isfinite(np.asarray(solution.moments)).any():  # as of a program that was cut
+        return values
     reduced = presolved(program)
-    values = np.full(len(reduced.centers), -np.inf)
     for i, whole in enumerate(np.asarray(solution.moments)):
         X = whole[np.ix_(reduced.columns, reduced.columns)]
         if not np.isfinite(X).all() or abs(X[-1, -1] - 1) > SHORTFALL:

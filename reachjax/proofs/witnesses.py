@@ -21,7 +21,7 @@ from reachjax.proofs.ascent import ascended
 from reachjax.sets import AbstractSet
 
 BLOCK = 1024
-"""Trajectories are evaluated in multiples of so many, for which code is compiled once."""
+"""Points are drawn and evaluated in multiples of so many, for which code is compiled once."""
 
 PULLS = PULL, 1 - 1e-9, 1 - 1e-6
 """The same of points that solvers of cones found, by turns until one is inside."""
@@ -32,19 +32,27 @@ def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, 
 
     Where the set has a curved surface, half of the points are on it, just inside.
     """
-    key = jax.random.key(seed)
-    states, surface = X0.sample(key, count), X0.sample_boundary(key, count)
+    key, drawn = jax.random.key(seed), _blocks(count)
+    states, surface = jax.device_get((X0.sample(key, drawn), X0.sample_boundary(key, drawn)))
+    states = states[:count]
     if surface is not None:
         middle = states.mean(axis=0)
-        states = states.at[::2].set((middle + PULL * (surface - middle))[::2])
-    states = jnp.concatenate([X0.corners(), states])
-    states, inside = jax.device_get(_brought_inside(X0, states))
+        states = states.copy()
+        states[::2] = (middle + PULL * (surface[:count] - middle))[::2]
+    states = np.concatenate([jax.device_get(X0.corners()), states])
+    moved, inside = jax.device_get(_brought_inside(X0, _padded(states)))
+    states, inside = moved[: len(states)], inside[: len(states)]
     return states[inside] if inside.any() else states  # a flat set contains none exactly
+
+
+def _blocks(count: int) -> int:
+    """At least so many, in whole blocks."""
+    return -(-count // BLOCK) * BLOCK
 
 
 def _padded(points: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "b n"]:
     """The same points and some of them again, so that there are few numbers of them."""
-    return np.resize(points, (-(-len(points) // BLOCK) * BLOCK, points.shape[1]))
+    return np.resize(points, (_blocks(len(points)), points.shape[1]))
 
 
 @jax.jit

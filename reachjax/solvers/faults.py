@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from reachjax.numerics.budget import TimeOverError, clock
 from reachjax.numerics.checks import described
 from reachjax.programs.lmi import Program
-from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution, SolverStatus
+from reachjax.proofs.proposal import ANSWERS, OF_SOLVERS, Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
 
 if TYPE_CHECKING:
@@ -55,7 +56,11 @@ def proposed(solver: AbstractSolver, program: Program) -> Solution:
         SetupError: the solver was chosen or set up wrongly.
     """
     blank = Solution.blank_for(program)
-    found = _asked(solver, lambda: _solution(solver.solve(program), blank))
+    try:
+        clock().require()
+        found = _asked(solver, lambda: _solution(solver.solve(program), blank))
+    except TimeOverError:
+        return blank._replace(statuses=np.full_like(blank.statuses, int(SolverStatus.LIMIT)))
     return blank if found is None else _repaired(found, type(solver).__name__)
 
 
@@ -68,7 +73,11 @@ def proposed_enclosure(
         SetupError: the solver was chosen or set up wrongly.
     """
     blank = Enclosure.blank(program)
-    found = _asked(solver, lambda: _enclosure(solver.enclose(program, form), blank))
+    try:
+        clock().require()
+        found = _asked(solver, lambda: _enclosure(solver.enclose(program, form), blank))
+    except TimeOverError:
+        return blank._replace(status=np.array(int(SolverStatus.LIMIT)))
     return blank if found is None else _repaired_enclosure(found, blank, type(solver).__name__)
 
 
@@ -80,7 +89,7 @@ def _repaired(solution: Solution, name: str) -> Solution:
         name: what warnings call the solver.
     """
     statuses, multipliers = np.asarray(solution.statuses), np.asarray(solution.multipliers)
-    known = np.isin(statuses, list(SolverStatus))
+    known = np.isin(statuses, OF_SOLVERS)
     finite = np.isfinite(multipliers).all(axis=1)
     broken = ~known | (np.isin(statuses, CLAIMING) & ~finite)
     for facet in np.flatnonzero(broken)[:1]:
@@ -98,7 +107,7 @@ def _repaired(solution: Solution, name: str) -> Solution:
 
 
 def _repaired_enclosure(found: Enclosure, blank: Enclosure, name: str) -> Enclosure:
-    known = int(found.status) in list(SolverStatus)
+    known = int(found.status) in OF_SOLVERS
     finite = bool(np.isfinite(found.multipliers).all())
     if not known or (int(found.status) in CLAIMING and not finite):
         _warn(name, _why(known, found.status))
@@ -117,7 +126,7 @@ def _asked(solver: AbstractSolver, answer: Callable[[], NamedTuple]) -> Any:
     name = type(solver).__name__
     try:
         return answer()
-    except SetupError:
+    except (SetupError, TimeOverError):
         raise
     except _FaultError as fault:
         _warn(name, str(fault))
@@ -140,7 +149,7 @@ def _warn(name: str, why: str) -> None:
 
 def _why(known: bool, status: Any, where: str = "") -> str:
     if not known:
-        return f"the status{where} is {int(status)}, which SolverStatus does not have"
+        return f"the status{where} is {int(status)}, which no solver's SolverStatus is"
     called = SolverStatus(int(status)).name
     return f"the status{where} is {called}, but its multipliers contain NaN or infinity"
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 
 from reachjax.numerics.checks import described, is_concrete, whole_number
 from reachjax.numerics.host import on_host
-from reachjax.proofs.proposal import SolverStatus
+from reachjax.proofs.proposal import AS_ASKED
 from reachjax.tubes.reach import ReachTube
 
 if TYPE_CHECKING:
@@ -134,7 +134,10 @@ def failures(state: Any) -> int:
 
 
 def unsolved(tube: ReachTube) -> Int[Array, ""]:
-    """How many of a tube's programs were not solved, also inside `jax.jit`.
+    """How many of a tube's bounds are not as tight as was asked for, also inside `jax.jit`.
+
+    Programs that were not solved to tolerance, and facets whose gap was not closed in time or by
+    the budget: all whose `SolverStatus` is neither `SOLVED` nor, of `LinearBounds`, `AFFINE_FORM`.
 
     Their bounds hold and have gradients, but they are looser than they might be. A loss that
     returns this beside its value (`jax.value_and_grad(loss, has_aux=True)`) says how often solvers
@@ -147,4 +150,5 @@ def unsolved(tube: ReachTube) -> Int[Array, ""]:
         0
     """
     codes = [tube.proof(t).codes for t in range(1, len(tube.sets))]
-    return sum((jnp.sum(code != SolverStatus.SOLVED) for code in codes), start=jnp.zeros((), int))
+    as_asked = jnp.asarray(AS_ASKED)
+    return sum((jnp.sum(~jnp.isin(code, as_asked)) for code in codes), start=jnp.zeros((), int))

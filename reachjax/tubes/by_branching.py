@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import Budget
@@ -125,7 +125,9 @@ def sets_by_branching(
             offsets, products = _with_products(steps[-1], directions, offsets, opened, share)
         X = Polytope(directions, offsets)
         seconds = time.perf_counter() - began
-        proof = _certificate(climbed, offsets, products, opened, seconds)
+        shut = _fixed(X)[1] - climbed.attained <= setting.gap * ranges
+        codes = np.where(shut, int(SolverStatus.SOLVED), climbed.codes)
+        proof = _certificate(climbed, codes, offsets, products, opened, seconds)
         yield Reached(X, proof, climbed.ended, climb=False)
         ladder.horizon.narrow(*_ends(*_fixed(X)))
 
@@ -206,6 +208,7 @@ def _ends(rows: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def _certificate(
     climbed: Climbed,
+    codes: Int[np.ndarray, " f"],
     offsets: Float[Array, " f"],
     products: Certificate | None,
     opened: np.ndarray,
@@ -215,8 +218,10 @@ def _certificate(
     facets, rungs = len(climbed.bounds), climbed.rungs.copy()
     better = np.asarray(jax.lax.stop_gradient(offsets)) < climbed.bounds
     rungs[better] = Rung.PRODUCTS
+    beside_forms = better & (codes == SolverStatus.AFFINE_FORM)
+    codes = np.where(beside_forms, int(SolverStatus.STALLED), codes)
     return BranchCertificate(
-        codes=np.full(facets, int(SolverStatus.SOLVED)),
+        codes=codes,
         bounds=offsets,
         witnesses=np.full(facets, np.nan),
         witness_states=np.full((facets, 0), np.nan),

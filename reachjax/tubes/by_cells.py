@@ -12,11 +12,12 @@ import itertools
 import math
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
@@ -137,7 +138,7 @@ def sets_by_cells(
     try:
         search.run()
     except KeyboardInterrupt:
-        interrupted = True
+        interrupted, search.ended = True, SolverStatus.INTERRUPTED
     seconds = time.perf_counter() - began
     for k in range(known, horizon):
         if interrupted and k == horizon - 1:
@@ -155,7 +156,7 @@ def sets_by_cells(
             X0=X0,
             directions=directions[k],
             axes=np.array(search.axes),
-            codes=np.full(facets, int(SolverStatus.SOLVED)),
+            codes=search.codes(k),
             bounds=bounds,
             witnesses=np.full(facets, np.nan),
             witness_states=np.full((facets, 0), np.nan),
@@ -176,6 +177,9 @@ class _Search:
         directions: `(N, f, n_x)`.
         most: how many cells there may be.
         known: of how many steps nothing is asked.
+
+    Attributes:
+        ended: how the search ended for facets that leave more open than was asked for.
     """
 
     def __init__(
@@ -199,6 +203,8 @@ class _Search:
         self.leaves = [self._root]
         self._note()
         self._left = min(2 * most - 2, affordable(self._loop, len(directions), setting.budget))
+        self.ended = SolverStatus.UNKNOWN_GAP
+        self._open_parts: np.ndarray | None = None
 
     def _made(self, cell: Cell, parent: _Node | None = None) -> _Node:
         given = self._loop, cell.part, cell.box, self._directions, self._setting.start
@@ -253,17 +259,32 @@ class _Search:
             if count % LOOKED == 0:
                 simulations.include(*(self.farthest(k) for k in range(len(self.bounds))))
                 least, most = self._simulated()
-            if self._left < 2 or self._setting.budget.late:
-                return
             # of the bounds so far: those of a wide set say nothing of a range
-            floor = self._floor(least, most)
-            excess, half = self.bounds - most, np.fmax((most - least) / 2, floor)
-            open_parts = np.divide(excess, half, out=np.zeros_like(excess), where=excess > 0)
-            open_parts[: self._known] = 0.0
+            excess, open_parts = self._open(least, most, self._floor(least, most))
+            if self._left < 2 or self._setting.budget.late:
+                late = self._setting.budget.late
+                self.ended = SolverStatus.TIME if late else SolverStatus.BUDGET
+                return
+            self.ended = SolverStatus.STALLED
             number = self._widest(open_parts, excess)
             if number is None or not self._halve(number):
                 return
             self._note()
+
+    def _open(self, least: np.ndarray, most: np.ndarray, floor: np.ndarray) -> tuple[Any, Any]:
+        """What is open of each facet, in the units of the states and in parts of its range."""
+        excess, half = self.bounds - most, np.fmax((most - least) / 2, floor)
+        open_parts = np.divide(excess, half, out=np.zeros_like(excess), where=excess > 0)
+        open_parts[: self._known] = 0.0
+        self._open_parts = open_parts
+        return excess, open_parts
+
+    def codes(self, k: int) -> Int[np.ndarray, " f"]:
+        """How the search ended for each facet after `k + 1` steps, as values of `SolverStatus`."""
+        if self._open_parts is None:
+            return np.full(len(self.bounds[k]), int(self.ended))
+        shut = self._open_parts[k] <= self._setting.gap
+        return np.where(shut, int(SolverStatus.SOLVED), int(self.ended))
 
     def _widest(
         self, open_parts: Float[np.ndarray, "N f"], excess: Float[np.ndarray, "N f"]

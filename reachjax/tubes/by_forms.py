@@ -18,6 +18,9 @@ from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
 from reachjax.tubes.steps import Reached
 
+ENDS = SolverStatus.AFFINE_FORM, SolverStatus.FAILED
+"""How a form ends that has a bound, and one that has none."""
+
 
 def sets_by_forms(
     loop: ClosedLoop,
@@ -58,7 +61,7 @@ def sets_by_forms(
             directions=shaped.directions,
             slopes=step.slopes,
             corners=step.corners,
-            codes=jnp.where(jnp.isfinite(step.offsets), SolverStatus.SOLVED, SolverStatus.FAILED),
+            codes=jnp.where(jnp.isfinite(step.offsets), *ENDS),
             bounds=step.offsets,
             witnesses=np.full(facets, np.nan),
             witness_states=np.full((facets, 0), np.nan),

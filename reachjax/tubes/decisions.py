@@ -10,6 +10,7 @@ until it is decided. Between its forms and its programs a smooth loop is halved 
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
 
@@ -244,6 +245,7 @@ class _Decision:
         self._margins = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
+        self._ends: dict[tuple[str, int], np.ndarray] = {}
         self._example: Counterexample | None = None
         self.simulations = simulations
         if simulations is not None:
@@ -264,10 +266,9 @@ class _Decision:
         status = VerdictStatus.UNKNOWN if self._open else VerdictStatus.PROVED
         if self._example is not None:
             status = VerdictStatus.REFUTED
-        certificates = self._certificates
-        return Verdict(
-            status, self._margins, self._simulated, self._example, certificates=certificates
-        )
+        ends = Counter(SolverStatus(int(code)) for codes in self._ends.values() for code in codes)
+        known = status, self._margins, self._simulated, self._example
+        return Verdict(*known, ends=dict(ends), certificates=self._certificates)
 
     def _require_unbroken(self) -> None:
         """Raise an error if a trajectory, as JAX runs it, breaks what is proved."""
@@ -319,6 +320,7 @@ class _Decision:
         margin = float(np.min(-climbed.bounds / units))
         holds = bool(np.all(right))
         self._note(key, holds, margin)
+        self._ends[key] = climbed.codes
         if holds:
             self._certificates[key] = _certificate(climbed, target.simulated, not item.inside)
         if not np.all(right):
@@ -358,7 +360,7 @@ def _certificate(climbed: Climbed, known: Simulated, least: bool) -> BranchCerti
     """The proof of a requirement."""
     count = len(climbed.bounds)
     proof = BranchCertificate(
-        codes=np.full(count, int(SolverStatus.SOLVED)),
+        codes=climbed.codes,
         bounds=climbed.bounds,
         witnesses=known.most,
         witness_states=known.scenarios,

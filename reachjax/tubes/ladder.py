@@ -19,6 +19,7 @@ from reachjax.numerics.budget import Budget
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, joined
 from reachjax.proofs.branches import Branches, HorizonFacts, Rung, bounds_of, leaf_bounds
+from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box
 from reachjax.solvers.branching import Found, Tree, affine_leaf, settled
@@ -67,6 +68,7 @@ class Climbed(NamedTuple):
         multipliers: `(g, m)`, of that leaf.
         rungs: `(g,)`, values of `Rung`.
         nodes: `(g,)`, how many linear programs were solved.
+        codes: `(g,)`, how the search for each ended, as values of `SolverStatus`.
         ended: `(c, s)`, scenarios at which they ended.
     """
 
@@ -79,6 +81,7 @@ class Climbed(NamedTuple):
     multipliers: Float[np.ndarray, "g m"]
     rungs: Int[np.ndarray, " g"]
     nodes: Int[np.ndarray, " g"]
+    codes: Int[np.ndarray, " g"]
     ended: Float[np.ndarray, "c s"]
 
 
@@ -225,7 +228,28 @@ class Ladder:
             (number in trees and trees[number].found()) or affine_leaf(forms, horizon)
             for number, forms in enumerate(target.forms)
         ]
-        return self._judged(target, best, worst, found, ended)
+        judged = self._judged(target, best, worst, found, ended)
+        codes = [
+            self._ended(trees.get(number), budget)
+            if not target.enough(number, float(bound), float(known))
+            else SolverStatus.SOLVED
+            for number, (bound, known) in enumerate(
+                zip(judged.bounds, judged.attained, strict=True)
+            )
+        ]
+        return judged._replace(codes=np.array(codes, int))
+
+    def _ended(self, tree: Tree | None, budget: Budget) -> SolverStatus:
+        """How the search for a bound ended that leaves more open than it should."""
+        if not self._nodes:
+            return SolverStatus.AFFINE_FORM
+        if budget.late:
+            return SolverStatus.TIME
+        if tree is None:
+            return SolverStatus.BUDGET if budget.work <= 0 else SolverStatus.FAILED
+        if tree.found() is None:  # the first linear program had no answer
+            return SolverStatus.FAILED
+        return SolverStatus.BUDGET if tree.is_open else SolverStatus.STALLED
 
     def _grow(self, trees: list[Tree], share: float) -> None:
         """Grow trees by turns, until all are closed or this share of the work is done."""
@@ -292,6 +316,7 @@ class Ladder:
             multipliers=multipliers[deciding],
             rungs=np.where(bounds < uppers, rungs, Rung.AFFINE_FORM),
             nodes=np.array([leaf.nodes for leaf in found]),
+            codes=np.full(count, int(SolverStatus.SOLVED)),
             ended=np.array(ended).reshape(-1, len(self._middle)),
         )
 
@@ -302,6 +327,7 @@ class Ladder:
         found = climbed.multipliers.copy()
         columns, owner = climbed.columns.copy(), climbed.branches.owner
         phases = np.asarray(climbed.branches.phases)
+        self._programs.grow(self.horizon.facts, self.horizon.varying)
         for facet in range(len(found)):
             if self._budget.late:
                 break

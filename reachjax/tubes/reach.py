@@ -7,7 +7,6 @@ recheck. A tube repeats it, each set being the next one's set of states (equatio
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +19,7 @@ from reachjax.numerics.checks import floats_of, owned, require_double_precision,
 from reachjax.numerics.files import writable
 from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
-from reachjax.proofs.certificates import AbstractProof
+from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.solvers import AbstractSolver, Auto
@@ -218,12 +217,16 @@ class ReachTube(Replaceable):
 def _shown(tube: ReachTube, t: int) -> list[Any]:
     """A step in a notebook's table."""
     proof = tube.proof(t)
-    ends = Counter(status.name for status in proof.statuses)
-    counted = ", ".join(f"{count} {name}" for name, count in ends.items())
     gaps = np.asarray(proof.gaps, float)
     known = gaps[~np.isnan(gaps)]
     widest = float(known.max()) if len(known) else np.nan
-    return [t, widest, counted, float(np.sum(np.asarray(proof.seconds))), type(proof).__name__]
+    return [
+        t,
+        widest,
+        told(proof.ends),
+        float(np.sum(np.asarray(proof.seconds))),
+        type(proof).__name__,
+    ]
 
 
 def tube_of(

@@ -7,6 +7,7 @@ of them refutes it only if it surely begins in the initial set and breaks it wha
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 
 import jax
 import numpy as np
@@ -15,7 +16,6 @@ from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, require_kind, whole_number
 from reachjax.numerics.rounding import TINY
-from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet
 from reachjax.tubes.partitions import BESIDE, PartitionedTube
@@ -102,7 +102,7 @@ def _decided(
             "outside of jax.jit, or rj.shortfall inside"
         )
     proofs = [tube.proof(t) for t in range(1, tube.horizon + 1)]
-    unsolved = sum(s is not SolverStatus.SOLVED for proof in proofs for s in proof.statuses)
+    ends = dict(sum((Counter(proof.ends) for proof in proofs), Counter()))
     runs = _runs(tube, samples, seed)
     if X0 is not tube.sets[0]:  # a cell may hold points beside the initial set
         runs = runs.some(np.asarray(X0.contains(runs.states[:, 0], BESIDE)))
@@ -124,9 +124,9 @@ def _decided(
     require_unbroken(tube.loop, begun, tube.start, runs, claims)
     example = counterexample(tube.loop, X0, found, tube.start)
     if example is not None:
-        return Verdict(VerdictStatus.REFUTED, margins, simulated, example, unsolved)
+        return Verdict(VerdictStatus.REFUTED, margins, simulated, example, ends)
     status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
-    return Verdict(status, margins, simulated, None, unsolved)
+    return Verdict(status, margins, simulated, None, ends)
 
 
 def _runs(tube: ReachTube, samples: int, seed: int) -> Runs:

@@ -11,13 +11,15 @@ from __future__ import annotations
 import dataclasses
 import enum
 import html
+from collections import Counter
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from reachjax.proofs.certificates import AbstractProof
+from reachjax.proofs.certificates import AbstractProof, told
+from reachjax.proofs.proposal import AS_ASKED, SolverStatus
 from reachjax.sets import PolyhedralSet
 from reachjax.tubes.displays import display, picture, table
 
@@ -102,8 +104,8 @@ class Verdict:
             nothing is required. Negative: not proved.
         simulated: the same for the sampled trajectories. Negative: broken.
         counterexample: the trajectory, when refuted.
-        unsolved: how many of the tube's facets the solver did not solve to its tolerance: their
-            bounds hold, but may be loose.
+        ends: how many of the bounds that it rests on ended in which way: those that are not
+            `SOLVED` hold, but may be loose.
         certificates: of a verdict without a tube, what each requirement that is proved rests on,
             by its name and its time.
         cells: of a decision by cells, what is known of each, see `plot_cells`.
@@ -114,7 +116,7 @@ class Verdict:
     margins: dict[str, Float[np.ndarray, " h+1"]]
     simulated: dict[str, Float[np.ndarray, " h+1"]]
     counterexample: Counterexample | None = None
-    unsolved: int = 0
+    ends: Mapping[SolverStatus, int] = dataclasses.field(default_factory=dict)
     certificates: Mapping[tuple[str, int], AbstractProof] = dataclasses.field(default_factory=dict)
     cells: tuple[DecidedCell, ...] = ()
     recurrence: Recurrence | None = None
@@ -133,6 +135,11 @@ class Verdict:
     def unknown(self) -> bool:
         """Whether neither is known."""
         return self.status is VerdictStatus.UNKNOWN
+
+    @property
+    def unsolved(self) -> int:
+        """How many of the bounds that it rests on are not as tight as was asked for."""
+        return sum(count for status, count in self.ends.items() if status not in AS_ASKED)
 
     def __bool__(self) -> bool:
         raise TypeError("a verdict has three values: use verdict.proved, .refuted or .unknown")
@@ -187,10 +194,11 @@ class Verdict:
             lines.append(f"  cells: {proved} proved, {refuted} refuted, {unknown} undecided")
         if self.recurrence is not None:
             lines.append(_described(self.recurrence))
+        open_ends = {end: count for end, count in self.ends.items() if end not in AS_ASKED}
         if self.unsolved:
             lines.append(
-                f"  {self.unsolved} programs were not solved to tolerance: their bounds hold, but "
-                "may be loose (see certificate.statuses)"
+                f"  {self.unsolved} bounds hold, but may be looser than was asked for: "
+                f"{told(open_ends)} (each status has a sentence of advice)"
             )
         return "\n".join(lines)
 
@@ -234,7 +242,7 @@ def of_cells(verdicts: list[Verdict]) -> Verdict:
         margins=_least([verdict.margins for verdict in verdicts]),
         simulated=_least([verdict.simulated for verdict in verdicts]),
         counterexample=max(broken, key=lambda example: example.violation, default=None),
-        unsolved=sum(verdict.unsolved for verdict in verdicts),
+        ends=dict(sum((Counter(verdict.ends) for verdict in verdicts), Counter())),
     )
 
 

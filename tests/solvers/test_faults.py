@@ -69,8 +69,8 @@ WRONG = {
     "moments of another shape": (changed(moments=lambda X: X[..., :-1]), "solution.moments must"),
     "seconds as text": (changed(seconds=lambda s: "soon"), "solution.seconds must be numbers"),
     "statuses as text": (changed(statuses=lambda s: "optimal"), "statuses must be whole numbers"),
-    "an unknown status": (changed(statuses=lambda s: 0 * s + 17), "is 17, which SolverStatus does"),
-    "a negative status": (changed(statuses=lambda s: 0 * s - 1), "is -1, which SolverStatus"),
+    "an unknown status": (changed(statuses=lambda s: 0 * s + 17), "is 17, which no solver's"),
+    "a negative status": (changed(statuses=lambda s: 0 * s - 1), "is -1, which no solver's"),
     "multipliers that are NaN": (
         changed(multipliers=lambda y: np.nan * y),
         "the status of facet 0 is SOLVED, but its multipliers contain NaN or infinity",

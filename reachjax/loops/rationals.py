@@ -30,6 +30,7 @@ from reachjax.loops.units import (
     Sqrt,
     Square,
     Tanh,
+    Within,
     XLogX,
 )
 from reachjax.numerics.checks import is_concrete
@@ -65,6 +66,7 @@ VALUES: dict[type[AbstractUnit], Callable[[Fraction], Rational]] = {
     Erf: _at(0, 0),
     ISRU: _at(0, 0),
     XLogX: lambda y: Fraction(0) if y in (0, 1) else None,
+    Within: lambda y: y,
 }
 """Rational values of units at rational points."""
 

@@ -72,6 +72,11 @@ TRUTHS: dict[SmoothUnit, Truth] = {
         lambda y: (1 + y**2) ** -1.5,
         lambda y: (12 * y**2 - 3) / (1 + y**2) ** 3.5,
     ),
+    rj.Softplus(): Truth(
+        lambda y: max(y, 0) + mpmath.log1p(mpmath.exp(-abs(y))),
+        lambda y: 1 / (1 + mpmath.exp(-y)),
+        lambda y: mpmath.exp(-abs(y)) * (1 - mpmath.exp(-abs(y))) / (1 + mpmath.exp(-abs(y))) ** 3,
+    ),
     rj.XLogX(): Truth(
         lambda y: y * mpmath.log(y) if y else mpf(0),
         lambda y: 1 + mpmath.log(y),

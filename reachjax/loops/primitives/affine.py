@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.primitives.equations import Equation, Rule, entrywise, on_host
+from reachjax.loops.primitives.related import over_norm, over_sum
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import Reciprocal
 from reachjax.loops.values import Operand, UnsupportedError, Value, is_known
@@ -81,7 +82,18 @@ def _product(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
     one, other = operands
     if not isinstance(other, Value):
         return recorder.scaled(one, other)
-    return recorder.product(one, other) if isinstance(one, Value) else recorder.scaled(other, one)
+    return (
+        _multiplied(recorder, one, other) if isinstance(one, Value) else recorder.scaled(other, one)
+    )
+
+
+def _multiplied(recorder: Recorder, one: Value, other: Value) -> Value:
+    """A product, of a number and the inverse of its norm among others."""
+    for pair in ((one, other), (other, one)):
+        found = over_norm(recorder, *pair)
+        if found is not None:
+            return found
+    return recorder.product(one, other)
 
 
 @entrywise
@@ -89,9 +101,12 @@ def _quotient(recorder: Recorder, equation: Equation, operands: Sequence[Operand
     one, other = operands
     if not isinstance(other, Value):
         return recorder.divided(one, other)
+    found = over_sum(recorder, one, other)
+    if found is not None:
+        return found
     inverse = recorder.unit(Reciprocal(), other)
     if isinstance(one, Value):
-        return recorder.product(one, inverse)
+        return _multiplied(recorder, one, inverse)
     return recorder.scaled(inverse, one)
 
 

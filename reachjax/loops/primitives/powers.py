@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from reachjax.loops.primitives.equations import Equation, Rule, entrywise
+from reachjax.loops.primitives.related import of_sum
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import (
     AbstractUnit,
@@ -107,8 +108,13 @@ def _logistic(recorder: Recorder, equation: Equation, operands: Sequence[Operand
     return recorder.shifted(recorder.scaled(half, np.array(0.5)), np.array(0.5))
 
 
+def _log(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    found = of_sum(recorder, operands[0])
+    return recorder.unit(Log(), operands[0]) if found is None else found
+
+
 def _log_of_more(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    return recorder.unit(Log(), recorder.shifted(operands[0], np.array(1.0)))
+    return _log(recorder, equation, [recorder.shifted(operands[0], np.array(1.0))])
 
 
 def _exp_less_one(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
@@ -153,7 +159,7 @@ def multiplied(recorder: Recorder, equation: Equation, operands: Sequence[Operan
 RULES: dict[str, Rule] = {
     "tanh": by(Tanh()),
     "exp": by(Exp()),
-    "log": by(Log()),
+    "log": _log,
     "sqrt": _root,
     "rsqrt": _inverse_root,
     "square": _square,

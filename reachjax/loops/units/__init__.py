@@ -16,7 +16,7 @@ from reachjax.loops.units.clip import clipped
 from reachjax.loops.units.disturbance import Constraint, Disturbance
 from reachjax.loops.units.exponential import Exp, Log, XLogX
 from reachjax.loops.units.hard_tanh import HardTanh
-from reachjax.loops.units.hyperbolic import Sigmoid, Tanh
+from reachjax.loops.units.hyperbolic import Sigmoid, Softplus, Tanh
 from reachjax.loops.units.leaky_relu import LeakyReLU
 from reachjax.loops.units.powers import Reciprocal, Sqrt, Square
 from reachjax.loops.units.projection import ProjectionSlack, projected
@@ -24,6 +24,7 @@ from reachjax.loops.units.relu import ReLU
 from reachjax.loops.units.saturating import ISRU, Asin, Asinh, Erf
 from reachjax.loops.units.smooth import Origin, Quadratic, SmoothUnit, UnboundedError
 from reachjax.loops.units.trigonometric import Atan, Cos, Sin
+from reachjax.loops.units.within import Within
 
 __all__ = [
     "ISRU",
@@ -55,10 +56,12 @@ __all__ = [
     "Sigmoid",
     "Sin",
     "SmoothUnit",
+    "Softplus",
     "Sqrt",
     "Square",
     "Tanh",
     "UnboundedError",
+    "Within",
     "XLogX",
     "clipped",
     "evaluate",

@@ -1,8 +1,9 @@
-"""The hyperbolic tangent, and the logistic sigmoid made of it: `1/2 + tanh(y/2)/2`."""
+"""The hyperbolic tangent, the logistic sigmoid made of it, and the integral of that."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 from jaxtyping import Array, Float
@@ -62,3 +63,49 @@ class Sigmoid(AbstractActivation):
     def propagate(self, y: Any, unit: AtUnit) -> Any:
         """`1/2 + tanh(y/2)/2`, with `unit` at the hyperbolic tangent."""
         return 0.5 + 0.5 * unit(Tanh(), 0.5 * y)
+
+
+@dataclasses.dataclass(frozen=True)
+class Softplus(SmoothUnit):
+    """`log(1 + exp y)`, whose derivative is the logistic sigmoid `p`.
+
+    Example:
+        >>> import numpy as np
+        >>> lower, upper = np.array([-1.0]), np.array([2.0])
+        >>> [end.round(3).tolist() for end in Softplus().interval(lower, upper)]
+        [[0.313], [2.127]]
+    """
+
+    image = (0.0, math.inf)
+    rises = True
+
+    def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`max(y, 0) + log(1 + exp(-|y|))`."""
+        xp = namespace(y)
+        return larger(y, 0.0) + xp.log1p(xp.exp(-abs(y)))
+
+    def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """`p = 1 / (1 + exp(-y))`, without overflow."""
+        xp = namespace(y)
+        e = xp.exp(-abs(y))
+        return xp.where(y < 0, e, 1.0) / (1 + e)
+
+    def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
+        """`p = s` at `log(s / (1 - s))`."""
+        xp, slope = namespace(slope, lower), smaller(larger(slope, TINY), 1.0)
+        return (xp.log(slope) - xp.log1p(-slope),)
+
+    def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
+        """`f''' = p (1 - p) (1 - 2 p)`, extreme where `p (1 - p) = 1/6`, where it is `sqrt(3)/18`.
+
+        Its size is the same at `-y`, so it is asked for at `|y|`.
+        """
+        xp, found = namespace(lower, upper), []
+        near, far = nearest(lower, upper), farthest(lower, upper)
+        for size in (near, far):
+            e = xp.exp(-size)
+            found.append(e * (1 - e + 4 * SLACK) / ((1 + e) * (1 + e) * (1 + e)))
+        top, at = math.sqrt(3) / 18, math.log(2 + math.sqrt(3))
+        inner = (near <= at * (1 + SLACK)) & (far >= at * (1 - SLACK))
+        ends = larger(larger(*found), xp.where(inner, top, 0.0))
+        return ends * (1 + SLACK) * (1 + 1e-12) + TINY

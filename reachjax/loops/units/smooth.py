@@ -294,8 +294,8 @@ class SmoothUnit(AbstractUnit):
 
     def linear(self, lower: Array, upper: Array) -> Quadratic:
         """The lines as a quadratic without curvature."""
-        lower, upper = self.met(lower, upper)
         (slope, low), (_, high) = self.lines(lower, upper)
+        lower, upper = self.met(lower, upper)
         center = settled(lower / 2 + upper / 2)
         start, half = slope * center, low / 2 + high / 2
         gap = high / 2 - low / 2 + gamma(4) * constant(abs(start) + abs(low) + abs(high))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.proofs.proposal import OF_SOLVERS
 from reachjax.programs.lmi import lagrangian_slopes
+from reachjax.proofs.proposal import OF_SOLVERS
 from reachjax.solvers import Facets, proved
 from reachjax.solvers.clarabel import FacetCone
 from tests.closed_loops import closed_loop, random_loop, recursion, step_program

@@ -56,16 +56,25 @@ CALLS = {
 }
 
 
+def called(call, *given, **options):
+    """What a call gives; None if a limit left no time for anything to be proved."""
+    try:
+        return CALLS[call](*given, **options)
+    except ValueError as error:
+        assert "time_limit" in str(error)
+        return None
+
+
 @pytest.mark.parametrize("call", CALLS)
 def test_a_limit_is_kept(switching, touching, call):
     began = time.monotonic()
-    CALLS[call](*switching, touching, time_limit=2.0)
+    called(call, *switching, touching, time_limit=2.0)
     assert time.monotonic() - began < 2.0 + PATIENCE
 
 
 @pytest.mark.parametrize("call", CALLS)
 def test_ctrl_c_ends_a_call_soon_and_keeps_what_was_found(switching, touching, call):
-    CALLS[call](*switching, touching, time_limit=0.5)  # what is compiled is compiled
+    called(call, *switching, touching, time_limit=0.5)  # what is compiled is compiled
     pressed = []
 
     def press():
@@ -75,19 +84,17 @@ def test_ctrl_c_ends_a_call_soon_and_keeps_what_was_found(switching, touching, c
     timer = threading.Timer(0.7, press)
     timer.start()
     try:
-        with pytest.raises(KeyboardInterrupt) as stopped:
-            CALLS[call](*switching, touching)
-            if not pressed:
-                timer.cancel()
-                pytest.skip("the call has ended before it could be interrupted")
+        CALLS[call](*switching, touching)
+    except KeyboardInterrupt as stopped:
+        assert time.monotonic() - pressed[0] < 1.0 + PATIENCE
+        if isinstance(stopped, rj.Interrupted):
+            found = pickle.loads(pickle.dumps(stopped)).found
+            assert type(found) is type(stopped.found)
+            assert str(stopped).startswith("interrupted")
+    else:
+        pytest.skip("the call ended before it could be interrupted")
     finally:
         timer.cancel()  # nothing else is to be interrupted
-    late = time.monotonic() - pressed[0]
-    assert late < 1.0 + PATIENCE
-    if isinstance(stopped.value, rj.Interrupted):
-        found = pickle.loads(pickle.dumps(stopped.value)).found
-        assert type(found) is type(stopped.value.found)
-        assert str(stopped.value).startswith("interrupted")
 
 
 WAYS = {

@@ -153,6 +153,10 @@ def largest_set(
         )
         raise Interrupted(message, search.best) from None
     if search.best is None:
+        if budget.late:
+            raise ValueError(
+                f"nothing is proved yet after time_limit={time_limit} seconds: give more of them"
+            )
         raise ValueError(
             "nothing is proved around the center of X0: give another one, or see "
             "reachjax.winning_set for where to begin"

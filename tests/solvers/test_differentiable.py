@@ -10,6 +10,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.programs.lmi import lagrangian_slopes
+from reachjax.proofs.proposal import OF_SOLVERS
 from reachjax.solvers import Facets, proved
 from reachjax.solvers.clarabel import FacetCone
 from tests.closed_loops import closed_loop, random_loop, recursion, step_program
@@ -339,7 +340,7 @@ class Stubborn(rj.AbstractSolver):
         return self.said[0]
 
 
-@pytest.mark.parametrize("status", rj.SolverStatus)
+@pytest.mark.parametrize("status", OF_SOLVERS)
 def test_the_gradient_of_an_inaccurate_bound_is_the_central_difference(status):
     """Multipliers off by a fifth prove less than the optimum, whatever the solver calls them."""
     args = planar(0)
@@ -350,7 +351,7 @@ def test_the_gradient_of_an_inaccurate_bound_is_the_central_difference(status):
         assert relative_error(f, args, gradient, along(part, *args, 0), 1e-5) <= 1e-6, part
 
 
-@pytest.mark.parametrize("status", rj.SolverStatus)
+@pytest.mark.parametrize("status", OF_SOLVERS)
 def test_a_claim_that_is_borne_out_has_the_gradient_of_the_optimum_whatever_the_status(status):
     loop, X0 = planar(0)
     solver = Stubborn(status)

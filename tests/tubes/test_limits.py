@@ -56,32 +56,47 @@ CALLS = {
 }
 
 
+def called(call, *given, **options):
+    """What a call gives; None if a limit left no time for anything to be proved."""
+    try:
+        return CALLS[call](*given, **options)
+    except ValueError as error:
+        if "time_limit" not in str(error):
+            raise
+        return None
+
+
 @pytest.mark.parametrize("call", CALLS)
 def test_a_limit_is_kept(switching, touching, call):
     began = time.monotonic()
-    CALLS[call](*switching, touching, time_limit=2.0)
+    called(call, *switching, touching, time_limit=2.0)
     assert time.monotonic() - began < 2.0 + PATIENCE
 
 
 @pytest.mark.parametrize("call", CALLS)
 def test_ctrl_c_ends_a_call_soon_and_keeps_what_was_found(switching, touching, call):
-    CALLS[call](*switching, touching, time_limit=0.5)  # what is compiled is compiled
+    called(call, *switching, touching, time_limit=0.5)  # what is compiled is compiled
     pressed = []
 
     def press():
         pressed.append(time.monotonic())
         os.kill(os.getpid(), signal.SIGINT)
 
-    timer = threading.Timer(2.0, press)
+    timer, stopped = threading.Timer(0.7, press), None
     timer.start()
-    with pytest.raises(KeyboardInterrupt) as stopped:
+    try:
         CALLS[call](*switching, touching)
-    late = time.monotonic() - pressed[0]
-    assert late < 1.0 + PATIENCE
-    if isinstance(stopped.value, rj.Interrupted):
-        found = pickle.loads(pickle.dumps(stopped.value)).found
-        assert type(found) is type(stopped.value.found)
-        assert str(stopped.value).startswith("interrupted")
+    except KeyboardInterrupt as error:
+        stopped = error
+    finally:
+        timer.cancel()  # nothing else is to be interrupted
+    if stopped is None:
+        pytest.skip("the call ended before it could be interrupted")
+    assert time.monotonic() - pressed[0] < 1.0 + PATIENCE
+    if isinstance(stopped, rj.Interrupted):
+        found = pickle.loads(pickle.dumps(stopped)).found
+        assert type(found) is type(stopped.found)
+        assert str(stopped).startswith("interrupted")
 
 
 WAYS = {

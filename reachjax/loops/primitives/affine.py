@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +15,7 @@ from reachjax.loops.primitives.equations import Equation, Rule, entrywise, on_ho
 from reachjax.loops.primitives.related import over_norm, over_sum
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import Reciprocal
-from reachjax.loops.values import Operand, UnsupportedError, Value, is_known
+from reachjax.loops.values import Operand, Parameter, UnsupportedError, Value, is_known
 
 
 def _linear(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
@@ -24,14 +25,21 @@ def _linear(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
         raise UnsupportedError("of its operands only one may depend on inputs")
     value = operands[where]
 
+    plain = [each for each in operands if each is not value]
+    bare = [np.asarray(each) if isinstance(each, Parameter) else each for each in operands]
+
     def of(flat: Any) -> Any:
-        given = [*operands]
+        given = [*bare]
         given[where] = flat.reshape(value.shape)
         return equation.evaluate(*given).reshape(-1)
 
-    matrix = jax.vmap(of)(jnp.eye(value.size)).T
-    if is_known(matrix) and all(on_host(each) for each in operands if each is not value):
+    # known numbers stay known where others are traced
+    with jax.ensure_compile_time_eval() if is_known(*plain) else contextlib.nullcontext():
+        matrix = jax.vmap(of)(jnp.eye(value.size)).T
+    if is_known(matrix) and all(map(on_host, plain)):
         matrix = np.asarray(matrix)
+        if any(isinstance(each, Parameter) for each in plain):
+            matrix = Parameter.of(matrix)
     return recorder.mapped(value, matrix, equation.shape)
 
 

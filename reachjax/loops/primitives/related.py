@@ -20,7 +20,7 @@ from reachjax.loops.combinations import LARGEST, Combination
 from reachjax.loops.limits import Limits
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import ISRU, Exp, Reciprocal, Softplus, Sqrt, Square, Tanh, Within
-from reachjax.loops.values import Term, Value
+from reachjax.loops.values import Term, Value, is_constant
 from reachjax.numerics.rounding import gamma
 
 TERMS = 96
@@ -35,10 +35,10 @@ three steps of a network with RMS norms of 12 numbers linear bounds were 0.272 w
 
 
 class Entries(NamedTuple):
-    """Entries `value[index]` of a value; what a step picks is that of the step before."""
+    """Entries `value[numbers]` of a value; what a step picks is that of the step before."""
 
     value: Value
-    index: Int[np.ndarray, " k"]
+    numbers: Int[np.ndarray, " k"]
 
 
 def _entries(value: Value) -> Entries:
@@ -49,10 +49,15 @@ def _levels(value: Value) -> Iterator[tuple[Value, list[Term]]]:
     """A value, and each that it is a multiple of, with the factors and divisors in between."""
     found: list[Term] = []
     yield value, found
-    while value.terms is not None and len(value.terms) == 1 and not np.any(value.offset):
+    while value.terms is not None and len(value.terms) == 1 and _is_nothing(value.offset):
         found = [*found, *value.terms]
         value = found[-1].value
         yield value, found
+
+
+def _is_nothing(offset: Any) -> bool:
+    """Whether an offset is zero, whatever the parameters are."""
+    return is_constant(offset) and not np.any(offset)
 
 
 def _scaled(recorder: Recorder, value: Value, terms: Sequence[Term]) -> Value:
@@ -73,7 +78,7 @@ def _inputs(recorder: Recorder, entries: Entries, kind: type) -> Entries | None:
     if step is None or not isinstance(step.unit, kind):
         return None
     inner, before = _entries(recorder.values[step.parents[0]])
-    return Entries(inner, before[entries.index])
+    return Entries(inner, before[entries.numbers])
 
 
 def over_norm(recorder: Recorder, one: Value, other: Value) -> Value | None:
@@ -83,7 +88,7 @@ def over_norm(recorder: Recorder, one: Value, other: Value) -> Value | None:
         inner = root and _inputs(recorder, root, Sqrt)
         if not inner or one.size * inner.value.size > LARGEST**2:
             continue
-        squares = Combination.of(recorder, inner.value)[inner.index]
+        squares = Combination.of(recorder, inner.value)[inner.numbers]
         for number, more in _levels(one):
             found = _without_own(recorder, squares, _entries(number))
             if found is not None:
@@ -129,7 +134,7 @@ def _without_own(
 
     None unless each has its own, and the rest is positive whatever the inputs are.
     """
-    weights, rest = np.zeros(len(own.index)), {}
+    weights, rest = np.zeros(len(own.numbers)), {}
     for place, matrix in squares.parts.items():
         value, step, matrix = recorder.values[place], recorder.steps[place], matrix.copy()
         if np.any(matrix < 0) or not recorder.is_nonnegative(value):
@@ -137,7 +142,7 @@ def _without_own(
         if step is not None and isinstance(step.unit, Square):
             base, index = _entries(recorder.values[step.parents[0]])
             if base.place == own.value.place:
-                same = own.index[:, None] == index
+                same = own.numbers[:, None] == index
                 weights += np.where(same, matrix, 0.0).sum(axis=1)
                 matrix[same] = 0.0
         rest[place] = matrix
@@ -157,12 +162,13 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
     mine: Combination | None = None
     more: list[Term] = []
     if not isinstance(one, Value):
-        mine = Combination({}, np.zeros(other.size)) if np.all(one == 1) else None
+        is_one = is_constant(one) and bool(np.all(one == 1))
+        mine = Combination({}, np.zeros(other.size)) if is_one else None
     else:
         for number, factors in _levels(one):
             own = _inputs(recorder, _entries(number), Exp)
             if own is not None:
-                mine, more = Combination.of(recorder, own.value)[own.index], factors
+                mine, more = Combination.of(recorder, own.value)[own.numbers], factors
                 break
     if mine is None:
         return None
@@ -187,8 +193,8 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
 def of_sum(recorder: Recorder, value: Value) -> Value | None:
     """The logarithm of a sum of exponentials; None if it is of something else."""
     terms = _exponents(recorder, value)
-    columns = terms and _columns(terms)
-    if not columns or len(columns) < 2:
+    columns = None if terms is None else _columns(terms)
+    if columns is None or len(columns) < 2:
         return None
     first, logarithm = _logarithm(recorder, columns)
     logarithm = recorder.reshaped(logarithm, value.shape)

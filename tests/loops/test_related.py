@@ -1,0 +1,91 @@
+"""Numbers that know each other: quotients by norms and by sums, and logarithms of sums.
+
+What bounds say of a numerator and of a denominator is forgotten in their product; what they have in
+common is not. Widths are compared with those of samples, and every sample is inside.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+
+RNG = np.random.default_rng(0)
+WEIGHTS = [jnp.asarray(RNG.normal(size=shape) / 2) for shape in ((6, 2), (6, 6), (1, 6))]
+
+
+def layer_norm(y):
+    return (y - y.mean()) / jnp.sqrt(y.var() + 1e-5)
+
+
+def rms_norm(y):
+    return y / jnp.sqrt(jnp.mean(y * y) + 1e-5)
+
+
+def huber(v):
+    """A friction that is nearly a sign."""
+    return -0.3 * v / jnp.sqrt(v * v + 1e-4)
+
+
+def normed(norm):
+    first, second, last = WEIGHTS
+    return lambda x: last @ jax.nn.relu(norm(second @ jax.nn.relu(norm(first @ x + 0.3))))
+
+
+def friction(x, u):
+    return jnp.stack([x[0] + 0.1 * x[1], x[1] + 0.1 * (huber(x[1]) - x[0] + u[0])])
+
+
+def drawn_in(x, u):
+    return jnp.stack([x[0] + 0.1 * x[1], x[1] + 0.1 * u[0]])
+
+
+def of_x(function):
+    return lambda x, u: jnp.broadcast_to(function(x), (2,))
+
+
+def unit_vector(x):
+    return x / jnp.sqrt(x @ x + 0.1)
+
+
+def scaled(s, x, u):
+    return s * jax.nn.softmax(s * x + s) + s / (2 + x**2)
+
+
+AROUND, BESIDE = ([-0.2, -0.2], [0.2, 0.2]), ([0.4, 0.2], [0.6, 0.4])
+SMALL = [-0.1] * 2, [0.1] * 2
+FORMS = rj.LinearBounds()
+CASES = {
+    "friction": (friction, AROUND, 4, rj.BranchAndCut(), None, 1.01),
+    "friction by forms": (friction, AROUND, 1, FORMS, None, 1.2),
+    "layer norm": (drawn_in, BESIDE, 3, rj.BranchAndCut(), normed(layer_norm), 1.01),
+    "RMS norm": (drawn_in, SMALL, 2, rj.BranchAndCut(), normed(rms_norm), 1.2),
+    "unit vector": (of_x(unit_vector), AROUND, 1, FORMS, None, 1.05),
+    "softmax": (of_x(lambda x: jax.nn.softmax(50 * x)), SMALL, 1, FORMS, None, 1.05),
+    "logarithm of a sum": (of_x(jax.nn.logsumexp), AROUND, 1, FORMS, None, 1.05),
+    "log softmax": (of_x(jax.nn.log_softmax), AROUND, 1, FORMS, None, 1.05),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_quotients_are_bounded_by_what_their_parts_have_in_common(name):
+    step, ends, horizon, relaxation, network, most = CASES[name]
+    controller = rj.Network(network or (lambda x: -x[:1]), inputs=2, outputs=1)
+    loop, X0 = rj.ClosedLoop(rj.NonlinearPlant(step, 2, 1), controller), rj.Box(*ends)
+    region = rj.reach(loop, X0, horizon, rj.Template.box(2), relaxation).sets[horizon]
+    starts = jnp.concatenate([X0.sample(jax.random.key(0), 4000), X0.corners()])
+    values = np.asarray(loop.simulate(starts, horizon)[:, horizon] @ np.asarray(region.A).T)
+    assert np.all(values <= np.asarray(region.b))
+    widths = np.asarray(region.b[::2] + region.b[1::2])
+    sampled = np.max(values[:, ::2], axis=0) + np.max(values[:, 1::2], axis=0)
+    assert np.all(widths <= most * sampled), widths / sampled
+
+
+def test_traced_parameters_beside_a_quotient_are_recorded_alike():
+    def bound(scale):
+        plant = rj.NonlinearPlant(jax.tree_util.Partial(scaled, scale), 2, 1)
+        loop = rj.ClosedLoop(plant, rj.Network(lambda x: -x[:1], inputs=2, outputs=1))
+        return rj.reach(loop, rj.Box(*AROUND), 1, rj.Template.box(2), FORMS).sets[1].b
+
+    np.testing.assert_allclose(jax.jit(bound)(1.5), bound(1.5), rtol=1e-9)

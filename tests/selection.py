@@ -13,8 +13,13 @@ import jax
 import numpy as np
 import pytest
 
-ELSEWHERE = "tests/experiments", "tests/test_notebooks.py", "tests/test_docs.py"
-"""Claims about the experiments, the notebooks and the site, which are not about the library."""
+ELSEWHERE = (
+    "tests/experiments",
+    "tests/test_notebooks.py",
+    "tests/test_docs.py",
+    "tests/solvers/test_diffcp.py",
+)
+"""Claims about experiments, notebooks and site, and comparisons with a library of `[dev]`."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 from typing import Any
 
-import numpy as np
-
 from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import (
     owned,
@@ -20,9 +18,7 @@ from reachjax.numerics.storage import read
 from reachjax.tubes.kept import Kept
 from reachjax.tubes.partitions import Bar, PartitionedTube
 from reachjax.tubes.reach import ReachTube
-
-ROUNDING = 1e-9
-"""Of a bound's size: what a recheck may differ by on another machine."""
+from reachjax.tubes.rechecks import Recheck, require_partition
 
 MISSING = (
     "was written without its loop, whose functions cannot be stored: give the loop again, "
@@ -70,17 +66,32 @@ def load(
     if not isinstance(kept, Kept) or not isinstance(kept.tube, ReachTube | PartitionedTube):
         raise ValueError(f"{path} must hold a tube, but something else arrived")
     tube = _sealed(kept.tube)
-    tubes = tube.tubes if isinstance(tube, PartitionedTube) else (tube,)
     if loop is not None and not kept.is_of(loop):
         raise ValueError(
             f"loop must be that of the tube in {path}, with the same equations and numbers, but "
             "another one arrived (or another version of JAX, which writes its equations otherwise)"
         )
-    if recheck:
-        steps = [(each, t) for each in tubes for t in range(1, each.horizon + 1)]
-        for each, t in wrapped(progress, steps):
-            _require_proved(each, t)
-    return tube
+    return _rechecked(tube, progress) if recheck else tube
+
+
+def _rechecked(tube: ReachTube | PartitionedTube, progress: Bar | None) -> Any:
+    """The tube as it is proved anew.
+
+    Raises:
+        DisagreementError: it says what is not proved.
+        ValueError: the progress bar leaves out steps.
+    """
+    parts = tube.tubes if isinstance(tube, PartitionedTube) else (tube,)
+    if isinstance(tube, PartitionedTube):
+        require_partition(tube)
+    steps = [each for each in map(Recheck, parts) for _ in range(each.left)]
+    for each in wrapped(progress, steps):
+        each.advance()
+    done = {id(each): each for each in steps}
+    found = tuple(each.finished() for each in done.values())
+    if isinstance(tube, PartitionedTube):
+        return PartitionedTube.sealed(tube.X0, found)
+    return found[0]
 
 
 def _sealed(tube: Any) -> ReachTube | PartitionedTube:
@@ -88,16 +99,3 @@ def _sealed(tube: Any) -> ReachTube | PartitionedTube:
     if isinstance(tube, PartitionedTube):
         return PartitionedTube.sealed(tube.X0, tuple(map(_sealed, tube.tubes)))  # type: ignore[arg-type]
     return ReachTube.sealed(tube.loop, tube.template, tube.sets, tube.certificates, tube.start)
-
-
-def _require_proved(tube: ReachTube, t: int) -> None:
-    proof = tube.proof(t)
-    bounds, again = np.asarray(proof.bounds), np.asarray(proof.recheck())
-    size = np.fmax(abs(bounds), abs(np.asarray(proof.gaps)))
-    missing = ~(again <= bounds + ROUNDING * size) & np.isfinite(bounds)
-    if np.any(missing):
-        facet = int(np.flatnonzero(missing)[0])
-        raise ValueError(
-            f"the recheck of step {t} proves {again[facet]:g} for facet {facet}, but the tube says "
-            f"{bounds[facet]:g}: it was computed for another loop, or by another version"
-        )

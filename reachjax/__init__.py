@@ -95,6 +95,7 @@ from reachjax.tubes.loading import load
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
 from reachjax.tubes.plotting import plot_cells, plot_set, plot_tube
 from reachjax.tubes.reach import ReachTube, reach, reach_step
+from reachjax.tubes.rechecks import DisagreementError
 from reachjax.tubes.requirements import shortfall
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.tubes.soundness import UnsoundError
@@ -150,6 +151,7 @@ __all__ = [
     "CuttingPlanes",
     "CvxpySolver",
     "DecidedCell",
+    "DisagreementError",
     "Ellipsoid",
     "EllipsoidCertificate",
     "EllipsoidTemplate",

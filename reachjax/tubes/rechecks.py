@@ -146,17 +146,16 @@ class Recheck:
             proof = proof.replace(bounds=jnp.asarray(raised))
             if flat is not None:
                 flat = Polytope(flat.facets[0], proof.bounds[: len(offsets)])
-        if ball is not None:
-            own: Any = proof
-            level = own.level * raised[-1]
-            made = Ellipsoid.enclosing(own.form, level)
-            if not _alike(own.form.A, level, ball, made):
-                raise DisagreementError(f"the ellipsoid of sets[{k}] is not its certificate's", k)
-            ball = made
-            if raised[-1] > 1:
-                proof = own.replace(level=level, bounds=proof.bounds.at[-1].set(1.0))
-        parts = [part for part in (flat, ball) if part is not None]
-        return (parts[0] if len(parts) == 1 else Intersection(*parts)), proof
+        if ball is None:
+            return flat or region, proof
+        own: Any = proof
+        level = own.level * raised[-1]
+        made = Ellipsoid.enclosing(own.form, level)
+        if not _alike(own.form.A, level, ball, made):
+            raise DisagreementError(f"the ellipsoid of sets[{k}] is not its certificate's", k)
+        if raised[-1] > 1:
+            proof = own.replace(level=level, bounds=own.bounds.at[-1].set(1.0))
+        return made if flat is None else Intersection(flat, made), proof
 
     def _sizes(self, k: int, region: AbstractSet) -> np.ndarray:
         """The size of what facets add up on a few trajectories; 1 of an ellipsoid."""

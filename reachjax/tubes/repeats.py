@@ -73,7 +73,10 @@ class Repeat:
         """
         tube = self._tube
         own: dict[str, Any] = {"loop": tube.loop, "X0": tube.sets[0], "k": k, "start": tube.start}
-        own["directions"] = getattr(tube.template.at(k), "directions", None)
+        own["directions"] = self._directions(k)
+        if isinstance(proof, LinearCertificate | CellCertificate):
+            if (proof.k, proof.start) != (k, tube.start):
+                raise ValueError(f"it is of step {proof.k} from t = {proof.start}")
         if isinstance(proof, LinearCertificate):
             *_, last = (p for p in tube.certificates if isinstance(p, LinearCertificate))
             slopes = np.asarray(last.slopes)
@@ -93,6 +96,10 @@ class Repeat:
             raise TypeError(f"{type(proof).__name__} proves no set of a tube")
         return proof, np.asarray(proof.recheck())
 
+    def _directions(self, k: int) -> Any:
+        """Those of the facets of the set after `k` steps; None of ellipsoids."""
+        return getattr(self._tube.template.at(k), "directions", None)
+
     @cached_property
     def _box(self) -> Any:
         return boxed(self._tube.sets[0], "X0")
@@ -104,11 +111,12 @@ class Repeat:
         tube, forms = self._tube, self._forms
         if forms.key != key or forms.taken >= k:
             steps = range(1, tube.horizon + 1 if slopes is None else len(slopes) + 1)
-            directions = np.stack([np.asarray(tube.template.at(j).directions) for j in steps])
-            given = directions, tube.start, slopes
+            directions = np.stack([np.asarray(self._directions(j)) for j in steps])
+            given: Any = directions, tube.start, slopes
             forms = _Unrolled(key, [unrolled(tube.loop, *part, *given) for part in parts])
+        found = list[np.ndarray]()
         for _ in range(forms.taken, k):
-            found = [next(each).offsets for each in forms.parts]
+            found = [np.asarray(next(each).offsets) for each in forms.parts]
         self._forms = forms._replace(taken=k)
         return np.max(np.where(np.isnan(found), np.inf, found), axis=0)
 
@@ -127,7 +135,7 @@ class Repeat:
             if done:
                 ladder.narrow(self._sets[done])
             ladder.repeat(tube.proof(done + 1))
-        directions = tube.template.at(k).directions
+        directions = self._directions(k)
         about = ladder.about(np.asarray(directions) @ ladder.horizon.state)
         products = proof.products
         if products is not None:

@@ -41,6 +41,7 @@ from reachjax.loops import (
     runge_kutta,
     zero_order_hold,
 )
+from reachjax.numerics.archives import UnreadableError
 from reachjax.numerics.compilations import keep_compilations
 from reachjax.programs.basis import ChangeOfBasis, change_of_basis
 from reachjax.programs.relaxations import (
@@ -190,6 +191,7 @@ __all__ = [
     "Square",
     "Tanh",
     "Template",
+    "UnreadableError",
     "UnsoundError",
     "Verdict",
     "VerdictStatus",

@@ -74,9 +74,9 @@ class Repeat:
         tube = self._tube
         own: dict[str, Any] = {"loop": tube.loop, "X0": tube.sets[0], "k": k, "start": tube.start}
         own["directions"] = self._directions(k)
-        if isinstance(proof, LinearCertificate | CellCertificate):
-            if (proof.k, proof.start) != (k, tube.start):
-                raise ValueError(f"it is of step {proof.k} from t = {proof.start}")
+        by_forms = isinstance(proof, LinearCertificate | CellCertificate)
+        if by_forms and (proof.k, proof.start) != (k, tube.start):
+            raise ValueError(f"it is of step {proof.k} from t = {proof.start}")
         if isinstance(proof, LinearCertificate):
             *_, last = (p for p in tube.certificates if isinstance(p, LinearCertificate))
             slopes = np.asarray(last.slopes)

@@ -56,14 +56,17 @@ def _box_of(part: AbstractSet, X: AbstractSet) -> Ends | None:
     """A box of which a part holds all that the set has there; None if none is seen."""
     if not _same_ball(part, X):
         return None
-    normals, offsets = (np.asarray(each) for each in part.facets)
-    holding = offsets >= np.asarray(X.support(normals))
-    normals, offsets = normals[~holding], offsets[~holding]
+    own = np.column_stack(X.facets)
     n = X.dimension
     ends = np.stack([np.full(n, -np.inf), np.full(n, np.inf)])
-    for normal, offset in zip(normals, offsets, strict=True):
+    for row in np.column_stack(part.facets):
+        normal, offset = row[:-1], row[-1]
+        if (own == row).all(axis=1).any():
+            continue
         (there,) = np.nonzero(normal)
         if len(there) != 1 or abs(normal[there[0]]) != 1.0:
+            if offset >= X.support(normal[None])[0]:
+                continue
             return None
         i, side = there[0], int(normal[there[0]] > 0)
         ends[side, i] = min(ends[side, i], offset) if side else max(ends[side, i], -offset)

@@ -13,7 +13,7 @@ import dataclasses
 import enum
 import importlib
 import importlib.metadata
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,7 @@ class Writer:
         self.left_out = False
         self._outside = outside
         self._known: dict[int, tuple[Any, int]] = {}
+        self._numbers: dict[str, int] = {}
 
     def described(self, value: Any) -> Any:
         """A value as plain data, its arrays by their numbers.
@@ -91,8 +92,11 @@ class Writer:
 
     def _placed(self, array: Any) -> int:
         if id(array) not in self._known:
-            self._known[id(array)] = array, len(self.arrays)  # kept alive: numbers stay its own
-            self.arrays.append(np.asarray(array))
+            held = np.asarray(array)
+            number = self._numbers.setdefault(digest(None, [held]), len(self.arrays))
+            self._known[id(array)] = array, number  # kept alive: no other one has its place
+            if number == len(self.arrays):
+                self.arrays.append(held)
         return self._known[id(array)][1]
 
     def _object(self, value: Any) -> Any:
@@ -153,54 +157,91 @@ def _restorable(name: str) -> Any:
     return found
 
 
-def _read(described: Any, arrays: list[np.ndarray], outside: Any) -> Any:
-    """The value of plain data."""
-    if described is None or isinstance(described, PLAIN):
-        return described
+class Reader:
+    """Objects on their way out of a file; what is there more than once is one object again.
 
-    def read(each: Any) -> Any:
-        return _read(each, arrays, outside)
+    Args:
+        arrays: by their numbers.
+        outside: takes the place of objects that were left out.
+    """
 
-    match described:
-        case {"enum": name, "member": member}:
-            return _enumeration(name)[member]
-        case {"bytes": text}:
-            return base64.b64decode(text)
-        case {"array": number, "on": where}:
-            return jax.device_put(arrays[number]) if where else arrays[number]
-        case {"outside": _}:
-            return outside
-        case {"named": name, "parts": parts}:
-            made = _named_tuple(name)(*map(read, parts))
-            require_structure(type(made), made._asdict())
-            return made
-        case {"tuple": parts}:
-            return tuple(map(read, parts))
-        case {"list": parts}:
-            return [*map(read, parts)]
-        case {"mapping": items}:
-            return {read(key): read(each) for key, each in items}
-        case {"stored": name, "as": parts}:
-            return _restorable(name).restored(read(parts))
-        case {"object": name, "fields": fields}:
-            return _rebuilt(_class(name), {str(key): read(fields[key]) for key in fields})
-    raise ValueError(f"it describes {described!r:.60}, which is unknown")
+    def __init__(self, arrays: Sequence[np.ndarray], outside: Any):
+        self._arrays, self._outside = arrays, outside
+        self._known: dict[Any, tuple[Any, Any]] = {}
+
+    def value(self, described: Any) -> Any:
+        """The value of plain data.
+
+        Raises:
+            Exception: of any kind: it describes nothing that there is.
+        """
+        if described is None or isinstance(described, PLAIN):
+            return described
+        match described:
+            case {"enum": name, "member": member}:
+                return _enumeration(name)[member]
+            case {"bytes": text}:
+                return base64.b64decode(text)
+            case {"array": number, "on": where}:
+                return self._once("on" if where else "off", self._placed, number)
+            case {"outside": _}:
+                return self._outside
+            case {"named": name, "parts": parts}:
+                return self._once(_named_tuple(name), _named, *map(self.value, parts))
+            case {"tuple": parts}:
+                return self._once(tuple, _tuple, *map(self.value, parts))
+            case {"list": parts}:
+                return [*map(self.value, parts)]
+            case {"mapping": items}:
+                return {self.value(key): self.value(each) for key, each in items}
+            case {"stored": name, "as": parts}:
+                return self._once(_restorable(name), _restored, self.value(parts))
+            case {"object": name, "fields": fields}:
+                values = map(self.value, fields.values())
+                return self._once((_class(name), *fields), _rebuilt, *values)
+        raise ValueError(f"it describes {described!r:.60}, which is unknown")
+
+    def _once(self, kind: Any, make: Callable[..., Any], *parts: Any) -> Any:
+        """What is made of parts, the same if it was made of them before."""
+        key = kind, *(repr(part) if isinstance(part, PLAIN) else id(part) for part in parts)
+        if key not in self._known:
+            self._known[key] = parts, make(kind, *parts)  # kept alive: no other one has their place
+        return self._known[key][1]
+
+    def _placed(self, where: str, number: int) -> Any:
+        array = self._arrays[number]
+        return jax.device_put(array) if where == "on" else array
 
 
-def _rebuilt(kind: Any, fields: dict[str, Any]) -> Any:
+def _tuple(kind: Any, *parts: Any) -> tuple[Any, ...]:
+    return parts
+
+
+def _named(kind: Any, *parts: Any) -> Any:
+    made = kind(*parts)
+    require_structure(kind, made._asdict())
+    return made
+
+
+def _restored(kind: Any, parts: Any) -> Any:
+    return kind.restored(parts)
+
+
+def _rebuilt(named: tuple[Any, ...], *values: Any) -> Any:
     """An object as it was, down to the last bit, if a user might have made it.
 
     What a class has got since a file was written is as it is by default.
     """
+    kind, *names = named
     if not hasattr(kind, "__dataclass_fields__"):
         raise ValueError(f"it names {kind.__qualname__}, which has no fields")
     known = dataclasses.fields(kind)
     later = {f.name: f.default for f in known if f.default is not dataclasses.MISSING}
-    fields = later | fields
-    expected = {f.name for f in known}
-    if expected != set(fields):
-        differ = sorted(expected ^ set(fields))
-        raise ValueError(f"its {kind.__qualname__} has other fields than this version's: {differ}")
+    fields = later | dict(zip(names, values, strict=True))
+    if differ := {f.name for f in known} ^ set(fields):
+        raise ValueError(
+            f"its {kind.__qualname__} has other fields than this version's: {sorted(differ)}"
+        )
     require_structure(kind, fields)
     if SEAL not in fields:  # else the parts are checked where they are sealed again
         kind(**{f.name: fields[f.name] for f in known if f.init})
@@ -249,7 +290,7 @@ def read(path: Path, outside: Any, missing: str) -> Any:
     if head.get("left_out") and outside is None:
         raise UnreadableError(f"{path} {missing}")
     try:
-        return _read(head["value"], arrays, outside)
+        return Reader(arrays, outside).value(head["value"])
     except Exception as error:  # whoever wrote it may have written anything
         raise UnreadableError(f"{path} cannot be read: {_said(error)}") from error
 

@@ -33,6 +33,9 @@ class Entry(NamedTuple):
 Scalar = Entry | Fraction
 
 
+ONE = Fraction(1)
+
+
 class Product(NamedTuple):
     """`sign one other`, a term of a sum."""
 
@@ -58,9 +61,26 @@ def entries(recorder: Recorder, operand: Operand) -> np.ndarray:
                 limits.least.tolist(), known.tolist(), numbers.tolist(), strict=True
             )
         ]
-    array = np.empty(len(found), object)
-    array[:] = found
-    return array.reshape(shape)
+    return row_of(found).reshape(shape)
+
+
+def row_of(scalars: Sequence[Scalar]) -> np.ndarray:
+    """Scalars as an array of objects."""
+    found = np.empty(len(scalars), object)
+    found[:] = scalars
+    return found
+
+
+def zeros(*shape: int) -> np.ndarray:
+    """An array of zeros."""
+    return np.full(shape, Fraction(0), object)
+
+
+def identity(n: int) -> np.ndarray:
+    """The identity matrix."""
+    found = zeros(n, n)
+    np.fill_diagonal(found, ONE)
+    return found
 
 
 def varying(recorder: Recorder, operand: Operand) -> Value:
@@ -93,7 +113,7 @@ def as_value(recorder: Recorder, scalars: np.ndarray) -> Any:
     constants = [each if isinstance(each, Fraction) else Fraction(0) for each in flat]
     if not own:
         return _floats(constants).reshape(scalars.shape)
-    (index,) = np.nonzero([isinstance(each, Entry) for each in flat])
+    (index,) = np.nonzero(np.array([isinstance(each, Entry) for each in flat]))
     found = gathered(recorder, own)
     if len(own) < len(flat):
         matrix = np.zeros((len(flat), len(own)))
@@ -105,8 +125,8 @@ def as_value(recorder: Recorder, scalars: np.ndarray) -> Any:
 def sums(recorder: Recorder, rows: Iterable[Iterable[Product]]) -> list[Scalar]:
     """Sums of products."""
     offsets: list[Fraction] = []
-    products: dict[tuple[Entry, Entry], None] = {}
-    multiples: dict[tuple[Entry, Fraction], None] = {}
+    products: dict[Any, None] = {}
+    multiples: dict[Any, None] = {}
     terms: list[list[tuple[int, Any]]] = []
     for row in rows:
         offset, mine = Fraction(0), []

@@ -1,17 +1,20 @@
 """Systems of linear equations whose matrices depend on the inputs: inverses, solves, factors.
 
 What LAPACK computes by pivoting is in exact arithmetic the solution, whatever the pivots are; that
-is what is recorded, as determinants over a determinant (Cramer's rule), so that nothing but this
-one must keep away from zero. A matrix is first brought to block triangular form by where its zeros
-are (Dulmage and Mendelsohn, Coverings of bipartite graphs, 1958), so that blocks are solved one
-after the other. How far floats of LAPACK are from the solution is rounding of a simulation, as that
-of sums and products is, and no part of what is certified.
+is what is recorded: an inverse times what is on the right. Most of what entries and a determinant
+have in common cancels in an inverse, and is lost where they meet numbers of both signs before it:
+linear bounds of an arm of three links were 1.2 times as wide as what was sampled by inverses, and
+10 times by Cramer's rule.
+
+A matrix is first brought to block triangular form by where its zeros are (Dulmage and Mendelsohn,
+Coverings of bipartite graphs, 1958), so that blocks are solved one after the other. How far floats
+of LAPACK are from the solution is rounding of a simulation, as that of sums and products is, and no
+part of what is certified.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from fractions import Fraction
 from typing import Any
 
 import jax
@@ -22,30 +25,26 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
 
 from reachjax.loops.primitives.entries import (
-    Entry,
+    ONE,
     Product,
     Scalar,
     as_value,
     entries,
-    gathered,
+    identity,
+    row_of,
     sums,
     varying,
+    zeros,
 )
 from reachjax.loops.primitives.equations import Equation, Rule
+from reachjax.loops.primitives.inverses import Block, block_of, inverse, less, reciprocals
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import equations
-from reachjax.loops.units import Origin, Reciprocal, Sqrt
+from reachjax.loops.units import Sqrt
 from reachjax.loops.values import Operand, Unknown, UnsupportedError
 
 LARGEST = 6
 """Blocks of more rows have too many minors: 434 products are those of six rows."""
-
-SINGULAR = Origin(
-    "the inverse of a matrix",
-    "divides by a determinant in",
-    "keep the matrix away from singular ones",
-)
-"""What is wrong where a determinant may be zero."""
 
 PIVOTS = (
     "an LU factorisation takes the largest pivots, so that its factors jump where these change: "
@@ -55,8 +54,6 @@ PIVOTS = (
 
 MOVES = ("dot_general", "transpose", "reshape", "broadcast_in_dim", "squeeze", "reduce_sum", "jit")
 """Primitives of products of a matrix and a vector that JAX's own solvers are made of."""
-
-ONE = Fraction(1)
 
 
 def _solved(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
@@ -72,7 +69,7 @@ def _solved(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
     if not b.size:
         return [as_value(recorder, b)]
     places = _places(bodies.matvec, matrix.shape, b.shape)
-    A = np.full(places.shape, Fraction(0), object)
+    A = zeros(*places.shape)
     A[places > 0] = matrix.ravel()[places[places > 0] - 1]
     return [as_value(recorder, solution(recorder, A, b.ravel()).reshape(b.shape))]
 
@@ -102,9 +99,9 @@ def _triangular(recorder: Recorder, equation: Equation, operands: Sequence[Opera
     params, (factor, right) = equation.params, operands
     L, B = entries(recorder, factor), entries(recorder, right)
     lower = np.tri(L.shape[-1], dtype=bool)
-    L = np.where(lower if params["lower"] else lower.T, L, Fraction(0))
+    L = np.where(lower if params["lower"] else lower.T, L, zeros(1))
     if params["unit_diagonal"]:
-        L = np.where(np.eye(L.shape[-1], dtype=bool), ONE, L)
+        L = np.where(np.eye(L.shape[-1], dtype=bool), identity(L.shape[-1]), L)
     if params["transpose_a"]:
         L = L.swapaxes(-1, -2)
     if not params["left_side"]:
@@ -119,7 +116,7 @@ def _each(recorder: Recorder, A: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """The solutions of `A x = b` for each column `b`, `(*batch, m, n)`, at once."""
     n, count = A.shape[-1], columns.size // max(A.shape[-1], 1)
     matrices = np.broadcast_to(A[..., None, :, :], (*columns.shape, n)).reshape(count, n, n)
-    whole = np.full((count, n, count, n), Fraction(0), object)
+    whole = zeros(count, n, count, n)
     for k in range(count):
         whole[k, :, k] = matrices[k]
     found = solution(recorder, whole.reshape(count * n, count * n), columns.ravel())
@@ -130,7 +127,7 @@ def _cholesky(recorder: Recorder, equation: Equation, operands: Sequence[Operand
     """`L` with `L L' = A`, of which only the lower triangle is read."""
     A = entries(recorder, operands[0])
     n, batch = A.shape[-1], A.reshape(-1, *A.shape[-2:])
-    L = np.full(batch.shape, Fraction(0), object)
+    L = zeros(*batch.shape)
     for j in range(n):
         rows = [(k, i) for k in range(len(batch)) for i in range(j, n)]
         left = sums(
@@ -145,9 +142,9 @@ def _cholesky(recorder: Recorder, equation: Equation, operands: Sequence[Operand
         )
         squares = [each for each, (_, i) in zip(left, rows, strict=True) if i == j]
         pivots = _roots(recorder, squares)
-        inverses = _inverses(recorder, pivots)
+        ratios = reciprocals(recorder, pivots)
         below = [(k, i, each) for each, (k, i) in zip(left, rows, strict=True) if i > j]
-        made = sums(recorder, ([Product(1, each, inverses[k])] for k, _, each in below))
+        made = sums(recorder, ([Product(1, each, ratios[k])] for k, _, each in below))
         L[:, j, j] = pivots
         for (k, i, _), each in zip(below, made, strict=True):
             L[k, i, j] = each
@@ -155,7 +152,7 @@ def _cholesky(recorder: Recorder, equation: Equation, operands: Sequence[Operand
 
 
 def _roots(recorder: Recorder, squares: Sequence[Scalar]) -> list[Scalar]:
-    value = varying(recorder, as_value(recorder, _row(squares)))
+    value = varying(recorder, as_value(recorder, row_of(squares)))
     return [*entries(recorder, recorder.unit(Sqrt(), value))]
 
 
@@ -175,29 +172,25 @@ def solution(recorder: Recorder, A: np.ndarray, b: np.ndarray) -> np.ndarray:
     Raises:
         UnsupportedError: a block of it is too large, or is singular whatever the inputs are.
     """
-    x = np.full(len(b), Fraction(0), object)
+    x = zeros(len(b))
     for blocks in _levels(A != 0):
         rows, columns = (np.concatenate(each) for each in zip(*blocks, strict=True))
         done = [j for j in range(len(b)) if j not in {*columns} and np.any(A[rows, j] != 0)]
-        rest = sums(
-            recorder,
-            (
-                [Product(1, b[i], ONE), *(Product(-1, A[i, j], x[j]) for j in done if A[i, j])]
-                for i in rows
-            ),
-        )
-        ends = np.cumsum([len(each) for each, _ in blocks])[:-1]
-        parts = np.split(_row(rest), ends)
-        systems = [(A[np.ix_(*each)], part) for each, part in zip(blocks, parts, strict=True)]
-        for (_, mine), found in zip(blocks, _by_determinants(recorder, systems), strict=True):
-            x[mine] = found
+        rest = less(recorder, b[rows, None], A[rows][:, done], x[done, None]).ravel()
+        known = dict(zip(rows.tolist(), rest, strict=True))
+        inverses: dict[Block, np.ndarray] = {}
+        products, places = [], []
+        for mine, its in blocks:
+            block = block_of(A[np.ix_(mine, its)])
+            if block not in inverses:
+                inverses[block] = inverse(recorder, block)
+            for row, column in zip(inverses[block], its, strict=True):
+                products.append(
+                    [Product(1, each, known[i]) for each, i in zip(row, mine, strict=True)]
+                )
+                places.append(column)
+        x[places] = row_of(sums(recorder, products))
     return x
-
-
-def _row(scalars: Sequence[Scalar]) -> np.ndarray:
-    found = np.empty(len(scalars), object)
-    found[:] = scalars
-    return found
 
 
 def _levels(there: np.ndarray) -> list[list[tuple[np.ndarray, np.ndarray]]]:
@@ -226,69 +219,6 @@ def _levels(there: np.ndarray) -> list[list[tuple[np.ndarray, np.ndarray]]]:
         found.append([(each, column[each]) for each in rows])
         left[free] = False
     return found
-
-
-Block = tuple[tuple[Scalar, ...], ...]
-
-
-def _by_determinants(
-    recorder: Recorder, systems: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> list[np.ndarray]:
-    """The solutions of systems by Cramer's rule; minors that several need are made once."""
-    tops: list[list[Block]] = []
-    for A, b in systems:
-        whole, n = np.column_stack([A, b]), len(b)
-        kept = [[*range(j), *range(j + 1, n + 1)] for j in (n, *range(n))]
-        tops.append([tuple(map(tuple, whole[:, each])) for each in kept])
-    found = _determinants(recorder, [each for top in tops for each in top])
-    dets = [found[top[0]] for top in tops]
-    inverses = _inverses(recorder, dets)
-    rows = []
-    for top, inverse in zip(tops, inverses, strict=True):
-        n = len(top) - 1
-        for j, block in enumerate(top[1:]):
-            rows.append([Product((-1) ** (n - 1 - j), found[block], inverse)])
-    ends = np.cumsum([len(b) for _, b in systems])[:-1]
-    return np.split(_row(sums(recorder, rows)), ends)
-
-
-def _inverses(recorder: Recorder, numbers: Sequence[Scalar]) -> list[Scalar]:
-    """Inverses of numbers, none of which may be zero."""
-    if any(each == 0 for each in numbers):
-        raise UnsupportedError("its matrix is singular, whatever the inputs are")
-    own = sorted({each for each in numbers if isinstance(each, Entry)})
-    found: dict[Scalar, Scalar] = {each: 1 / each for each in numbers if isinstance(each, Fraction)}
-    if own:
-        value = recorder.unit(Reciprocal(origin=SINGULAR), gathered(recorder, own))
-        found.update(zip(own, entries(recorder, value), strict=True))
-    return [found[each] for each in numbers]
-
-
-def _determinants(recorder: Recorder, wanted: Sequence[Block]) -> dict[Block, Scalar]:
-    """Determinants, by their minors of the first rows: from one row to all."""
-    needed: list[dict[Block, list[tuple[int, Scalar, Block]]]] = []
-    todo = {*wanted}
-    while todo:
-        terms = {block: _expanded(block) for block in todo if block}
-        needed.append(terms)
-        todo = {minor for each in terms.values() for _, _, minor in each}
-    found: dict[Block, Scalar] = {(): ONE}
-    for terms in reversed(needed):
-        rows = ([Product(s, a, found[minor]) for s, a, minor in each] for each in terms.values())
-        found.update(zip(terms, sums(recorder, rows), strict=True))
-    return found
-
-
-def _expanded(block: Block) -> list[tuple[int, Scalar, Block]]:
-    """A determinant along its last row: signs, entries, and minors of the rows before."""
-    n = len(block)
-    if any(all(row[j] == 0 for row in block) for j in range(n)):
-        return []
-    return [
-        ((-1) ** (n - 1 - j), entry, tuple(row[:j] + row[j + 1 :] for row in block[:-1]))
-        for j, entry in enumerate(block[-1])
-        if entry != 0
-    ]
 
 
 RULES: dict[str, Rule] = {

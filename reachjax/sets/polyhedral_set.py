@@ -91,10 +91,11 @@ class PolyhedralSet(AbstractSet):
         """
         A, b = self.facets
         offsets, found = formulas.offsets_along(A, b, directions)
-        if is_concrete(found) and np.all(found):
+        known = is_concrete((A, directions))
+        if known and np.all(found):
             return offsets
         support = self.support(directions)
-        if not is_concrete(found):  # where a facet touches, its normal has a derivative too
+        if not known:  # where a facet touches, its normal has a derivative too
             rounding = formulas.TOUCHING * (abs(offsets) + abs(support))
             found = found & (offsets - support > rounding)
         return jnp.where(found, offsets, support)

@@ -23,6 +23,9 @@ REACHED = {
     "ellipsoid": ROUND,
     "intersection": rj.Intersection(rj.Box([0.1, -0.2], [0.5, 0.5]), ROUND),
 }
+SLOW = "box", "ellipsoid", "intersection"
+"""Their derivatives take a while to be compiled; of a box the rest of this file speaks as well."""
+
 REGIONS = {
     "box": rj.Box([0.3, -0.2], [0.7, 0.25]),
     "polytope": rj.Polytope(OCTAGON, np.full(len(OCTAGON), 0.4)),
@@ -42,7 +45,10 @@ def margins(reached, regions=REGIONS):
     return [item.compared_with(reached, by_offsets=True).margins for both in asked for item in both]
 
 
-@pytest.mark.parametrize("kind", REACHED)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=[pytest.mark.costly] * (kind in SLOW)) for kind in REACHED],
+)
 def test_margins_and_their_slopes_are_the_same_in_compiled_code(kind):
     reached = REACHED[kind]
 

@@ -85,9 +85,8 @@ class Reader:
         return [self._cut(each) for each in found]
 
     def _one_by_one(self, rule: Callable, equation: Any, operands: Sequence[Any]) -> list[Any]:
-        columns = []
+        columns, alone = [], Reader(1)
         for k in range(self.points):
-            alone = Reader(1)
             given = [
                 Varying(each.numbers[:, k : k + 1], each.shape)
                 if isinstance(each, Varying)
@@ -96,7 +95,7 @@ class Reader:
             ]
             found = rule(alone, equation, given)
             columns.append(found if isinstance(found, list) else [found])
-            self.is_cut |= alone.is_cut
+        self.is_cut |= alone.is_cut
         shapes = [each.aval.shape for each in equation.outvars]
         return [
             Varying(np.hstack([alone.of(each, shape).numbers for each in column]), shape)

@@ -129,16 +129,11 @@ def _convolved(reader: Reader, equation: Any, operands: Sequence[Any]) -> Varyin
         return equation.primitive.bind(*given, **equation.params).ravel()
 
     ones = [jnp.eye(len(each.numbers)) for each in (left, right)]
-    weights = fractions_of(jax.vmap(lambda a: jax.vmap(lambda b: of(a, b))(ones[1]))(ones[0]))
+    weights = fractions(jax.vmap(lambda a: jax.vmap(lambda b: of(a, b))(ones[1]))(ones[0]))
     found = np.full((weights.shape[-1], reader.points), Fraction(0), object)
     for i, j, k in np.argwhere(weights != 0):
         found[k] = found[k] + weights[i, j, k] * left.numbers[i] * right.numbers[j]
     return Varying(found, shape_of(equation))
-
-
-def fractions_of(plain: Any) -> np.ndarray:
-    """Floats as fractions."""
-    return np.frompyfunc(Fraction, 1, 1)(np.asarray(plain, float))
 
 
 def _chosen(which: Any, *cases: Any) -> Any:

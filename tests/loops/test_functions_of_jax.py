@@ -17,8 +17,8 @@ from jax.tree_util import Partial
 
 import reachjax as rj
 from tests.loops.jax_functions import arithmetic, constants, entries, flow
-from tests.oracles.exact.numbers import fractions
-from tests.oracles.exact.reader import images
+from tests.oracles.exact.exact_reader import images
+from tests.oracles.exact.varying import fractions
 
 FAMILIES = entries.FAMILIES | arithmetic.FAMILIES | constants.FAMILIES | flow.FAMILIES
 LOWER, UPPER = np.array([-0.5, 0.25]), np.array([0.75, 1.0])

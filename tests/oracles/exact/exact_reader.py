@@ -15,14 +15,14 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from tests.oracles.exact.numbers import (
+from tests.oracles.exact.exact_rules import RULES
+from tests.oracles.exact.varying import (
     DisagreeError,
     UndefinedError,
     UnreadError,
     Varying,
     fractions,
 )
-from tests.oracles.exact.rules import RULES
 
 BITS = 4000
 """Fractions with more of them in their denominators are cut."""
@@ -233,7 +233,7 @@ def images(function: Callable, points: np.ndarray) -> tuple[np.ndarray, Fraction
     Example:
         >>> found, off = images(lambda x: x * x, np.array([[0.1], [0.5]]))
         >>> found[1, 0], found[0, 0] == Fraction(0.1) ** 2, off
-        (Fraction(1, 4), True, 0)
+        (Fraction(1, 4), True, Fraction(0, 1))
     """
     closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct(points.shape[1:], float))
     reader = Reader(len(points))

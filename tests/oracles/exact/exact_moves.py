@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from tests.oracles.exact.numbers import Varying
+from tests.oracles.exact.varying import Varying
 
 if TYPE_CHECKING:
-    from tests.oracles.exact.reader import Reader
+    from tests.oracles.exact.exact_reader import Reader
 
 
 def shape_of(equation: Any) -> tuple[int, ...]:

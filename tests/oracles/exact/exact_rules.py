@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from tests.oracles.exact.moves import MOVES, shape_of
-from tests.oracles.exact.numbers import UndefinedError, Varying
+from tests.oracles.exact.exact_moves import MOVES, shape_of
+from tests.oracles.exact.varying import UndefinedError, Varying, fractions
 
 if TYPE_CHECKING:
-    from tests.oracles.exact.reader import Reader
+    from tests.oracles.exact.exact_reader import Reader
 
 
 DIGITS = 60

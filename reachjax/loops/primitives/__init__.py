@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.primitives import affine, angles, bends, folds, moving, powers, solvers
-from reachjax.loops.primitives.equations import JUMPS, Equation, Rule, on_host
+from reachjax.loops.primitives.equations import JUMPS, NOT_FINITE, Equation, Rule, on_host
 from reachjax.loops.recording import Recorder
 from reachjax.loops.values import (
     Comparison,
@@ -40,6 +40,23 @@ INFINITE = (
 """Primitives that may take numbers that are not finite."""
 # fmt: on
 
+INSTEAD = {
+    "cbrt": "use y ** (1 / 3) of numbers above zero",
+    "cumlogsumexp": "use jax.nn.logsumexp of each part",
+    "ragged_dot_general": "use jnp.dot of each group",
+    "reduce": "use jnp.sum, jnp.prod, jnp.max or jnp.min",
+    "reduce_precision": "leave it out, and give what it rounds by as a disturbance",
+    "scatter-max": "use x.at[i].set(jnp.maximum(x[i], y))",
+    "scatter-min": "use x.at[i].set(jnp.minimum(x[i], y))",
+    "top_k": "use jnp.sort, jnp.max or jnp.min",
+}
+"""What to do in place of primitives that have no rule."""
+
+OTHERWISE = (
+    "write it with arithmetic, powers, exponentials, logarithms and sines, or use a polynomial "
+    "that is close to it, and give the difference as a disturbance"
+)
+
 RULES: dict[str, Rule] = {
     **moving.RULES,
     **affine.RULES,
@@ -62,7 +79,7 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
             f"it rounds to {equation.kind}: compute in 64-bit floats, for example by not giving "
             "layers a dtype"
             if jnp.issubdtype(equation.kind, jnp.floating)
-            else "it computes in complex numbers"
+            else "it computes in complex numbers: compute with their real and imaginary parts"
         )
     unknown = [each for each in operands if isinstance(each, Unknown)]
     if unknown and equation.name != "custom_linear_solve":  # which needs no factors
@@ -81,7 +98,7 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
         raise UnsupportedError(_why(equation))
     plain = [*filter(is_plain, operands)]
     if equation.name not in INFINITE and not all(map(_is_finite, plain)):
-        raise UnsupportedError("one of its operands is a constant that is not finite")
+        raise UnsupportedError(NOT_FINITE)
     values = [each for each in operands if isinstance(each, Value)]
     if values and not any(each.size for each in values):  # vectors without entries are all alike
         return equation.evaluate(
@@ -93,7 +110,8 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
 def _why(equation: Equation) -> str:
     if equation.name in DISCONTINUOUS or equation.name == "convert_element_type":
         return JUMPS
-    return "there are no bounds for it: write it with primitives that have some"
+    instead = INSTEAD.get(equation.name, OTHERWISE)
+    return f"there are no bounds for it: {instead}"
 
 
 def _is_float(equation: Equation) -> bool:

@@ -159,7 +159,9 @@ def _adjugate(recorder: Recorder, A: np.ndarray) -> np.ndarray:
 def reciprocals(recorder: Recorder, numbers: Sequence[Scalar]) -> list[Scalar]:
     """Inverses of numbers, none of which may be zero."""
     if any(each == 0 for each in numbers):
-        raise UnsupportedError("its matrix is singular, whatever the inputs are")
+        raise UnsupportedError(
+            "its matrix is singular, whatever the inputs are: give one that has an inverse"
+        )
     own = sorted({each for each in numbers if isinstance(each, Entry)})
     found: dict[Scalar, Scalar] = {each: 1 / each for each in numbers if isinstance(each, Fraction)}
     if own:

@@ -202,7 +202,9 @@ def _levels(there: np.ndarray) -> list[list[tuple[np.ndarray, np.ndarray]]]:
     graph = csr_matrix(there.astype(int))
     column = maximum_bipartite_matching(graph, perm_type="column")
     if np.any(column < 0):
-        raise UnsupportedError("its matrix is singular, whatever the inputs are")
+        raise UnsupportedError(
+            "its matrix is singular, whatever the inputs are: give one that has an inverse"
+        )
     count, label = connected_components(graph[:, column], directed=True, connection="strong")
     needs = np.zeros((count, count), bool)
     for i, j in zip(*np.nonzero(there[:, column]), strict=True):

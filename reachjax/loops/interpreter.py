@@ -179,7 +179,7 @@ class Interpreter(abc.ABC):
             if not bool(np.asarray(goes_on)):
                 return carry
             carry = self.walk(params["body_jaxpr"], [*done, *carry])
-        raise UnsupportedError(f"it has not ended after {TURNS} turns")
+        raise UnsupportedError(f"it has not ended after {TURNS} turns: use a loop of fewer")
 
     def _branch(self, params: dict[str, Any], operands: Sequence[Operand]) -> list[Operand]:
         """The one that is taken."""

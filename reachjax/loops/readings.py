@@ -160,7 +160,7 @@ def require_traced(jaxpr: Any) -> None:
                 "put modules into evaluation mode"
             )
         if name in CALLBACKS:
-            why = "what Python computes outside of JAX has no bounds"
+            why = "what Python computes outside of JAX has no bounds: use functions of JAX"
         if why:
             error = UnsupportedError(why)
             error.primitive, error.line = name, line_of(equation)

@@ -194,7 +194,10 @@ class Recorder:
         divisor = _flat(divisor, value)
         normal = (abs(divisor) >= TINY) & (abs(divisor) <= 1 / TINY)
         if is_known(divisor) and not np.all(np.asarray(normal)):
-            raise UnsupportedError("it divides by zero, or by what has no inverse in 64 bits")
+            raise UnsupportedError(
+                "it divides by zero, or by what has no inverse in 64 bits: keep divisors away from "
+                "zero"
+            )
         xp = namespace(divisor)
         inverse = xp.where(normal, 1.0 / xp.where(normal, divisor, 1.0), np.nan)
 

@@ -41,7 +41,8 @@ def _beyond(recorder: Recorder, one: Operand, other: Operand, idle: float, rule:
         return rule(one, other)
     plain = np.asarray(other, float)
     if np.any(np.isnan(plain) | (plain == -idle)):
-        raise UnsupportedError(f"one of its operands is {plain[~np.isfinite(plain)].flat[0]}")
+        which = plain[~np.isfinite(plain)].flat[0]
+        raise UnsupportedError(f"one of its operands is {which}: use a finite one in its place")
     ignored = plain == idle
     if not np.any(ignored):
         return rule(one, other)

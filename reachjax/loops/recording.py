@@ -202,7 +202,7 @@ class Recorder:
         inverse = xp.where(normal, 1.0 / xp.where(normal, divisor, 1.0), np.nan)
 
         def apply(unit: AtUnit, y: Any) -> Any:
-            return y.over(divisor) if isinstance(y, Rationals) else inverse * y
+            return y.over(divisor) if hasattr(y, "over") else inverse * y
 
         step = Step(
             apply,

@@ -193,10 +193,8 @@ class Combination:
         return Combination(parts, matrix @ self.offset, errors)
 
     def __getitem__(self, index: Any) -> Combination:
-        parts, errors = (
-            {place: each[index] for place, each in arrays.items()}
-            for arrays in (self.parts, self.errors)
-        )
+        parts = {place: matrix[index] for place, matrix in self.parts.items()}
+        errors = {place: error[index] for place, error in self.errors.items()}
         return Combination(parts, self.offset[index], errors)
 
 

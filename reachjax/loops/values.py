@@ -79,8 +79,27 @@ class Comparison:
         return self.value.shape
 
 
+class Unknown:
+    """A result that has no bounds, and may be passed on, but not computed with.
+
+    Attributes:
+        primitive: what made it.
+        why: it has none, and what to do.
+    """
+
+    def __init__(self, primitive: str, why: str):
+        self.primitive, self.why = primitive, why
+
+    @property
+    def error(self) -> UnsupportedError:
+        """The error where it is used."""
+        error = UnsupportedError(self.why)
+        error.primitive = self.primitive
+        return error
+
+
 Operand = Any
-"""A `Value`, a `Comparison`, or a plain array that depends on no input."""
+"""A `Value`, a `Comparison`, an `Unknown`, or a plain array that depends on no input."""
 
 Fact = Callable[[Callable[[Operand], Any]], Any]
 """Limits of a value, from a function that gives those of others."""
@@ -117,7 +136,7 @@ class Parameter(np.ndarray):
 
 def is_plain(operand: Operand) -> bool:
     """Whether an operand depends on no input."""
-    return not isinstance(operand, Value | Comparison)
+    return not isinstance(operand, Value | Comparison | Unknown)
 
 
 def is_constant(plain: Any) -> bool:

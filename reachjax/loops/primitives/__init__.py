@@ -12,10 +12,18 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.primitives import affine, angles, bends, folds, moving, powers
+from reachjax.loops.primitives import affine, angles, bends, folds, moving, powers, solvers
 from reachjax.loops.primitives.equations import JUMPS, NOT_FINITE, Equation, Rule, on_host
 from reachjax.loops.recording import Recorder
-from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value, is_known
+from reachjax.loops.values import (
+    Comparison,
+    Operand,
+    Unknown,
+    UnsupportedError,
+    Value,
+    is_known,
+    is_plain,
+)
 
 __all__ = ["Equation", "recorded"]
 
@@ -25,9 +33,6 @@ DISCONTINUOUS = (
     "nextafter", "shift_left", "reduce_and", "reduce_or",
 )
 """Primitives that jump."""
-
-SOLVERS = ("custom_linear_solve", "triangular_solve", "lu", "cholesky", "lu_solve")
-"""Primitives whose results are known up to rounding that is not bounded."""
 
 INFINITE = (
     "max", "min", "clamp", "select_n", "gt", "ge", "lt", "le", "eq", "ne", *moving.RULES,
@@ -59,6 +64,7 @@ RULES: dict[str, Rule] = {
     **angles.RULES,
     **bends.RULES,
     **folds.RULES,
+    **solvers.RULES,
 }
 
 
@@ -75,6 +81,9 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
             if jnp.issubdtype(equation.kind, jnp.floating)
             else "it computes in complex numbers: compute with their real and imaginary parts"
         )
+    unknown = [each for each in operands if isinstance(each, Unknown)]
+    if unknown and equation.name != "custom_linear_solve":  # which needs no factors
+        raise unknown[0].error
     rule = RULES.get(equation.name)
     first = operands[0]
     if isinstance(first, Comparison) and equation.name in moving.ALONE:
@@ -87,7 +96,7 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
         )
     if rule is None or (equation.name == "convert_element_type" and not _is_float(equation)):
         raise UnsupportedError(_why(equation))
-    plain = [each for each in operands if not isinstance(each, Value | Comparison)]
+    plain = [*filter(is_plain, operands)]
     if equation.name not in INFINITE and not all(map(_is_finite, plain)):
         raise UnsupportedError(NOT_FINITE)
     values = [each for each in operands if isinstance(each, Value)]
@@ -101,11 +110,6 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
 def _why(equation: Equation) -> str:
     if equation.name in DISCONTINUOUS or equation.name == "convert_element_type":
         return JUMPS
-    if equation.name in SOLVERS:
-        return (
-            "what a solver's rounding may add is not known: multiply by jnp.linalg.inv(A), which "
-            "is taken as it is computed"
-        )
     instead = INSTEAD.get(equation.name, OTHERWISE)
     return f"there are no bounds for it: {instead}"
 

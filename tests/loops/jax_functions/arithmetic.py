@@ -195,4 +195,21 @@ REFUSED = [
 ]
 """What has no bounds, or not yet."""
 
-FAMILIES = {"products": PRODUCTS, "powers": POWERS, "sums": SUMS, "special functions": SPECIAL}
+LINEAR = [
+    lambda x: jnp.linalg.inv(jnp.outer(x, A[1]) + 3 * jnp.eye(2))[0],
+    lambda x: jnp.linalg.solve(jnp.diag(x + 2), jnp.ones(2)),
+    lambda x: jnp.linalg.solve(A, x),
+    lambda x: jnp.linalg.solve(jnp.outer(x, x) + jnp.eye(2), x),
+    lambda x: jnp.linalg.inv(jnp.diag(jnp.append(x, 1.0) + 2) + 0.1)[2, :2],
+    lambda x: jax.scipy.linalg.solve_triangular(jnp.outer(x, x) + jnp.eye(2), x),
+    lambda x: jax.scipy.linalg.solve(A @ A.T + jnp.eye(2), x, assume_a="pos"),
+    lambda x: jnp.linalg.det(jnp.diag(x) + 0.1),
+]
+
+FAMILIES = {
+    "linear equations": LINEAR,
+    "products": PRODUCTS,
+    "powers": POWERS,
+    "sums": SUMS,
+    "special functions": SPECIAL,
+}

@@ -142,6 +142,10 @@ class Evaluation(Interpreter):
         """The results of an equation."""
         return [*map(Number, bound(equation, [*map(_array, operands)]))]
 
+    def whole(self, equation: Any, operands: Sequence[Operand]) -> list[Operand] | None:
+        """The result of a function that is not looked into."""
+        return None if rule_of(equation) is None else self.apply(equation, operands)
+
     def entry(self, operand: Operand, k: int) -> Operand:
         """An entry along the first axis."""
         return Number(operand.array[k])
@@ -178,6 +182,10 @@ class ConstantPart(Interpreter):
     def apply(self, equation: Any, operands: Sequence[Operand]) -> list[Operand]:
         """Nothing of an equation whose operands depend on inputs."""
         return [None] * len(equation.outvars)
+
+    def whole(self, equation: Any, operands: Sequence[Operand]) -> list[Operand] | None:
+        """Nothing of a function that is not looked into."""
+        return None if rule_of(equation) is None else self.apply(equation, operands)
 
     def entry(self, operand: Operand, k: int) -> Operand:
         """An entry along the first axis."""

@@ -183,6 +183,8 @@ EXACT: dict[str, Callable[..., Any]] = {
     "ne": operator.ne,
     "lt": operator.lt,
     "le": operator.le,
+    "lt_to": operator.lt,
+    "le_to": operator.le,
     "gt": operator.gt,
     "ge": operator.ge,
     "and": lambda a, b: a and b,

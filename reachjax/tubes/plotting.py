@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reachjax.numerics.checks import require_kind
+from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
@@ -29,6 +30,7 @@ ABOVE = {"loc": "lower center", "bbox_to_anchor": (0.5, 1), "ncols": 3, "frameon
 SAMPLE_STYLE = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
 
 
+@lenient
 def plot_set(
     region: AbstractSet,
     ax: Axes | None = None,
@@ -86,6 +88,7 @@ def _two_of(dimension: int, coordinates: Any) -> tuple[int, int]:
     return int(chosen[0]), int(chosen[1])
 
 
+@lenient
 def plot_tube(
     tube: ReachTube | PartitionedTube,
     ax: Axes | None = None,
@@ -121,6 +124,7 @@ def plot_tube(
     return ax
 
 
+@lenient
 def plot_cells(
     verdict: Verdict | WinningSet, ax: Axes | None = None, coordinates: tuple[int, int] = (0, 1)
 ) -> Axes:

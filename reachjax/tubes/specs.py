@@ -15,6 +15,7 @@ import numpy as np
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, require_kind, whole_number
+from reachjax.numerics.flags import lenient
 from reachjax.numerics.rounding import TINY
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet
@@ -27,6 +28,7 @@ from reachjax.tubes.soundness import Claim, require_unbroken
 from reachjax.tubes.verdicts import Verdict, VerdictStatus, of_cells
 
 
+@lenient
 def verify(
     tube: ReachTube | PartitionedTube,
     goal: Timed | None = None,

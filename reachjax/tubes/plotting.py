@@ -10,6 +10,7 @@ import numpy as np
 from reachjax.numerics.checks import require_kind
 from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet
+from reachjax.sets.unusable import ThinSetError
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.verdicts import Verdict, VerdictStatus
@@ -179,7 +180,7 @@ def _plot_cell(
     simulated, initial, certified = labels
     try:
         trajectories = np.asarray(tube.simulate(samples))[:, :, [i, j]]
-    except RuntimeError:  # the initial set is too thin to be sampled: the sets alone
+    except ThinSetError:  # the initial set is too thin to be sampled: the sets alone
         trajectories = np.zeros((0, tube.horizon + 1, 2))
     for t, region in enumerate(tube.sets):
         ax.scatter(*trajectories[:, t].T, **SAMPLE_STYLE, label=None if t else simulated)

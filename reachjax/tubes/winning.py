@@ -273,6 +273,7 @@ class _Run:
             self.done.append(cell._replace(status=found.status, margin=found.margin))
 
 
+@lenient
 def sorted_cells(
     task: CellTask, boxes: Sequence[Ends], scale: Float[np.ndarray, " n"], budget: Budget
 ) -> list[Sorted]:

@@ -55,6 +55,8 @@ class Horizon:
         origins: `(m, 3)`, of each fact the step, the unit's number among those of a step, and which
             of its facts it is; -1 of the initial set, -2 of products of its columns.
         merged: of each step, what a smooth controller leaves out.
+        tightened: multipliers `(2 k, m)` by which ranges of the last step's units were bounded, for
+            each time that they were asked for; none of no forms where there were none.
 
     Example:
         >>> import jax
@@ -74,6 +76,7 @@ class Horizon:
         self.state = AffineForms.beginning(self.start)
         self.steps: list[tuple[UnitForms, ...]] = []
         self.merged: list[Merged | None] = []
+        self.tightened: list[np.ndarray] = []
         self._varying = np.zeros(0, dtype=int)
         self._width = self.start.count
         self._facts: list[AffineForms] = []
@@ -134,6 +137,7 @@ class Horizon:
             inputs = y[switching]
             both = joined([inputs, -inputs])
             weights = multipliers(both)
+            self.tightened.append(np.zeros((0, self._count)) if weights is None else weights)
             if weights is None:
                 return ends
             found_ends = self.bounds(both, weights)
@@ -145,7 +149,7 @@ class Horizon:
             return lower, upper
 
         t = self._t + len(self.steps)
-        self._stated = 0
+        self._stated, self.tightened = 0, []
         with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
             self.state, units, merged = step_forms(
                 self._loop, self.state, t, self.start, ranges=ranges

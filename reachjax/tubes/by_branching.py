@@ -78,11 +78,11 @@ def sets_by_branching(
     for k, (region, proof, *_) in enumerate(known, start=1):
         steps.append(Step(setting, X, k - 1, tuple(steps)))
         X = region
-        ladder.advance()
+        ladder.repeat(proof)
         if isinstance(proof, BranchCertificate):
             ladder.spend(int(np.sum(proof.nodes)))
             work -= len(proof.by_products) * ladder.width**4
-        ladder.horizon.narrow(*_ends(*_fixed(X)))
+        ladder.narrow(X)
     left = (horizon - len(known)) / horizon
     budget.grant(left * of_programs)
     work = max(work, left * PRODUCTS)
@@ -125,11 +125,13 @@ def sets_by_branching(
             offsets, products = _with_products(steps[-1], directions, offsets, opened, share)
         X = Polytope(directions, offsets)
         seconds = time.perf_counter() - began
-        shut = _fixed(X)[1] - climbed.attained <= setting.gap * ranges
+        shut = np.asarray(jax.lax.stop_gradient(offsets)) - climbed.attained <= setting.gap * ranges
         codes = np.where(shut, int(SolverStatus.SOLVED), climbed.codes)
-        proof = _certificate(climbed, codes, offsets, products, opened, seconds)
+        proof = _certificate(climbed, codes, offsets, products, opened, seconds).replace(
+            ranges=tuple(ladder.horizon.tightened), time=setting.start + k
+        )
         yield Reached(X, proof, climbed.ended, climb=False)
-        ladder.horizon.narrow(*_ends(*_fixed(X)))
+        ladder.narrow(X)
 
 
 def _replayed(
@@ -181,29 +183,6 @@ def _with_products(
     found, proof = facets_by_products(step, directions[opened], budget)
     better = found < offsets[opened]
     return offsets.at[opened].set(jnp.where(better, found, offsets[opened])), proof
-
-
-def _fixed(X: AbstractSet) -> tuple[np.ndarray, np.ndarray]:
-    """Directions and offsets of a set's facets, without derivatives."""
-    flat, _ = X.parts
-    assert flat is not None  # as templates have it
-    rows, offsets = jax.lax.stop_gradient(flat.facets)
-    return np.asarray(rows), np.asarray(offsets)
-
-
-def _ends(rows: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the state that facets along the axes are; infinite where there is none."""
-    n = rows.shape[1]
-    lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
-    for row, offset in zip(rows, offsets, strict=True):
-        (there,) = np.nonzero(row)
-        if len(there) == 1 and abs(row[there[0]]) == 1.0:
-            i = there[0]
-            if row[i] > 0:
-                upper[i] = min(upper[i], offset)
-            else:
-                lower[i] = max(lower[i], -offset)
-    return lower, upper
 
 
 def _certificate(

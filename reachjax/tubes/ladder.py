@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
@@ -18,7 +19,15 @@ from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import Budget
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, joined
-from reachjax.proofs.branches import Branches, HorizonFacts, Rung, bounds_of, leaf_bounds
+from reachjax.proofs.branches import (
+    BranchCertificate,
+    Branches,
+    HorizonFacts,
+    Rung,
+    bounds_of,
+    leaf_bounds,
+)
+from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box
@@ -135,6 +144,31 @@ class Ladder:
         ranges = partial(self._ranges, budget or self._budget) if tighten and self._nodes else None
         self.horizon.advance(ranges)
 
+    def repeat(self, proof: AbstractProof) -> None:
+        """One step more, whose set is known with its proof.
+
+        Ranges of units are those of the proof's multipliers, which are sound whatever they are. A
+        proof that does not say them has them found again; one of another kind had none.
+        """
+        if not isinstance(proof, BranchCertificate):
+            self.horizon.advance()
+            return
+        if proof.ranges is None:
+            self.advance()
+            return
+        known = iter(proof.ranges)
+
+        def multipliers(forms: AffineForms) -> np.ndarray | None:
+            given = np.asarray(next(known, np.zeros((0, 0))))
+            fits = given.shape == (len(forms.rows), len(self.horizon.facts.rows))
+            return np.where(np.isfinite(given), np.fmax(given, 0.0), 0.0) if fits else None
+
+        self.horizon.advance(multipliers)
+
+    def narrow(self, X: AbstractSet) -> None:
+        """Meet the state with a set that surely holds it: with its facets along the axes."""
+        self.horizon.narrow(*_ends(*map(np.asarray, jax.lax.stop_gradient(X.facets))))
+
     def _ranges(self, budget: Budget, forms: AffineForms) -> Float[np.ndarray, "k m"] | None:
         """Multipliers that bound the inputs of units from both sides; None if there is no time."""
         if budget.late or budget.work <= 0:
@@ -151,6 +185,11 @@ class Ladder:
             if vertex is not None and len(vertex.columns):
                 multipliers[:] = np.maximum(vertex.multipliers, 0.0)
         return found
+
+    def about(self, forms: AffineForms) -> HorizonFacts:
+        """What branches are about that bound these forms."""
+        horizon, rows = self.horizon, forms.widened(self.width)
+        return HorizonFacts(horizon.start, horizon.facts, horizon.zero, rows)
 
     @property
     def _size(self) -> int:
@@ -298,8 +337,7 @@ class Ladder:
             multipliers=multipliers,
             weights=np.asarray(block_diag(*(each.weights for each in found))),
         )
-        rows = joined([forms.widened(width) for forms in target.forms])
-        about = HorizonFacts(horizon.start, horizon.facts, horizon.zero, rows)
+        about = self.about(joined([forms.widened(width) for forms in target.forms]))
         each = leaf_bounds(about, leaves)
         uppers = [forms.ends(horizon.start)[1].min() for forms in target.forms]
         mine = (np.flatnonzero(owner == number) for number in range(count))
@@ -339,3 +377,18 @@ class Ladder:
             if given is not None:
                 found[facet], columns[facet] = given, at
         return columns, found
+
+
+def _ends(rows: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the state that facets along the axes are; infinite where there is none."""
+    n = rows.shape[1]
+    lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
+    for row, offset in zip(rows, offsets, strict=True):
+        (there,) = np.nonzero(row)
+        if len(there) == 1 and abs(row[there[0]]) == 1.0:
+            i = there[0]
+            if row[i] > 0:
+                upper[i] = min(upper[i], offset)
+            else:
+                lower[i] = max(lower[i], -offset)
+    return lower, upper

@@ -35,7 +35,7 @@ def strict():
     jax.config.update("jax_numpy_rank_promotion", "raise")  # in all threads
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     with pytest.raises(ValueError, match="broadcast"):
-        jnp.ones((2, 3)) * jnp.ones(3)
+        jnp.multiply(jnp.ones((2, 3)), jnp.ones(3))
     yield
     for name, value in before.items():
         jax.config.update(name, value)

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array
 
 from reachjax.numerics.checks import is_concrete
@@ -27,7 +28,7 @@ ONLY_FIRST = (
 
 def _modes(leaf: Any) -> Iterator[str]:
     """How a number is being differentiated, the innermost first, as far as can be seen."""
-    while isinstance(leaf, jax.core.Tracer):
+    while isinstance(leaf, Tracer):
         if hasattr(leaf, "primal"):
             yield type(leaf).__name__
             leaf = leaf.primal

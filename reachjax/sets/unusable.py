@@ -2,7 +2,7 @@
 
 
 class UnusableSetError(ValueError):
-    """A set is empty or unbounded, which nothing that is computed from it can mend."""
+    """A set is empty or unbounded, or a sequence of sets: nothing can be computed from it."""
 
 
 class ThinSetError(RuntimeError):

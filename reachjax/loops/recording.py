@@ -208,7 +208,9 @@ class Recorder:
             UnsupportedError: a divisor is zero, or has no inverse.
         """
         divisor = _flat(divisor, value)
-        normal = (abs(divisor) >= TINY) & (abs(divisor) <= 1 / TINY)
+        kind = np.finfo(divisor.dtype)  # of 32 bits where 64 are off
+        least, most = max(TINY, float(kind.tiny)), min(1 / TINY, float(kind.max))
+        normal = (abs(divisor) >= least) & (abs(divisor) <= most)
         if is_known(divisor) and not np.all(np.asarray(normal)):
             raise UnsupportedError(
                 "it divides by zero, or by what has no inverse in 64 bits: keep divisors away from "

@@ -73,7 +73,7 @@ class Trace:
         self._parts = tree, others, kinds, inputs
         self._closed: dict[bool, core.ClosedJaxpr] = {}
         self._rounds: bool | None = None
-        self.described = _description(self.closed)
+        self.described = description(self.closed)
 
     @classmethod
     def of(cls, function: Callable, inputs: Sizes) -> tuple[Trace, tuple[Any, ...]]:
@@ -96,7 +96,7 @@ class Trace:
         if double not in self._closed:
             for other in self._closed:
                 with jax.enable_x64(other):
-                    _require_same(_description(self._traced()), self.described)
+                    _require_same(description(self._traced()), self.described)
             self._closed[double] = self._traced()
         return self._closed[double]
 
@@ -258,7 +258,7 @@ def _copied(constant: Any) -> Any:
     return jnp.array(constant, copy=True) if is_number else constant
 
 
-def _description(closed: core.ClosedJaxpr) -> str | None:
+def description(closed: core.ClosedJaxpr) -> str | None:
     """What a jaxpr computes, as a hash; None if it holds numbers that are traced.
 
     It is the same in another process, and says nothing of names and places of functions.

@@ -12,10 +12,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.primitives import affine, angles, bends, folds, moving, powers, solvers
+from reachjax.loops.primitives import affine, angles, bends, choices, folds, moving, powers, solvers
 from reachjax.loops.primitives.equations import JUMPS, NOT_FINITE, Equation, Rule, on_host
 from reachjax.loops.recording import Recorder
 from reachjax.loops.values import (
+    Choice,
     Comparison,
     Operand,
     Unknown,
@@ -81,19 +82,20 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
             if jnp.issubdtype(equation.kind, jnp.floating)
             else "it computes in complex numbers: compute with their real and imaginary parts"
         )
+    first, *others = operands
     unknown = [each for each in operands if isinstance(each, Unknown)]
+    if unknown and equation.name == "select_n" and all(each is others[0] for each in others):
+        return others[0]
     if unknown and equation.name != "custom_linear_solve":  # which needs no factors
         raise unknown[0].error
-    rule = RULES.get(equation.name)
-    first = operands[0]
+    rules = choices.RULES if any(isinstance(each, Choice) for each in operands) else RULES
     if isinstance(first, Comparison) and equation.name in moving.ALONE:
-        return Comparison(recorded(recorder, equation, [first.value, *operands[1:]]))
-    compared = any(isinstance(each, Comparison) for each in operands)
-    if compared and equation.name not in ("select_n", "not"):
-        raise UnsupportedError(
-            "a comparison of numbers may only choose between two of them that agree where it "
-            "changes, as jnp.where(y > 0, y, 0.1 * y) does"
-        )
+        return Comparison(recorded(recorder, equation, [first.value, *others]))
+    rule = (RULES if equation.name == "not" else rules).get(equation.name)
+    if rule is None and rules is choices.RULES:
+        raise UnsupportedError(choices.ONLY)
+    if rules is choices.RULES and rule is not None:
+        return rule(recorder, equation, operands)
     if rule is None or (equation.name == "convert_element_type" and not _is_float(equation)):
         raise UnsupportedError(_why(equation))
     plain = [*filter(is_plain, operands)]

@@ -245,6 +245,8 @@ class _Decision:
         self._required = {(item.name, item.time): item for item in required}
         self._open = dict(self._required)
         self._margins = {item.name: np.full(horizon + 1, np.nan) for item in required}
+        for item in required:
+            self._margins[item.name][item.time] = -np.inf  # as long as nothing is known
         self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
         self._ends: dict[tuple[str, int], np.ndarray] = {}

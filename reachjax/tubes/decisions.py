@@ -31,6 +31,7 @@ from reachjax.numerics.checks import (
     whole_number,
 )
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.numerics.rounding import TINY
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate
@@ -66,6 +67,7 @@ PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
 """How far an initial state is brought towards the middle of the set, so that it surely is in it."""
 
 
+@logged
 @lenient
 def decide(
     loop: ClosedLoop,

@@ -81,7 +81,7 @@ def _listen() -> None:
     jax.monitoring.register_event_duration_secs_listener(_heard)
 
 
-def _heard(event: str, seconds: float, **about: Any) -> None:
-    if event == COMPILED and seconds >= LONG:
+def _heard(event: str, duration_secs: float, **about: Any) -> None:
+    if event == COMPILED and duration_secs >= LONG:
         name = about.get("fun_name", "a function")
-        LOGGER.info("JAX has compiled %s in %.1f s: once for these shapes", name, seconds)
+        LOGGER.info("JAX has compiled %s in %.1f s: once for these shapes", name, duration_secs)

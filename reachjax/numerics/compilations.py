@@ -15,6 +15,7 @@ import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
 from reachjax.numerics.checks import described
+from reachjax.numerics.flags import lenient
 
 EVALUATIONS = 3000
 """What compiling a step of a loop takes, in evaluations of it in numpy: both grow with the number
@@ -103,6 +104,7 @@ class CompiledBeside:
                 self._known.popitem(last=False)
         return known
 
+    @lenient
     def _compiled(self, known: _Compiled, given: Any, static: Any) -> None:
         """Compile, and measure a call; what fails here fails as well where it is called."""
         with jax.enable_x64(True):

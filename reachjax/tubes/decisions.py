@@ -30,6 +30,7 @@ from reachjax.numerics.checks import (
     same_size,
     whole_number,
 )
+from reachjax.numerics.flags import lenient
 from reachjax.numerics.rounding import TINY
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate
@@ -65,6 +66,7 @@ PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
 """How far an initial state is brought towards the middle of the set, so that it surely is in it."""
 
 
+@lenient
 def decide(
     loop: ClosedLoop,
     X0: AbstractSet,

@@ -25,6 +25,7 @@ from reachjax.numerics.checks import (
     whole_number,
     wrapped,
 )
+from reachjax.numerics.flags import lenient
 from reachjax.numerics.host import in_numpy
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.programs.unrolled import unrolled
@@ -67,6 +68,7 @@ class LargestSet(NamedTuple):
     verdict: Verdict
 
 
+@lenient
 def largest_set(
     loop: ClosedLoop,
     X0: Kind,

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import is_concrete, real_number, require_kind
+from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet, Polytope
 from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
 from reachjax.sets.polyhedra import is_empty
@@ -204,6 +205,7 @@ def _depths(ball: Ellipsoid, points: np.ndarray) -> Float[np.ndarray, " c"]:
     return (1 - away) * np.sqrt(np.linalg.eigvalsh(np.asarray(ball.shape))[0])
 
 
+@lenient
 def shortfall(
     tube: ReachTube,
     goal: Timed | None = None,

@@ -190,7 +190,7 @@ def _ends_by_intervals(
     """
     if start.box is None:
         return -np.inf, np.inf
-    state, found = Limits(start.box.lower, start.box.upper), []
+    state, found = Limits(*map(np.asarray, (start.box.lower, start.box.upper))), []
 
     def apply(unit: AbstractUnit, y: Limits) -> Limits:
         found.append((y.least, y.most))

@@ -152,7 +152,7 @@ class Horizon:
         self._stated, self.tightened = 0, []
         with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
             self.state, units, merged = step_forms(
-                self._loop, self.state, t, self.start, ranges=ranges
+                self._loop, self.state, t, self.start, ranges=ranges, before=len(self.steps)
             )
             self._state_facts(units)
         self.steps.append(units)

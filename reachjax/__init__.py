@@ -90,13 +90,13 @@ from reachjax.training import (
     volume_penalty,
 )
 from reachjax.tubes.decisions import decide
+from reachjax.tubes.disagreements import DisagreementError
 from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.largest import LargestSet, largest_set
 from reachjax.tubes.loading import load
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
 from reachjax.tubes.plotting import plot_cells, plot_set, plot_tube
 from reachjax.tubes.reach import ReachTube, reach, reach_step
-from reachjax.tubes.rechecks import DisagreementError
 from reachjax.tubes.requirements import shortfall
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.tubes.soundness import UnsoundError

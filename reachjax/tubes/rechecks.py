@@ -27,6 +27,7 @@ from reachjax.sets import (
     Template,
 )
 from reachjax.sets.covers import covers
+from reachjax.tubes.disagreements import DisagreementError
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.repeats import Repeat
@@ -34,28 +35,6 @@ from reachjax.tubes.seals import seal_of
 
 ROUNDING = 1e-9
 """Of a number's size: what a recheck may differ by on another machine."""
-
-
-class DisagreementError(ValueError):
-    """A tube says what its own certificates do not prove.
-
-    Attributes:
-        step: how many steps after the initial set; None if it is not about one.
-        facet: the number of the facet; None if it is not about one.
-        said: what the tube says.
-        proved: what is proved, or simulated.
-    """
-
-    def __init__(
-        self,
-        message: str,
-        step: int | None = None,
-        facet: int | None = None,
-        said: Any = None,
-        proved: Any = None,
-    ):
-        super().__init__(message)
-        self.step, self.facet, self.said, self.proved = step, facet, said, proved
 
 
 class Recheck:

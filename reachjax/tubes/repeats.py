@@ -29,6 +29,7 @@ from reachjax.proofs.linear import LinearCertificate
 from reachjax.sets import AbstractSet
 from reachjax.sets.cells import from_tree
 from reachjax.solvers import Auto
+from reachjax.tubes.disagreements import DisagreementError
 from reachjax.tubes.ladder import Ladder
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.steps import Setting, Step, boxed
@@ -156,13 +157,16 @@ class Repeat:
         """The program of a window that ends after `k` steps, with products that hold in it.
 
         Raises:
-            ValueError: it is not known what the program was made of, or a product does not hold.
+            DisagreementError: an earlier version wrote it, which does not say what it was made of.
+            ValueError: it is of another window, or a product does not hold.
         """
         origin = said.origin
         if origin is None:
-            raise ValueError(
-                "it was written by an earlier version, which did not say over how many steps its "
-                "program was made: call reach again and save that tube, or load without recheck"
+            raise DisagreementError(
+                f"step {k} cannot be rechecked: an earlier version wrote its certificate, which "
+                "does not say over how many steps its program is. Call reach again and save that "
+                "tube, or load this one without recheck",
+                k,
             )
         start, steps, prune, linear, drop = origin
         first = k - steps

@@ -172,6 +172,12 @@ def test_what_does_not_prove_the_bounds_is_refused(path, loop, X0):
         rj.load(path, recheck=True)
 
 
+def test_a_bar_must_pass_on_all_steps(tube, path):
+    tube.save(path)
+    with pytest.raises(ValueError, match="progress must pass on each step, but 1 of 2 did not"):
+        rj.load(path, recheck=True, progress=lambda steps: list(steps)[1:])
+
+
 def test_the_loop_of_a_file_is_compared(tube, loop, path):
     tube.save(path)
     equal(rj.load(path, loop), tube)

@@ -320,3 +320,30 @@ def test_garbage_is_refused_without_a_recheck(small, path):
     written(path, head, arrays)
     with pytest.raises(rj.UnreadableError, match=r"ReachTube\.certificates must be of"):
         rj.load(path)
+
+
+# files of earlier versions ------------------------------------------------------------------------
+
+
+def without(node, *names):
+    """A document without fields that were added later."""
+    if isinstance(node, list):
+        return [without(each, *names) for each in node]
+    if not isinstance(node, dict):
+        return node
+    return {key: without(each, *names) for key, each in node.items() if key not in names}
+
+
+@pytest.mark.parametrize("kind", ["branches", "programs"])
+def test_a_file_of_an_earlier_version_is_read(kind, path):
+    tube = made(kind)
+    tube.save(path)
+    head, arrays = opened(path)
+    head["value"] = without(head["value"], "ranges", "time", "origin")
+    written(path, head, arrays)
+    assert same(rj.load(path).sets, tube.sets)
+    if kind == "branches":  # what is not said is found again
+        assert same(rj.load(path, recheck=True).sets, tube.sets)
+    else:
+        with pytest.raises(rj.DisagreementError, match=r"an earlier version wrote .* reach again"):
+            rj.load(path, recheck=True)

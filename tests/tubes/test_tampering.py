@@ -47,6 +47,12 @@ KINDS = {
 }
 
 
+COSTLY = "windows", "ellipsoids", "mixed"
+"""Kinds whose programs take seconds to compile; there are others by programs."""
+
+EVERY = [pytest.param(kind, marks=[pytest.mark.costly] * (kind in COSTLY)) for kind in KINDS]
+
+
 @functools.cache
 def made(kind):
     return KINDS[kind]()
@@ -155,7 +161,7 @@ def read(path, tube):
     return rj.load(path, loop, recheck=True)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EVERY)
 def test_a_tube_is_proved_anew(kind, tmp_path):
     tube = made(kind)
     again = read(tmp_path / "tube.reach", tube)
@@ -165,7 +171,7 @@ def test_a_tube_is_proved_anew(kind, tmp_path):
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EVERY)
 def test_a_tube_that_was_changed_is_not(kind, change, tmp_path):
     with pytest.raises((rj.DisagreementError, rj.UnreadableError)):
         read(tmp_path / "tube.reach", changed(made(kind), change))

@@ -22,8 +22,8 @@ from jaxtyping import Array, Float, Int
 from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit, Quadratic, SmoothUnit, UnboundedError
 from reachjax.numerics.rounding import Ball, gamma, namespace
-from reachjax.programs.affine import AffineForms, Place, met
-from reachjax.programs.initial import Ends, InitialColumns, constant, settled
+from reachjax.programs.affine import AffineForms, Place
+from reachjax.programs.initial import Ends, InitialColumns, constant, met, settled
 from reachjax.sets import Box
 
 SPILL = 1e-13
@@ -89,6 +89,11 @@ class StepForms(NamedTuple):
 
 Ranges = Callable[[AbstractUnit, AffineForms, Ends, Sequence[UnitForms]], Ends]
 """Bounds of a layer's inputs that are no worse than these, given the layers before."""
+
+
+def states_facts(unit: AbstractUnit) -> bool:
+    """Whether facts of a unit say more than its form; columns of free units say all theirs do."""
+    return not (unit.free or isinstance(unit, SmoothUnit))
 
 
 def step_columns(loop: ClosedLoop) -> tuple[int, int]:

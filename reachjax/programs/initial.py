@@ -107,6 +107,20 @@ class InitialColumns(Replaceable):
             below, above = below - rest, above + rest
         return below - constant(error * size), above + constant(error * size)
 
+    def bounds(self, rows: Rows, cut: bool = False) -> Ends:
+        """Bounds of each row over all columns, the better of all that are known.
+
+        Args:
+            rows: over these columns.
+            cut: whether what cuts the initial set is looked at as well.
+        """
+        w = self.spread.shape[1]
+        lower, upper = self.cut_ends(rows[:, :w]) if cut else self.ends(rows[:, :w])
+        if not self.curved:
+            return lower, upper
+        products = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(rows.shape[1]))
+        return met(self.curved_ends(rows), (lower - products, upper + products))
+
     def norms(self, rows: Rows) -> Any:
         """What `r . w` does not exceed for each row, whatever the cut."""
         if not self.round:
@@ -143,6 +157,12 @@ class InitialColumns(Replaceable):
         lower = least - at - constant((error + gamma(4) * abs(least)) * (1 + gamma(n)))
         upper = most - at + constant((error + gamma(4) * abs(most)) * (1 + gamma(n)))
         return larger(-norms, lower), smaller(norms, upper)
+
+
+def met(one: Ends, other: Ends) -> Ends:
+    """What both bounds hold; never empty. What is no number stays so in the first alone."""
+    lower = larger(one[0], other[0])
+    return lower, larger(smaller(one[1], other[1]), lower)
 
 
 @lru_cache(maxsize=64)

@@ -12,37 +12,47 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.host import in_numpy
+from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine import AffineForms
-from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
-from reachjax.programs.initial import Ends, InitialColumns, constant, product_facts
+from reachjax.programs.affine_steps import UnitForms, states_facts, step_columns, step_forms
+from reachjax.programs.initial import Ends, InitialColumns, constant, met, product_facts
 from reachjax.sets import AbstractSet, Box
 
-Carry = tuple[AffineForms, AffineForms]
+Carry = tuple[AffineForms, Array]
 
 
-class FactWeights(NamedTuple):
-    """Multipliers of the facts of a horizon, for each of some bounds.
+class HeldBounds(NamedTuple):
+    """What `B` bounds of rows over a horizon rest on, of which derivatives are taken.
+
+    A bound is the largest value of its row and weighed facts over the columns. Where that is
+    attained, multipliers and columns may be held (the envelope theorem). Bounds of directions of
+    states come first, then those of inputs of units that something better than their forms proved.
 
     Attributes:
-        of_units: `(f, N, b, units)`, of the facts of each unit, of which there are `b`.
-        of_set: `(f, r)`, of the facets of the initial set.
-        of_products: `(f, p)`, of the facts of products of its columns.
+        of_units: `(B, N, b, units)`, multipliers of the facts of each unit, of which there are `b`.
+        of_set: `(B, r)`, of the facets of the initial set.
+        of_products: `(B, p)`, of the facts of products of its columns.
+        columns: `(B, n)`, where each is attained, in the places of compiled forms.
+        by_norm: `(B,)`, whether it is attained instead where the norm of its initial columns is.
+        by_form: `(f,)`, whether directions are bounded by their forms alone, or by intervals.
         ranges: `(N, 2, units)`, lower and upper bounds of the units' inputs, as they were known.
-        attained: `(f, c)`, the initial columns where each bound is attained, which is that of a
-            form there then; NaN for the norms of its form.
+        of_ranges: `(N, 2, units)`, which of the bounds they are; -1 for those of forms.
     """
 
-    of_units: Float[Array | np.ndarray, "f N b units"]
-    of_set: Float[Array | np.ndarray, "f r"]
-    of_products: Float[Array | np.ndarray, "f p"]
+    of_units: Float[Array | np.ndarray, "B N b units"]
+    of_set: Float[Array | np.ndarray, "B r"]
+    of_products: Float[Array | np.ndarray, "B p"]
+    columns: Float[Array | np.ndarray, "B n"]
+    by_norm: Bool[Array | np.ndarray, " B"]
+    by_form: Bool[Array | np.ndarray, " f"]
     ranges: Float[Array | np.ndarray, "N 2 units"]
-    attained: Float[Array | np.ndarray, "f c"]
+    of_ranges: Int[Array | np.ndarray, "N 2 units"]
 
 
 class ByForms(NamedTuple):
@@ -153,68 +163,103 @@ def unrolled_from_boxes(
 
 
 @partial(Compiled, static_argnames="t")
-def weighed_at_once(
+def held_at_once(
     loop: ClosedLoop,
     X0: AbstractSet,
     box: Box,
     directions: Float[Array, "f n_x"],
-    weights: FactWeights,
+    held: HeldBounds,
+    known: tuple[Float[Array, "N n_x"], Float[Array, "N n_x"]],
     t: int = 0,
 ) -> Float[Array, "N f"]:
-    """Upper bounds of directions after 1, ..., N steps by forms and weighed facts, compiled.
+    """Numbers with the derivatives of bounds of directions after 1, ..., N steps, compiled.
 
-    Each is that of its direction's form and the facts so far, as `Horizon.bounds` takes them, so it
-    has the derivative of a bound whose weights are held. Ranges of units that were better known
-    than by forms have the derivatives of these.
+    Each has the value of its direction's form and of the facts so far where the bound is attained.
 
     Args:
         loop: the closed loop.
         X0: the initial set.
         box: around it.
         directions: one row a bound.
-        weights: of the facts, for each bound.
+        held: what the bounds rest on.
+        known: bounds of the state after each step that narrow its interval, with derivatives of
+            their own; infinite where there is none.
         t: the time of the initial set.
     """
-    start = InitialColumns.of(X0, box, loop.curved)
-    (more, between), steps = step_columns(loop), weights.of_units.shape[1]
-    first, end = start.count, start.count + steps * more
-    state = AffineForms.beginning(start, end + between)
+    start, steps = InitialColumns.of(X0, box, loop.curved), len(held.ranges)
+    more, between = step_columns(loop)
+    first, end, count = start.count, start.count + steps * more, start.count
+    state, columns = AffineForms.beginning(start, end + between), jnp.asarray(held.columns)
+
+    def values(rows: AffineForms, columns: Float[Array, "k n"]) -> Float[Array, "k c"]:
+        """Of one row each: its initial columns, and beside these its value."""
+        rest = rows.rows[:, 0] + (rows.columns[:, count:] * columns[:, count:]).sum(axis=1)
+        return jnp.concatenate([rows.columns[:, :count], rest[:, None]], axis=1)
+
+    def weighed(facts: AffineForms, weights: Float[Array, "B k"]) -> Float[Array, "B c"]:
+        rest = facts.rows[:, 0] + columns[:, count:] @ facts.columns[:, count:].T
+        rest = (weights * rest).sum(axis=1)
+        return jnp.concatenate([weights @ facts.columns[:, :count], rest[:, None]], axis=1)
+
+    def largest(values: Float[Array, "k c"], which: Any) -> Float[Array, " k"]:
+        rows, rest = values[:, :-1], values[:, -1]
+        attained = (rows * columns[which, :count]).sum(axis=1)
+        return rest + jnp.where(held.by_norm[which], start.bounds(rows)[1], attained)
+
     facts, radii = map(jnp.asarray, product_facts(start))
     facts = jnp.pad(facts, ((0, 0), (0, end + between - start.count)))
-    total = weights.of_products @ AffineForms(facts, radii)
-    if weights.of_set.shape[1]:
+    total = weighed(AffineForms(facts, radii), held.of_products)
+    if held.of_set.shape[1]:
         A, b = X0.facets
-        total = total + weights.of_set @ (b - A @ state)
+        total = total + weighed(b - A @ state, held.of_set)
 
-    def advance(carry: Carry, step: tuple[Array, Array, Array]) -> tuple[Carry, Array]:
-        (state, total), (k, given, known), done = carry, step, 0
+    def advance(carry: Carry, step: Any) -> tuple[Carry, Array]:
+        (state, total), (k, given, known_ends, numbers, narrowed) = carry, step
+        told = done = 0
+
+        def tell(units: Sequence[UnitForms]) -> None:
+            """Add what bounds make of the facts of layers that are new."""
+            nonlocal total, told, done
+            for layer in units[told:]:
+                here, done = slice(done, done + len(layer.gap)), done + len(layer.gap)
+                if not states_facts(layer.unit):
+                    continue
+                ends: Any = layer.lower, layer.upper
+                said = layer.unit.facts(layer.inputs, layer.outputs, *ends)
+                sectors = (block.rows for block in said.blocks if block.mark is Mark.SECTOR)
+                for rows, weights in zip(sectors, jnp.moveaxis(given, 1, 0), strict=False):
+                    total = total + weighed(rows, weights[:, here])
+            told = len(units)
 
         def ranges(
             unit: AbstractUnit, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
         ) -> Ends:
-            before = sum(len(each.gap) for each in found)
-            here = known[:, before : before + len(y.rows)]
-            low, high = (end - jax.lax.stop_gradient(end) for end in ends)
-            return here[0] + low, here[1] + high
+            tell(found)
+            here = slice(done, done + len(y.rows))
+            moving = []
+            for form, end, sign, which in zip((-y, y), ends, (-1, 1), numbers, strict=True):
+                own = which[here]
+                proved = largest(values(form, columns[own]) + total[own], own)
+                moving.append(jnp.where(own >= 0, sign * proved, end))
+            lower, upper = (
+                end + (each - jax.lax.stop_gradient(each))
+                for end, each in zip(known_ends[:, here], moving, strict=True)
+            )
+            return lower, upper
 
-        place = first + k * more
         state, units, _ = step_forms(
-            loop, state, t + k, start, place=place, scratch=end, ranges=ranges
+            loop, state, t + k, start, place=first + k * more, scratch=end, ranges=ranges
         )
-        for layer in units:
-            here, done = slice(done, done + len(layer.gap)), done + len(layer.gap)
-            ends: Any = layer.lower, layer.upper
-            said = layer.unit.facts(layer.inputs, layer.outputs, *ends)
-            sectors = (block.rows for block in said.blocks if block.mark is Mark.SECTOR)
-            for rows, weight in zip(sectors, jnp.moveaxis(given, 1, 0), strict=False):
-                total = total + weight[:, here] @ rows
-        forms = directions @ state + total
-        return (state, total), jnp.where(held, forms.largest(there), forms.ends(start)[1])
+        tell(units)
+        forms, own = directions @ state, np.arange(len(directions))
+        attained = largest(values(forms, columns[own]) + total[own], own)
+        found = jnp.where(held.by_form, forms.ends(start)[1], attained)
+        state = state.within(Ball.between(*met(state.ends(start), narrowed)))
+        return (state, total), found
 
-    held = jnp.isfinite(weights.attained).all(axis=1)
-    there = jnp.where(held[:, None], weights.attained, 0.0)
-    of_units = jnp.moveaxis(weights.of_units, 1, 0)
-    given = jnp.arange(steps), of_units, jnp.asarray(weights.ranges)
+    of_units = jnp.moveaxis(held.of_units, 1, 0)
+    ranges, numbers = jnp.asarray(held.ranges), jnp.asarray(held.of_ranges)
+    given = jnp.arange(steps), of_units, ranges, numbers, known
     return jax.lax.scan(advance, (state, total), given)[1]
 
 

@@ -27,7 +27,7 @@ from reachjax.loops.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.affine_steps import UnitForms
-from reachjax.programs.horizon import Horizon
+from reachjax.programs.horizon import OF_SET, Horizon
 from reachjax.programs.initial import InitialColumns
 from reachjax.sets import AbstractSet, Box
 
@@ -77,9 +77,12 @@ class Replay(Replaceable):
                 np.concatenate([part[which] for part in parts] or [np.zeros((facets, 0))], axis=1)
                 for which in range(2)
             )
-        weights = horizon.weights(multipliers, steps)
+        of_units, of_set = (
+            horizon.of_units(multipliers, steps),
+            horizon.of_kind(multipliers, OF_SET),
+        )
         initial = columns[:, : horizon.start.spread.shape[1]]
-        return cls(initial, slopes, offsets, weights.of_units, weights.of_set)
+        return cls(initial, slopes, offsets, of_units, of_set)
 
 
 def _lines(

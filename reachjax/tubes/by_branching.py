@@ -18,7 +18,8 @@ from jaxtyping import Array, Float, Int
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, owned
-from reachjax.programs.unrolled import weighed_at_once
+from reachjax.programs.held import attained, held_bounds
+from reachjax.programs.unrolled import held_at_once
 from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import SolverStatus
@@ -74,7 +75,7 @@ def sets_by_branching(
     budget = setting.budget.with_work(of_programs)
     scenarios = Scenarios.of(loop, begun, horizon, setting.start)
     ladder = Ladder(loop, begun, around, scenarios, setting.start, nodes, budget, setting.note)
-    X, steps = X0, []
+    X, steps, ends = X0, list[Step](), list[tuple[Array, Array]]()
     for k, (region, proof, *_) in enumerate(known, start=1):
         steps.append(Step(setting, X, k - 1, tuple(steps)))
         X = region
@@ -82,7 +83,8 @@ def sets_by_branching(
         if isinstance(proof, BranchCertificate):
             ladder.spend(int(np.sum(proof.nodes)))
             work -= len(proof.by_products) * ladder.width**4
-        ladder.horizon.narrow(*_ends(*_fixed(X)))
+        ends.append(_ends(*_facets(X)))
+        ladder.horizon.narrow(*jax.device_get(jax.lax.stop_gradient(ends[-1])))
     left = (horizon - len(known)) / horizon
     budget.grant(left * of_programs)
     work = max(work, left * PRODUCTS)
@@ -106,8 +108,7 @@ def sets_by_branching(
             )
         offsets = proved = owned(climbed.bounds)
         if not is_concrete(setting.loop, X0, directions):
-            derivative = _weighed if loop.curved else _replayed
-            moving = derivative(setting, X0, box, directions, climbed, ladder, horizon, k)
+            moving = _moving(setting, X0, box, directions, climbed, ladder, ends, horizon)
             moving = jnp.where(jnp.isfinite(moving), moving, 0.0)  # what overflows has none
             offsets = proved + (moving - jax.lax.stop_gradient(moving))
         gaps = climbed.bounds - climbed.attained
@@ -125,49 +126,48 @@ def sets_by_branching(
             offsets, products = _with_products(steps[-1], directions, offsets, opened, share)
         X = Polytope(directions, offsets)
         seconds = time.perf_counter() - began
-        shut = _fixed(X)[1] - climbed.attained <= setting.gap * ranges
+        shut = np.asarray(jax.lax.stop_gradient(offsets)) - climbed.attained <= setting.gap * ranges
         codes = np.where(shut, int(SolverStatus.SOLVED), climbed.codes)
         proof = _certificate(climbed, codes, offsets, products, opened, seconds)
         yield Reached(X, proof, climbed.ended, climb=False)
-        ladder.horizon.narrow(*_ends(*_fixed(X)))
+        ends.append(_ends(directions, offsets))
+        ladder.horizon.narrow(*jax.device_get(jax.lax.stop_gradient(ends[-1])))
 
 
-def _replayed(
+def _moving(
     setting: Setting,
     X0: AbstractSet,
     box: Box,
     directions: Float[Array, "f n_x"],
     climbed: Climbed,
     ladder: Ladder,
+    known: Sequence[tuple[Array, Array]],
     horizon: int,
-    k: int,
 ) -> Float[Array, " f"]:
-    """Numbers with the derivatives of what is proved, as of trajectories that attain it."""
-    held = Replay.of(ladder.horizon, *ladder.settled(climbed), horizon)
-    return replayed(setting.loop, X0, box, directions, held, k, setting.start)
+    """Numbers with the derivatives of what is proved.
 
-
-def _weighed(
-    setting: Setting,
-    X0: AbstractSet,
-    box: Box,
-    directions: Float[Array, "f n_x"],
-    climbed: Climbed,
-    ladder: Ladder,
-    horizon: int,
-    k: int,
-) -> Float[Array, " f"]:
-    """Numbers with the derivatives of what forms and the facts that decide prove.
-
-    What a smooth loop's forms leave out is part of its bounds, which no trajectory attains.
+    Where trajectories attain all of it, theirs; else, as of smooth loops, whose forms leave something
+    out, those of forms and of the facts that decide.
     """
-    by_form = climbed.rungs == Rung.AFFINE_FORM
-    multipliers = np.where(by_form[:, None], 0.0, climbed.multipliers)
-    held, begun = ladder.horizon.weights(multipliers, horizon), ladder.horizon.start
-    if not begun.round:  # of a program's solution, whose reduced costs are zero but for rounding
-        there = np.where(by_form[:, None], np.nan, climbed.columns[:, : begun.count])
-        held = held._replace(attained=there)
-    return weighed_at_once(setting.loop, X0, box, directions, held, setting.start)[k - 1]
+    k, begun = len(ladder.horizon.steps), ladder.horizon
+    columns, multipliers, settled = ladder.settled(climbed)
+    if settled.all():
+        held = Replay.of(begun, columns, multipliers, horizon)
+        return replayed(setting.loop, X0, box, directions, held, k, setting.start)
+    forms = climbed.rungs == Rung.AFFINE_FORM
+    bounds = [
+        None
+        if by_form
+        else attained(begun, climbed.about.rows[i : i + 1], multipliers[i], columns[i])
+        for i, by_form in enumerate(forms & ~settled)
+    ]
+    nowhere = jnp.full((horizon - len(known), len(directions.T)), jnp.inf)
+    ends = (
+        jnp.concatenate([jnp.stack(side), sign * nowhere]) if side else sign * nowhere
+        for side, sign in zip(zip(*known, strict=True) if known else ((), ()), (-1, 1), strict=True)
+    )
+    given = setting.loop, X0, box, directions, held_bounds(begun, bounds, horizon)
+    return held_at_once(*given, tuple(ends), setting.start)[k - 1]
 
 
 def _with_products(
@@ -183,26 +183,25 @@ def _with_products(
     return offsets.at[opened].set(jnp.where(better, found, offsets[opened])), proof
 
 
-def _fixed(X: AbstractSet) -> tuple[np.ndarray, np.ndarray]:
-    """Directions and offsets of a set's facets, without derivatives."""
+def _facets(X: AbstractSet) -> tuple[Array, Array]:
+    """Directions and offsets of a set's facets."""
     flat, _ = X.parts
     assert flat is not None  # as templates have it
-    rows, offsets = jax.lax.stop_gradient(flat.facets)
-    return np.asarray(rows), np.asarray(offsets)
+    return flat.facets
 
 
-def _ends(rows: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _ends(rows: Float[Array, "f n"], offsets: Float[Array, " f"]) -> tuple[Array, Array]:
     """Bounds of the state that facets along the axes are; infinite where there is none."""
-    n = rows.shape[1]
-    lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
-    for row, offset in zip(rows, offsets, strict=True):
+    fixed, n = np.asarray(jax.lax.stop_gradient(rows)), rows.shape[1]
+    lower, upper = jnp.full(n, -jnp.inf), jnp.full(n, jnp.inf)
+    for row, offset in zip(fixed, offsets, strict=True):
         (there,) = np.nonzero(row)
         if len(there) == 1 and abs(row[there[0]]) == 1.0:
             i = there[0]
             if row[i] > 0:
-                upper[i] = min(upper[i], offset)
+                upper = upper.at[i].min(offset)
             else:
-                lower[i] = max(lower[i], -offset)
+                lower = lower.at[i].max(-offset)
     return lower, upper
 
 

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.programs.held import Attained, Facets, by_cut, held_bounds
 from reachjax.programs.horizon import Horizon
-from reachjax.programs.unrolled import FactWeights, weighed_at_once
+from reachjax.programs.unrolled import HeldBounds, held_at_once
 from reachjax.sets import AbstractSet, Box, Polytope
 from reachjax.sets.cells import Cell
-from reachjax.sets.polyhedra import support
 from reachjax.tubes.steps import Setting
 
 LOOSE = 1e-6
@@ -49,6 +49,7 @@ def moving_offsets(
     sides = np.where(upper > lower, upper - lower, 1.0)
     fixed = jax.lax.stop_gradient((setting.loop, X0, directions))
     loop, region, rows = jax.device_get(fixed)
+    everywhere = tuple(jnp.full((len(rows), len(sides)), side * jnp.inf) for side in (-1, 1))
     for facet, cell in enumerate(deciding):
         if id(cell) not in known:
             ends = (np.asarray(end) for end in (cell.box.lower, cell.box.upper))
@@ -56,8 +57,8 @@ def moving_offsets(
             around = Box(*(box.lower + share * (box.upper - box.lower) for share in shares))
             part = X0.cut(around) if isinstance(X0, Polytope) else around
             held = _held(loop, region, rows, cell, k, setting.start)
-            given = setting.loop, part, around, directions[k], held, setting.start
-            known[id(cell)] = weighed_at_once(*given)[k]
+            given = setting.loop, part, around, directions[k], held, everywhere, setting.start
+            known[id(cell)] = held_at_once(*given)[k]
         offsets.append(known[id(cell)][facet])
     return jnp.stack(offsets)
 
@@ -69,37 +70,30 @@ def _held(
     cell: Cell,
     k: int,
     start: int,
-) -> FactWeights:
-    """Multipliers of facets of the initial set and of a cell's box that decide bounds there.
+) -> HeldBounds:
+    """What bounds over a cell rest on: forms, and what the initial set and its box are cut by.
 
     What a box is cut by decides where programs bound a form better than its norms do. The box is a
     little larger for them, so that where the initial set has a corner, its own facets decide.
     """
     loop, part, box = jax.device_get((loop, cell.part, cell.box))
     horizon = Horizon(loop, part, box, start)
-    forms = horizon.state
-    for step in range(len(directions)):
+    for _ in range(k + 1):
         horizon.advance()
-        forms = directions[k] @ horizon.state if step == k else forms
-    begun, count = horizon.start, len(directions[k])
-    weights = horizon.weights(np.zeros((count, len(horizon.facts.rows))), len(directions))
-    weights = weights._replace(
-        of_units=weights.of_units[:, :, :0]
-    )  # forms alone, no facts of units
-    if not isinstance(X0, Polytope):
-        return weights
-    room = LOOSE * np.max(box.upper - box.lower)
-    A, b = (np.asarray(each) for each in X0.cut(Box(box.lower - room, box.upper + room)).facets)
-    weights = weights._replace(of_set=np.zeros((count, len(b))))
-    first, products = np.split(forms.columns[:, : begun.count], [len(begun.spread)], axis=1)
-    by_cut = np.flatnonzero(forms.ends(begun, cut=True)[1] < forms.ends(begun)[1])
-    if not len(by_cut):
-        return weights
-    try:
-        _, Y, points = support(A, b, first[by_cut] @ begun.back)
-    except (ValueError, RuntimeError):  # too thin for programs
-        return weights
-    weights.of_set[by_cut] = Y
-    there = np.concatenate([(points - begun.center) @ begun.back.T, np.sign(products[by_cut])], 1)
-    weights.attained[by_cut] = there
-    return weights
+    forms, bounds = (
+        directions[k] @ horizon.state,
+        list[Attained | None]([None] * len(directions[k])),
+    )
+    facets: Facets | None = None
+    if isinstance(X0, Polytope):
+        room = LOOSE * np.max(box.upper - box.lower)
+        facets = X0.cut(Box(box.lower - room, box.upper + room)).facets
+        upper = forms.ends(horizon.start)[1]
+        decided = np.flatnonzero(forms.ends(horizon.start, cut=True)[1] < upper)
+        try:
+            found = by_cut(horizon.start, forms[decided], facets) if len(decided) else []
+            for number, bound in zip(decided, found, strict=True):
+                bounds[number] = bound
+        except (ValueError, RuntimeError):  # too thin for programs
+            pass
+    return held_bounds(horizon, bounds, len(directions), facets)

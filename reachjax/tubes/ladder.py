@@ -10,7 +10,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 
 from reachjax.loops import ClosedLoop
@@ -135,22 +135,26 @@ class Ladder:
         ranges = partial(self._ranges, budget or self._budget) if tighten and self._nodes else None
         self.horizon.advance(ranges)
 
-    def _ranges(self, budget: Budget, forms: AffineForms) -> Float[np.ndarray, "k m"] | None:
-        """Multipliers that bound the inputs of units from both sides; None if there is no time."""
+    def _ranges(
+        self, budget: Budget, forms: AffineForms
+    ) -> tuple[Float[np.ndarray, "k m"], Float[np.ndarray, "k n"]] | None:
+        """Multipliers that bound the inputs of units from both sides, and where; None without time."""
         if budget.late or budget.work <= 0:
             return None
         facts = self.horizon.facts
         self._programs.grow(facts, self.horizon.varying)
         self._note(f"ranges of {len(forms.rows) // 2} units")
         found = np.zeros((len(forms.rows), len(facts.rows)))
-        for row, constant, multipliers in zip(forms.columns, forms.rows, found, strict=True):
+        there = np.zeros((len(forms.rows), facts.columns.shape[1]))
+        for number, row in enumerate(forms.columns):
             if budget.work <= 0 or budget.late:
                 break
             self.spend(1)
-            vertex = self._programs.largest(row[None], constant[:1], (), budget)
+            vertex = self._programs.largest(row[None], forms.rows[number, :1], (), budget)
             if vertex is not None and len(vertex.columns):
-                multipliers[:] = np.maximum(vertex.multipliers, 0.0)
-        return found
+                found[number] = np.maximum(vertex.multipliers, 0.0)
+                there[number] = vertex.columns
+        return found, there
 
     @property
     def _size(self) -> int:
@@ -322,10 +326,11 @@ class Ladder:
 
     def settled(
         self, climbed: Climbed
-    ) -> tuple[Float[np.ndarray, "f n"], Float[np.ndarray, "f m"]]:
-        """Columns and multipliers that derivatives of facets' bounds hold."""
+    ) -> tuple[Float[np.ndarray, "f n"], Float[np.ndarray, "f m"], Bool[np.ndarray, " f"]]:
+        """Columns and multipliers that derivatives of facets' bounds hold, and which are attained."""
         found = climbed.multipliers.copy()
         columns, owner = climbed.columns.copy(), climbed.branches.owner
+        there = np.zeros(len(found), bool)
         phases = np.asarray(climbed.branches.phases)
         self._programs.grow(self.horizon.facts, self.horizon.varying)
         for facet in range(len(found)):
@@ -337,5 +342,5 @@ class Ladder:
             leaves, bound = phases[owner == facet], climbed.bounds[facet]
             given = settled(self.horizon, self._programs, form, at, leaves, bound, self._budget)
             if given is not None:
-                found[facet], columns[facet] = given, at
-        return columns, found
+                found[facet], columns[facet], there[facet] = given, at, True
+        return columns, found, there

@@ -132,15 +132,23 @@ class AffineForms:
             cut: whether what cuts the initial set is looked at as well (on the host, a linear
                 program for each end).
         """
+        return met(self.ends_by_form(start, cut), self.ends_by_interval())
+
+    def ends_by_form(self, start: InitialColumns, cut: bool = False) -> Ends:
+        """Lower and upper bounds `(k,)` by forms alone."""
         own, n = start.count, self.rows.shape[1]
-        center, middle = self.rows[:, 0], self.rows[:, 1]
+        center = self.rows[:, 0]
         lower, upper = start.bounds(self.rows[:, 2 : 2 + own], cut)
         largest = abs(constant(center)) + constant(larger(-lower, upper))
         rest = abs(self.rows[:, 2 + own :]).sum(axis=1) * (1 + gamma(n))
         slack = rest + (self.radii[:, 0] + gamma(8) * largest) * (1 + gamma(n))
-        by_forms = center + lower - slack, center + upper + slack
+        return center + lower - slack, center + upper + slack
+
+    def ends_by_interval(self) -> Ends:
+        """Lower and upper bounds `(k,)` by intervals alone."""
+        middle = self.rows[:, 1]
         reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(constant(middle))
-        return met(by_forms, (middle - reach, middle + reach))
+        return middle - reach, middle + reach
 
     def widened(self, width: int) -> AffineForms:
         """The same over at least so many columns, the new ones empty (numpy)."""

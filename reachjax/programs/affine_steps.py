@@ -87,8 +87,9 @@ class StepForms(NamedTuple):
     merged: Merged | None
 
 
-Ranges = Callable[[AbstractUnit, AffineForms, Ends, Sequence[UnitForms]], Ends]
-"""Bounds of a layer's inputs that are no worse than these, given the layers before."""
+Ranges = Callable[[AbstractUnit | None, AffineForms, Ends, Sequence[UnitForms]], Ends]
+"""Bounds of a layer's inputs that are no worse than these, given the layers before; or, of no unit,
+of the state after the step."""
 
 
 def states_facts(unit: AbstractUnit) -> bool:
@@ -126,7 +127,7 @@ def step_forms(
         slopes: of the units that are not smooth; None for those of their lines. What is found holds
             for any.
         known: a box that surely holds the successor, where one is known.
-        ranges: what else bounds the inputs of a layer, if anything does.
+        ranges: what else bounds the inputs of a layer, or the successor, if anything does.
         scratch: where the columns begin that a step needs in between, if there is a place.
     """
     found: list[UnitForms] = []
@@ -171,6 +172,8 @@ def step_forms(
     ends = successor.ends(start)
     if known is not None:
         ends = met(ends, (known.lower, known.upper))
+    if ranges is not None:
+        ends = ranges(None, successor, ends, found)
     return StepForms(successor.within(Ball.between(*ends)), tuple(found), merged)
 
 

@@ -1,14 +1,14 @@
-"""What bounds over a horizon rest on, as compiled forms hold it while a derivative is taken.
+"""Where bounds over a horizon are attained, as compiled forms hold it while a derivative is taken.
 
 A bound is the largest value of a row over the columns, so the row's derivative where that is
 attained is the bound's (Danskin). Of a form that is where its norm is; of a linear program, at its
-vertex: there reduced costs are zero but for rounding, and their signs mean nothing. What better
-ranges of units rest on is held alike, so that lines of units move as they do.
+vertex: there reduced costs are zero but for rounding, and their signs mean nothing. Ranges of units
+are bounds too and are held alike, so that lines of units move as they do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,9 +16,9 @@ from jaxtyping import Float, Int
 
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns
-from reachjax.programs.horizon import OF_PRODUCTS, OF_SET, Horizon
+from reachjax.programs.horizon import Horizon
 from reachjax.programs.initial import InitialColumns
-from reachjax.programs.unrolled import HeldBounds
+from reachjax.programs.unrolled import INTERVAL, KNOWN, HeldBounds
 from reachjax.sets.polyhedra import support
 
 NEAR = 1e-7
@@ -32,19 +32,29 @@ class Attained(NamedTuple):
 
     Attributes:
         columns: `(n,)`, of the first columns.
-        multipliers: `(m,)`, of the first facts.
+        multipliers: `(m,)`, of the first facts of the horizon.
         of_set: `(r,)`, of the facets of what the initial set is cut by, beside those.
-        by_norm: whether it is attained instead where the norm of the initial columns is.
     """
 
     columns: Float[np.ndarray, " n"]
     multipliers: Float[np.ndarray, " m"] = np.zeros(0)
     of_set: Float[np.ndarray, " r"] = np.zeros(0)
-    by_norm: bool = False
+
+
+Source = Attained | None
+"""What a bound rests on: None for an interval."""
+
+
+class _Bound(NamedTuple):
+    """A bound, where compiled forms have its columns, and where its number is to be written."""
+
+    source: Attained
+    places: Int[np.ndarray, " n"]
+    slot: Int[np.ndarray, ""]
 
 
 class _Layer(NamedTuple):
-    """A layer of units and its place among the units of a step, and its columns'.
+    """A layer of units.
 
     Attributes:
         step: of the horizon.
@@ -60,57 +70,87 @@ class _Layer(NamedTuple):
     forms: UnitForms
     places: Int[np.ndarray, " n"]
 
-    @property
-    def here(self) -> slice:
-        """The units among those of the step."""
-        return slice(self.before, self.before + len(self.forms.places))
-
 
 def held_bounds(
-    horizon: Horizon, bounds: Sequence[Attained | None], steps: int, facets: Facets | None = None
+    horizon: Horizon, bounds: Sequence[Source], steps: int, facets: Facets | None = None
 ) -> HeldBounds:
-    """What bounds of the last states rest on, and the ranges of units that these do.
+    """Where bounds of the last states are attained, and those of ranges that they rest on.
 
     Args:
         horizon: over some of the steps.
-        bounds: of directions; None for those of forms alone.
+        bounds: of directions.
         steps: over how many steps compiled forms go.
         facets: of the polytope that the initial set is cut by; None for the horizon's own.
     """
-    start, facts, own = horizon.start, horizon.facts, facets is None
+    start, own = horizon.start, facets is None
     if own and start.cut is not None:
         facets = start.cut.facets
-    layers, last = _layers(horizon, steps)
+    layers, places = _layers(horizon, steps)
     units = sum(len(layer.forms.places) for layer in layers if layer.step == 0)
-    ranges, numbers = np.zeros((steps, 2, units)), np.full((steps, 2, units), -1)
-    found = [(bound or Attained(np.zeros(0)), last) for bound in bounds]
+    ranges, states = np.zeros((steps, 2, units)), np.zeros((steps, 2, len(start.center)))
+    of_ranges, of_states = (np.full(part.shape, INTERVAL) for part in (ranges, states))
+    found = list[_Bound]()
     for layer in layers:
-        ranges[layer.step, :, layer.here] = np.stack([layer.forms.lower, layer.forms.upper])
-        for side, number, bound in _of_ranges(horizon, layer, facets):
-            numbers[layer.step, side, layer.here][number] = len(found)
-            found.append((bound, layer.places))
-    count = 1 << (len(found) - 1).bit_length()  # few shapes: each is compiled
+        here = slice(layer.before, layer.before + len(layer.forms.places))
+        ranges[layer.step, :, here] = layer.forms.lower, layer.forms.upper
+        given = _of_layer(horizon, layer, facets)
+        found += _told(given, layer.places, of_ranges[layer.step, :, here])
+    for step, (forms, (lower, upper)) in enumerate(zip(horizon.states, horizon.ends, strict=True)):
+        states[step] = lower, upper
+        sides = (-forms, -lower), (forms, upper)
+        given = [sources(start, rows, end, None) for rows, end in sides]
+        found += _told(given, places[step], of_states[step])
+        narrowed = [end < rows.ends(start)[1] - _near(rows) for rows, end in sides]
+        of_states[step] = np.where(narrowed, KNOWN, INTERVAL)
+    for part in (ranges, states):  # what comes later has no say, but shall be finite
+        part[len(horizon.steps) :] = part[len(horizon.steps) - 1]
+    nothing = Attained(np.zeros(0))
+    directions = [_Bound(bound or nothing, places[-1], np.zeros((), int)) for bound in bounds]
+    found = sorted(found, key=lambda bound: not _weighed(bound.source))
+    for number, bound in enumerate(found, start=len(bounds)):
+        if bound.slot != KNOWN:
+            bound.slot[...] = number
+    found = directions + found
+    weighed = len(bounds) + sum(_weighed(bound.source) for bound in found[len(bounds) :])
     more, between = step_columns(horizon.loop)
-    columns = np.zeros((count, start.count + steps * more + between))
-    multipliers = np.zeros((count, len(facts.rows)))
-    of_set = np.zeros((count, 0 if facets is None else len(facets[1])))
-    for k, (bound, places) in enumerate(found):
-        there = np.flatnonzero(places[: len(bound.columns)] >= 0)
-        columns[k, places[there]] = bound.columns[there]
-        multipliers[k, : len(bound.multipliers)] = bound.multipliers
-        of_set[k, : len(bound.of_set)] = bound.of_set
-    if own:
-        of_set += horizon.of_kind(multipliers, OF_SET)
+    # few shapes: each is compiled
+    count, some = (1 << (number - 1).bit_length() for number in (len(found), weighed))
+    columns = np.zeros((max(count, some), start.count + steps * more + between))
+    multipliers = np.zeros((some, len(horizon.facts.rows)))
+    of_set = np.zeros((some, 0 if facets is None else len(facets[1])))
+    for k, (source, where, _) in enumerate(found):
+        there = np.flatnonzero(where[: len(source.columns)] >= 0)
+        columns[k, where[there]] = source.columns[there]
+    for k, (source, *_) in enumerate(found[:weighed]):
+        multipliers[k, : len(source.multipliers)] = source.multipliers
+        of_set[k, : len(source.of_set)] = source.of_set
     return HeldBounds(
-        of_units=horizon.of_units(multipliers, steps),
-        of_set=of_set,
-        of_products=horizon.of_kind(multipliers, OF_PRODUCTS),
         columns=columns,
-        by_norm=np.array([bound.by_norm for bound, _ in found] + [False] * (count - len(found))),
-        by_form=np.array([bound is None for bound in bounds]),
+        of_units=horizon.of_units(multipliers, steps),
+        of_set=of_set + horizon.of_set(multipliers) if own else of_set,
+        by_interval=np.array([bound is None for bound in bounds]),
         ranges=ranges,
-        of_ranges=numbers,
+        of_ranges=of_ranges,
+        states=states,
+        of_states=of_states,
     )
+
+
+def _weighed(source: Attained) -> bool:
+    """Whether there are multipliers."""
+    return bool(len(source.multipliers) + len(source.of_set))
+
+
+def _told(
+    given: Sequence[Sequence[Source]], places: Int[np.ndarray, " n"], slots: Int[np.ndarray, "2 k"]
+) -> list[_Bound]:
+    """The bounds of both sides that no interval gives, and where their numbers go."""
+    return [
+        _Bound(source, places, slots[side, k : k + 1].reshape(()))
+        for side, sources in enumerate(given)
+        for k, source in enumerate(sources)
+        if source is not None
+    ]
 
 
 def attained(
@@ -127,66 +167,79 @@ def attained(
         multipliers: of the facts.
         columns: where a program says that it is attained; those of rounding errors do not matter.
     """
-    start, count = horizon.start, horizon.start.count
-    facts = horizon.facts[: len(multipliers)]
+    start, facts = horizon.start, horizon.facts[: len(multipliers)]
     width = max(row.columns.shape[1], facts.columns.shape[1])
     weighed = row.widened(width).columns[0] + multipliers @ facts.widened(width).columns
-    first, there = weighed[None, :count], np.sign(weighed)
-    largest = start.bounds(first)[1][0] + abs(weighed[count:]).sum()
+    first, rest = np.split(weighed, [start.count])
+    there, near = np.sign(weighed), NEAR * abs(weighed).sum()
     varying = horizon.varying
     varying = varying[varying < len(columns)]
     there[varying] = columns[varying]
-    near = NEAR * abs(weighed).sum()
-    if not start.round and weighed @ there > largest - near:
-        return Attained(there, multipliers)
-    by_norm = start.bounds(first)[1][0] + weighed[count:] @ there[count:]
-    if abs(by_norm - largest) > near:  # the program has not found where it is
-        there = np.sign(weighed)
-    return Attained(there, multipliers, by_norm=True)
+    by_norm = start.bounds(first[None])[1][0]
+    largest = by_norm + abs(rest).sum()
+    if start.round or weighed @ there < largest - near:
+        there[: start.count] = start.attaining(first[None])[0]
+        if by_norm + rest @ there[start.count :] < largest - near:  # the program did not find it
+            there[start.count :] = np.sign(rest)
+    return Attained(there, multipliers)
 
 
-def by_cut(start: InitialColumns, rows: AffineForms, facets: Facets) -> list[Attained]:
-    """Where rows are largest on a polytope that cuts the initial set.
+def sources(
+    start: InitialColumns,
+    rows: AffineForms,
+    ends: Float[np.ndarray, " k"],
+    facets: Facets | None,
+) -> list[Source]:
+    """What upper bounds of rows rest on that are of forms or intervals.
 
-    Raises:
-        ValueError, RuntimeError: the polytope is too thin for programs.
+    Args:
+        start: what the first columns are.
+        rows: one a bound.
+        ends: the bounds.
+        facets: of the polytope that the initial set is cut by, where rows are bounded on it.
     """
-    first, rest = np.split(rows.columns, [len(start.spread)], axis=1)
-    A, b = facets
-    _, multipliers, points = support(np.asarray(A), np.asarray(b), first @ start.back)
-    there = np.concatenate([(points - start.center) @ start.back.T, np.sign(rest)], axis=1)
-    return [
-        Attained(columns, of_set=of_set) for columns, of_set in zip(there, multipliers, strict=True)
-    ]
+    first, rest = np.split(rows.columns, [start.count], axis=1)
+    there = np.concatenate([start.attaining(first), np.sign(rest)], axis=1)
+    found: list[Source] = [Attained(columns) for columns in there]
+    better = ends < rows.ends_by_form(start)[1] - _near(rows)
+    intervals = better & (rows.ends_by_interval()[1] < ends + _near(rows))
+    for number in np.flatnonzero(intervals):
+        found[number] = None
+    cut = np.flatnonzero(better & ~intervals)
+    if facets is None or not len(cut) or start.cut is None or not start.cut.needs_programs:
+        return found
+    A, b = (np.asarray(part) for part in facets)
+    w = len(start.spread)
+    try:
+        _, multipliers, points = support(A, b, first[cut, :w] @ start.back)
+    except (ValueError, RuntimeError):  # too thin for programs
+        return found
+    states = (points - start.center) @ start.back.T
+    for number, state, of_set in zip(cut, states, multipliers, strict=True):
+        columns = np.concatenate([state, np.sign(rows.columns[number, w:])])
+        found[number] = Attained(columns, of_set=of_set)
+    return found
 
 
-def _of_ranges(
-    horizon: Horizon, layer: _Layer, facets: Facets | None
-) -> Iterator[tuple[int, int, Attained]]:
-    """Side, number of the unit, and where it is attained, of ends that no form gives."""
-    known, inputs = set[tuple[int, int]](), layer.forms.inputs
-    for end in horizon.tightened:
-        if (end.step, end.layer) == (layer.step, layer.number):
-            row = inputs[end.unit : end.unit + 1]
-            known.add((end.side, end.unit))
-            row = row if end.side else -row
-            yield end.side, end.unit, attained(horizon, row, end.multipliers, end.columns)
-    cut = horizon.start.cut
-    if facets is None or cut is None or not cut.needs_programs:
-        return
-    lower, upper = inputs.ends(horizon.start)
-    near = NEAR * (upper - lower)
-    better = layer.forms.lower > lower + near, layer.forms.upper < upper - near
-    for side, rows in enumerate((-inputs, inputs)):
-        units = [k for k in np.flatnonzero(better[side]) if (side, k) not in known]
-        if units:
-            yield from zip(
-                [side] * len(units), units, by_cut(horizon.start, rows[units], facets), strict=True
-            )
+def _of_layer(horizon: Horizon, layer: _Layer, facets: Facets | None) -> list[list[Source]]:
+    """What lower and upper ends of the inputs of units rest on."""
+    inputs, found = layer.forms.inputs, list[list[Source]]()
+    sides = (-inputs, -layer.forms.lower), (inputs, layer.forms.upper)
+    for side, (rows, ends) in enumerate(sides):
+        found.append(sources(horizon.start, rows, np.asarray(ends), facets))
+        for end in horizon.tightened:
+            if (end.step, end.layer, end.side) == (layer.step, layer.number, side):
+                row = rows[end.unit : end.unit + 1]
+                found[side][end.unit] = attained(horizon, row, end.multipliers, end.columns)
+    return found
 
 
-def _layers(horizon: Horizon, steps: int) -> tuple[list[_Layer], Int[np.ndarray, " n"]]:
-    """Layers of units, and where compiled forms have all columns.
+def _near(rows: AffineForms) -> Float[np.ndarray, " k"]:
+    return NEAR * abs(rows.columns).sum(axis=1)
+
+
+def _layers(horizon: Horizon, steps: int) -> tuple[list[_Layer], list[Int[np.ndarray, " n"]]]:
+    """Layers of units, and where compiled forms have all columns after each step.
 
     Args:
         horizon: over some of the steps.
@@ -195,7 +248,7 @@ def _layers(horizon: Horizon, steps: int) -> tuple[list[_Layer], Int[np.ndarray,
     start, (more, between) = horizon.start, step_columns(horizon.loop)
     places = np.full(horizon.width + between, -1)
     places[: start.count] = np.arange(start.count)
-    end, found = start.count + steps * more, list[_Layer]()
+    end, found, after = start.count + steps * more, list[_Layer](), list[np.ndarray]()
     for step, (layers, merged) in enumerate(zip(horizon.steps, horizon.merged, strict=True)):
         place, scratch, before = start.count + step * more, end, 0
         summed = range(0) if merged is None else merged.layers
@@ -213,4 +266,5 @@ def _layers(horizon: Horizon, steps: int) -> tuple[list[_Layer], Int[np.ndarray,
                 here = np.flatnonzero(merged.places >= 0)
                 places[merged.places[here]] = place + here
                 place += len(merged.places)
-    return found, places
+        after.append(places.copy())
+    return found, after

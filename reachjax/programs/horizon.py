@@ -81,6 +81,8 @@ class Horizon:
         origins: `(m, 3)`, of each fact the step, the unit's number among those of a step, and which
             of its facts it is; `OF_SET` or `OF_PRODUCTS` for what is of no unit.
         merged: of each step, what a smooth controller leaves out.
+        states: forms of the states after each step, with intervals of the step's own arithmetic.
+        ends: bounds of the states after each step, the best that are known.
         tightened: ends of ranges that are better known than by forms and intervals.
 
     Example:
@@ -101,6 +103,8 @@ class Horizon:
         self.state = AffineForms.beginning(self.start)
         self.steps: list[tuple[UnitForms, ...]] = []
         self.merged: list[Merged | None] = []
+        self.states: list[AffineForms] = []
+        self.ends: list[Ends] = []
         self.tightened: list[Tightened] = []
         self._varying = np.zeros(0, dtype=int)
         self._width = self.start.count
@@ -149,9 +153,12 @@ class Horizon:
         """
 
         def ranges(
-            unit: AbstractUnit, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
+            unit: AbstractUnit | None, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
         ) -> Ends:
             self._state_facts(found)
+            if unit is None:
+                self.states.append(y)
+                return ends
             self._width = max(self._width, y.columns.shape[1])
             if isinstance(unit, SmoothUnit):  # its range is that of its form, but for little
                 return ends
@@ -186,6 +193,7 @@ class Horizon:
                 self.loop, self.state, t, self.start, ranges=ranges
             )
             self._state_facts(units)
+        self.ends.append(self.state.ends_by_interval())
         self.steps.append(units)
         self.merged.append(merged)
         # those of units of a smooth controller are summed up in the merged ones
@@ -266,13 +274,13 @@ class Horizon:
         found[:, step[there], which[there], unit[there]] = multipliers[:, there]
         return found
 
-    def of_kind(self, multipliers: Float[np.ndarray, "k m"], kind: int) -> Float[np.ndarray, "k p"]:
-        """Multipliers of the facts of the initial set, `OF_SET`, or of products, `OF_PRODUCTS`."""
-        return multipliers[:, self.origins[:, 0] == kind]
+    def of_set(self, multipliers: Float[np.ndarray, "k m"]) -> Float[np.ndarray, "k r"]:
+        """Multipliers of the facets of what the initial set is cut by."""
+        return multipliers[:, self.origins[:, 0] == OF_SET]
 
     def narrow(self, lower: Float[np.ndarray, " n_x"], upper: Float[np.ndarray, " n_x"]) -> None:
         """Meet the state with bounds that surely hold it."""
-        ends = met(self.state.ends(self.start), (lower, upper))
+        self.ends[-1] = ends = met(self.state.ends(self.start), (lower, upper))
         self.state = self.state.within(Ball.between(*ends))
 
     def bounds(

@@ -18,41 +18,43 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.host import in_numpy
-from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, states_facts, step_columns, step_forms
-from reachjax.programs.initial import Ends, InitialColumns, constant, met, product_facts
+from reachjax.programs.initial import Ends, InitialColumns, constant
 from reachjax.sets import AbstractSet, Box
+
+INTERVAL, KNOWN = -1, -2
+"""In the place of a bound's number: that of an interval, and what is known of a state besides."""
 
 Carry = tuple[AffineForms, Array]
 
 
 class HeldBounds(NamedTuple):
-    """What `B` bounds of rows over a horizon rest on, of which derivatives are taken.
+    """Where bounds of rows over a horizon are attained, of which derivatives are taken.
 
-    A bound is the largest value of its row and weighed facts over the columns. Where that is
-    attained, multipliers and columns may be held (the envelope theorem). Bounds of directions of
-    states come first, then those of inputs of units that something better than their forms proved.
+    A bound is the largest value of its row and of weighed facts over the columns; those where it is
+    attained are held, and multipliers (the envelope theorem). Directions of states come first.
 
     Attributes:
-        of_units: `(B, N, b, units)`, multipliers of the facts of each unit, of which there are `b`.
-        of_set: `(B, r)`, of the facets of the initial set.
-        of_products: `(B, p)`, of the facts of products of its columns.
         columns: `(B, n)`, where each is attained, in the places of compiled forms.
-        by_norm: `(B,)`, whether it is attained instead where the norm of its initial columns is.
-        by_form: `(f,)`, whether directions are bounded by their forms alone, or by intervals.
+        of_units: `(P, N, b, units)`, multipliers of the facts of each unit, of which there are `b`,
+            of the first bounds; all others have none.
+        of_set: `(P, r)`, of the facets of the initial set.
+        by_interval: `(f,)`, whether directions are bounded by intervals instead.
         ranges: `(N, 2, units)`, lower and upper bounds of the units' inputs, as they were known.
-        of_ranges: `(N, 2, units)`, which of the bounds they are; -1 for those of forms.
+        of_ranges: `(N, 2, units)`, which of the bounds they are, or `INTERVAL`.
+        states: `(N, 2, n_x)`, those of states.
+        of_states: `(N, 2, n_x)`, which of the bounds they are, or `INTERVAL`, or `KNOWN`.
     """
 
-    of_units: Float[Array | np.ndarray, "B N b units"]
-    of_set: Float[Array | np.ndarray, "B r"]
-    of_products: Float[Array | np.ndarray, "B p"]
     columns: Float[Array | np.ndarray, "B n"]
-    by_norm: Bool[Array | np.ndarray, " B"]
-    by_form: Bool[Array | np.ndarray, " f"]
+    of_units: Float[Array | np.ndarray, "P N b units"]
+    of_set: Float[Array | np.ndarray, "P r"]
+    by_interval: Bool[Array | np.ndarray, " f"]
     ranges: Float[Array | np.ndarray, "N 2 units"]
     of_ranges: Int[Array | np.ndarray, "N 2 units"]
+    states: Float[Array | np.ndarray, "N 2 n_x"]
+    of_states: Int[Array | np.ndarray, "N 2 n_x"]
 
 
 class ByForms(NamedTuple):
@@ -169,53 +171,41 @@ def held_at_once(
     box: Box,
     directions: Float[Array, "f n_x"],
     held: HeldBounds,
-    known: tuple[Float[Array, "N n_x"], Float[Array, "N n_x"]],
+    known: Float[Array, "N 2 n_x"],
     t: int = 0,
 ) -> Float[Array, "N f"]:
     """Numbers with the derivatives of bounds of directions after 1, ..., N steps, compiled.
-
-    Each has the value of its direction's form and of the facts so far where the bound is attained.
 
     Args:
         loop: the closed loop.
         X0: the initial set.
         box: around it.
         directions: one row a bound.
-        held: what the bounds rest on.
-        known: bounds of the state after each step that narrow its interval, with derivatives of
-            their own; infinite where there is none.
+        held: where the bounds are attained, and those of ranges that they rest on.
+        known: bounds of the states that narrow their intervals, with derivatives of their own.
         t: the time of the initial set.
     """
     start, steps = InitialColumns.of(X0, box, loop.curved), len(held.ranges)
-    more, between = step_columns(loop)
-    first, end, count = start.count, start.count + steps * more, start.count
-    state, columns = AffineForms.beginning(start, end + between), jnp.asarray(held.columns)
+    (more, between), first = step_columns(loop), start.count
+    end, weights = first + steps * more, jnp.moveaxis(jnp.asarray(held.of_units), 1, 0)
+    columns, count = jnp.asarray(held.columns), len(held.of_units)
+    state, total = AffineForms.beginning(start, end + between), jnp.zeros(count)
 
-    def values(rows: AffineForms, columns: Float[Array, "k n"]) -> Float[Array, "k c"]:
-        """Of one row each: its initial columns, and beside these its value."""
-        rest = rows.rows[:, 0] + (rows.columns[:, count:] * columns[:, count:]).sum(axis=1)
-        return jnp.concatenate([rows.columns[:, :count], rest[:, None]], axis=1)
+    def weighed(facts: AffineForms, weights: Float[Array, "P k"]) -> Float[Array, " P"]:
+        values = facts.rows[:, 0] + columns[:count] @ facts.columns.T
+        return (weights * values).sum(axis=1)
 
-    def weighed(facts: AffineForms, weights: Float[Array, "B k"]) -> Float[Array, "B c"]:
-        rest = facts.rows[:, 0] + columns[:, count:] @ facts.columns[:, count:].T
-        rest = (weights * rest).sum(axis=1)
-        return jnp.concatenate([weights @ facts.columns[:, :count], rest[:, None]], axis=1)
-
-    def largest(values: Float[Array, "k c"], which: Any) -> Float[Array, " k"]:
-        rows, rest = values[:, :-1], values[:, -1]
-        attained = (rows * columns[which, :count]).sum(axis=1)
-        return rest + jnp.where(held.by_norm[which], start.bounds(rows)[1], attained)
-
-    facts, radii = map(jnp.asarray, product_facts(start))
-    facts = jnp.pad(facts, ((0, 0), (0, end + between - start.count)))
-    total = weighed(AffineForms(facts, radii), held.of_products)
     if held.of_set.shape[1]:
         A, b = X0.facets
-        total = total + weighed(b - A @ state, held.of_set)
+        total = weighed(b - A @ state, jnp.asarray(held.of_set))
 
     def advance(carry: Carry, step: Any) -> tuple[Carry, Array]:
-        (state, total), (k, given, known_ends, numbers, narrowed) = carry, step
+        (state, total), (k, given, ranges_known, of_ranges, *of_state) = carry, step
         told = done = 0
+
+        def attained(rows: AffineForms, which: Any) -> Float[Array, " k"]:
+            weighed = jnp.where(which < count, total[jnp.minimum(which, count - 1)], 0.0)
+            return rows.rows[:, 0] + (rows.columns * columns[which]).sum(axis=1) + weighed
 
         def tell(units: Sequence[UnitForms]) -> None:
             """Add what bounds make of the facts of layers that are new."""
@@ -227,39 +217,39 @@ def held_at_once(
                 ends: Any = layer.lower, layer.upper
                 said = layer.unit.facts(layer.inputs, layer.outputs, *ends)
                 sectors = (block.rows for block in said.blocks if block.mark is Mark.SECTOR)
-                for rows, weights in zip(sectors, jnp.moveaxis(given, 1, 0), strict=False):
-                    total = total + weighed(rows, weights[:, here])
+                for rows, of_unit in zip(sectors, jnp.moveaxis(given, 1, 0), strict=False):
+                    total = total + weighed(rows, of_unit[:, here])
             told = len(units)
 
         def ranges(
-            unit: AbstractUnit, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
+            unit: AbstractUnit | None, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
         ) -> Ends:
             tell(found)
             here = slice(done, done + len(y.rows))
-            moving = []
-            for form, end, sign, which in zip((-y, y), ends, (-1, 1), numbers, strict=True):
-                own = which[here]
-                proved = largest(values(form, columns[own]) + total[own], own)
-                moving.append(jnp.where(own >= 0, sign * proved, end))
-            lower, upper = (
-                end + (each - jax.lax.stop_gradient(each))
-                for end, each in zip(known_ends[:, here], moving, strict=True)
-            )
-            return lower, upper
+            values, which, besides = of_state if unit is None else (ranges_known, of_ranges, None)
+            moved = []
+            sides = zip((-y, y), (-1, 1), values, which, y.ends_by_interval(), strict=True)
+            for side, (form, sign, value, bound, end) in enumerate(sides):
+                if unit is not None:
+                    value, bound = value[here], bound[here]
+                by_form = sign * attained(form, jnp.maximum(bound, 0))
+                moving = jnp.where(bound == INTERVAL, end, by_form)
+                if besides is not None:
+                    moving = jnp.where(bound == KNOWN, besides[side], moving)
+                moved.append(value + (moving - jax.lax.stop_gradient(moving)))
+            return moved[0], moved[1]
 
-        state, units, _ = step_forms(
-            loop, state, t + k, start, place=first + k * more, scratch=end, ranges=ranges
+        place = first + k * more
+        following, *_ = step_forms(
+            loop, state, t + k, start, place=place, scratch=end, ranges=ranges
         )
-        tell(units)
-        forms, own = directions @ state, np.arange(len(directions))
-        attained = largest(values(forms, columns[own]) + total[own], own)
-        found = jnp.where(held.by_form, forms.ends(start)[1], attained)
-        state = state.within(Ball.between(*met(state.ends(start), narrowed)))
-        return (state, total), found
+        forms = directions @ following
+        by_form = attained(forms, np.arange(len(directions)))
+        found = jnp.where(held.by_interval, forms.ends_by_interval()[1], by_form)
+        return (following, total), found
 
-    of_units = jnp.moveaxis(held.of_units, 1, 0)
-    ranges, numbers = jnp.asarray(held.ranges), jnp.asarray(held.of_ranges)
-    given = jnp.arange(steps), of_units, ranges, numbers, known
+    parts = held.ranges, held.of_ranges, held.states, held.of_states
+    given = jnp.arange(steps), weights, *map(jnp.asarray, parts), known
     return jax.lax.scan(advance, (state, total), given)[1]
 
 

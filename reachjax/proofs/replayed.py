@@ -27,7 +27,7 @@ from reachjax.loops.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.affine_steps import UnitForms
-from reachjax.programs.horizon import OF_SET, Horizon
+from reachjax.programs.horizon import Horizon
 from reachjax.programs.initial import InitialColumns
 from reachjax.sets import AbstractSet, Box
 
@@ -79,7 +79,7 @@ class Replay(Replaceable):
             )
         of_units, of_set = (
             horizon.of_units(multipliers, steps),
-            horizon.of_kind(multipliers, OF_SET),
+            horizon.of_set(multipliers),
         )
         initial = columns[:, : horizon.start.spread.shape[1]]
         return cls(initial, slopes, offsets, of_units, of_set)

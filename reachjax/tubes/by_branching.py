@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, owned
-from reachjax.programs.held import attained, held_bounds
+from reachjax.programs.held import attained, held_bounds, sources
 from reachjax.programs.unrolled import held_at_once
 from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.facets import Certificate
@@ -75,7 +75,7 @@ def sets_by_branching(
     budget = setting.budget.with_work(of_programs)
     scenarios = Scenarios.of(loop, begun, horizon, setting.start)
     ladder = Ladder(loop, begun, around, scenarios, setting.start, nodes, budget, setting.note)
-    X, steps, ends = X0, list[Step](), list[tuple[Array, Array]]()
+    X, steps, ends = X0, list[Step](), list[Array]()
     for k, (region, proof, *_) in enumerate(known, start=1):
         steps.append(Step(setting, X, k - 1, tuple(steps)))
         X = region
@@ -141,33 +141,26 @@ def _moving(
     directions: Float[Array, "f n_x"],
     climbed: Climbed,
     ladder: Ladder,
-    known: Sequence[tuple[Array, Array]],
+    known: Sequence[Float[Array, "2 n_x"]],
     horizon: int,
 ) -> Float[Array, " f"]:
     """Numbers with the derivatives of what is proved.
 
-    Where trajectories attain all of it, theirs; else, as of smooth loops, whose forms leave something
-    out, those of forms and of the facts that decide.
+    Where trajectories attain all of it, theirs; else those of forms and of the facts that decide:
+    forms of smooth loops leave something out.
     """
     k, begun = len(ladder.horizon.steps), ladder.horizon
     columns, multipliers, settled = ladder.settled(climbed)
     if settled.all():
         held = Replay.of(begun, columns, multipliers, horizon)
         return replayed(setting.loop, X0, box, directions, held, k, setting.start)
-    forms = climbed.rungs == Rung.AFFINE_FORM
-    bounds = [
-        None
-        if by_form
-        else attained(begun, climbed.about.rows[i : i + 1], multipliers[i], columns[i])
-        for i, by_form in enumerate(forms & ~settled)
-    ]
-    nowhere = jnp.full((horizon - len(known), len(directions.T)), jnp.inf)
-    ends = (
-        jnp.concatenate([jnp.stack(side), sign * nowhere]) if side else sign * nowhere
-        for side, sign in zip(zip(*known, strict=True) if known else ((), ()), (-1, 1), strict=True)
-    )
+    rows = climbed.about.rows
+    bounds = sources(begun.start, rows, climbed.bounds, None)
+    for i in np.flatnonzero(settled | (climbed.rungs != Rung.AFFINE_FORM)):
+        bounds[i] = attained(begun, rows[i : i + 1], multipliers[i], columns[i])
+    ends = [*known, *[jnp.zeros((2, len(directions.T)))] * (horizon - len(known))]
     given = setting.loop, X0, box, directions, held_bounds(begun, bounds, horizon)
-    return held_at_once(*given, tuple(ends), setting.start)[k - 1]
+    return held_at_once(*given, jnp.stack(ends), setting.start)[k - 1]
 
 
 def _with_products(
@@ -190,19 +183,16 @@ def _facets(X: AbstractSet) -> tuple[Array, Array]:
     return flat.facets
 
 
-def _ends(rows: Float[Array, "f n"], offsets: Float[Array, " f"]) -> tuple[Array, Array]:
+def _ends(rows: Float[Array, "f n"], offsets: Float[Array, " f"]) -> Float[Array, "2 n"]:
     """Bounds of the state that facets along the axes are; infinite where there is none."""
     fixed, n = np.asarray(jax.lax.stop_gradient(rows)), rows.shape[1]
-    lower, upper = jnp.full(n, -jnp.inf), jnp.full(n, jnp.inf)
+    found = jnp.stack([jnp.full(n, -jnp.inf), jnp.full(n, jnp.inf)])
     for row, offset in zip(fixed, offsets, strict=True):
         (there,) = np.nonzero(row)
         if len(there) == 1 and abs(row[there[0]]) == 1.0:
             i = there[0]
-            if row[i] > 0:
-                upper = upper.at[i].min(offset)
-            else:
-                lower = lower.at[i].max(-offset)
-    return lower, upper
+            found = found.at[1, i].min(offset) if row[i] > 0 else found.at[0, i].max(-offset)
+    return found
 
 
 def _certificate(

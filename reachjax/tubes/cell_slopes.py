@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.programs.held import Attained, Facets, by_cut, held_bounds
+from reachjax.programs.held import held_bounds, sources
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.unrolled import HeldBounds, held_at_once
 from reachjax.sets import AbstractSet, Box, Polytope
@@ -49,7 +49,7 @@ def moving_offsets(
     sides = np.where(upper > lower, upper - lower, 1.0)
     fixed = jax.lax.stop_gradient((setting.loop, X0, directions))
     loop, region, rows = jax.device_get(fixed)
-    everywhere = tuple(jnp.full((len(rows), len(sides)), side * jnp.inf) for side in (-1, 1))
+    everywhere = jnp.zeros((len(rows), 2, len(sides)))
     for facet, cell in enumerate(deciding):
         if id(cell) not in known:
             ends = (np.asarray(end) for end in (cell.box.lower, cell.box.upper))
@@ -80,20 +80,9 @@ def _held(
     horizon = Horizon(loop, part, box, start)
     for _ in range(k + 1):
         horizon.advance()
-    forms, bounds = (
-        directions[k] @ horizon.state,
-        list[Attained | None]([None] * len(directions[k])),
-    )
-    facets: Facets | None = None
-    if isinstance(X0, Polytope):
+    forms, facets, cut = directions[k] @ horizon.state, None, isinstance(X0, Polytope)
+    if cut:
         room = LOOSE * np.max(box.upper - box.lower)
         facets = X0.cut(Box(box.lower - room, box.upper + room)).facets
-        upper = forms.ends(horizon.start)[1]
-        decided = np.flatnonzero(forms.ends(horizon.start, cut=True)[1] < upper)
-        try:
-            found = by_cut(horizon.start, forms[decided], facets) if len(decided) else []
-            for number, bound in zip(decided, found, strict=True):
-                bounds[number] = bound
-        except (ValueError, RuntimeError):  # too thin for programs
-            pass
+    bounds = sources(horizon.start, forms, forms.ends(horizon.start, cut=cut)[1], facets)
     return held_bounds(horizon, bounds, len(directions), facets)

@@ -138,7 +138,7 @@ class Ladder:
     def _ranges(
         self, budget: Budget, forms: AffineForms
     ) -> tuple[Float[np.ndarray, "k m"], Float[np.ndarray, "k n"]] | None:
-        """Multipliers that bound the inputs of units from both sides, and where; None without time."""
+        """Multipliers that bound inputs of units from both sides, and where; None without time."""
         if budget.late or budget.work <= 0:
             return None
         facts = self.horizon.facts
@@ -327,7 +327,7 @@ class Ladder:
     def settled(
         self, climbed: Climbed
     ) -> tuple[Float[np.ndarray, "f n"], Float[np.ndarray, "f m"], Bool[np.ndarray, " f"]]:
-        """Columns and multipliers that derivatives of facets' bounds hold, and which are attained."""
+        """Columns and multipliers that derivatives of bounds hold, and which are attained."""
         found = climbed.multipliers.copy()
         columns, owner = climbed.columns.copy(), climbed.branches.owner
         there = np.zeros(len(found), bool)

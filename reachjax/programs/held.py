@@ -18,11 +18,14 @@ from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.initial import InitialColumns
-from reachjax.programs.unrolled import INTERVAL, KNOWN, HeldBounds
+from reachjax.programs.moving import INTERVAL, KNOWN, HeldBounds
 from reachjax.sets.polyhedra import support
 
 NEAR = 1e-7
 """Values of a row that differ by a smaller part of its size are the same."""
+
+LARGE = 4e6
+"""Multipliers up to this many have one shape for all steps, which is compiled once."""
 
 Facets = tuple[np.ndarray, np.ndarray]
 
@@ -113,9 +116,10 @@ def held_bounds(
     found = directions + found
     weighed = len(bounds) + sum(_weighed(bound.source) for bound in found[len(bounds) :])
     more, between = step_columns(horizon.loop)
-    # few shapes: each is compiled
-    count, some = (1 << (number - 1).bit_length() for number in (len(found), weighed))
-    columns = np.zeros((max(count, some), start.count + steps * more + between))
+    shape = steps, horizon.kinds, units
+    every = len(bounds) + 2 * steps * (units + len(start.center))  # few shapes: each is compiled
+    some = every if every * np.prod(shape) < LARGE else 1 << (weighed - 1).bit_length()
+    columns = np.zeros((max(every, some), start.count + steps * more + between))
     multipliers = np.zeros((some, len(horizon.facts.rows)))
     of_set = np.zeros((some, 0 if facets is None else len(facets[1])))
     for k, (source, where, _) in enumerate(found):

@@ -263,13 +263,18 @@ class Horizon:
             for layers in self.steps
         ]
 
+    @property
+    def kinds(self) -> int:
+        """How many facts a unit may have."""
+        return int(self.origins[:, 2].max(initial=0)) + 1
+
     def of_units(
         self, multipliers: Float[np.ndarray, "k m"], steps: int
     ) -> Float[np.ndarray, "k N b units"]:
         """Multipliers of all facts by step, fact and unit, zero of those that there are not."""
         step, unit, which = self.origins.T
         units = sum(len(layer.places) for layer in self.steps[0])
-        found = np.zeros((len(multipliers), steps, which.max(initial=0) + 1, units))
+        found = np.zeros((len(multipliers), steps, self.kinds, units))
         there = np.flatnonzero(step >= 0)
         found[:, step[there], which[there], unit[there]] = multipliers[:, there]
         return found

@@ -19,7 +19,7 @@ from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.programs.held import attained, held_bounds, sources
-from reachjax.programs.unrolled import held_at_once
+from reachjax.programs.moving import Moving, moving
 from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import SolverStatus
@@ -108,9 +108,9 @@ def sets_by_branching(
             )
         offsets = proved = owned(climbed.bounds)
         if not is_concrete(setting.loop, X0, directions):
-            moving = _moving(setting, X0, box, directions, climbed, ladder, ends, horizon)
-            moving = jnp.where(jnp.isfinite(moving), moving, 0.0)  # what overflows has none
-            offsets = proved + (moving - jax.lax.stop_gradient(moving))
+            moved = _moving(setting, X0, box, directions, climbed, ladder, ends, horizon)
+            moved = jnp.where(jnp.isfinite(moved), moved, 0.0)  # what overflows has none
+            offsets = proved + (moved - jax.lax.stop_gradient(moved))
         gaps = climbed.bounds - climbed.attained
         opened = np.flatnonzero(gaps > setting.gap * ranges)
         opened = opened[np.argsort(-gaps[opened], kind="stable")]
@@ -159,8 +159,9 @@ def _moving(
     for i in np.flatnonzero(settled | (climbed.rungs != Rung.AFFINE_FORM)):
         bounds[i] = attained(begun, rows[i : i + 1], multipliers[i], columns[i])
     ends = [*known, *[jnp.zeros((2, len(directions.T)))] * (horizon - len(known))]
-    given = setting.loop, X0, box, directions, held_bounds(begun, bounds, horizon)
-    return held_at_once(*given, jnp.stack(ends), setting.start)[k - 1]
+    held = held_bounds(begun, bounds, horizon)
+    parts = Moving(setting.loop, X0, box, directions, jnp.stack(ends))
+    return moving(parts, held, k, setting.start)
 
 
 def _with_products(

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from reachjax.loops import ClosedLoop
 from reachjax.programs.held import held_bounds, sources
 from reachjax.programs.horizon import Horizon
-from reachjax.programs.unrolled import HeldBounds, held_at_once
+from reachjax.programs.moving import HeldBounds, Moving, moving
 from reachjax.sets import AbstractSet, Box, Polytope
 from reachjax.sets.cells import Cell
 from reachjax.tubes.steps import Setting
@@ -57,8 +57,8 @@ def moving_offsets(
             around = Box(*(box.lower + share * (box.upper - box.lower) for share in shares))
             part = X0.cut(around) if isinstance(X0, Polytope) else around
             held = _held(loop, region, rows, cell, k, setting.start)
-            given = setting.loop, part, around, directions[k], held, everywhere, setting.start
-            known[id(cell)] = held_at_once(*given)[k]
+            parts = Moving(setting.loop, part, around, directions[k], everywhere)
+            known[id(cell)] = moving(parts, held, k + 1, setting.start)
         offsets.append(known[id(cell)][facet])
     return jnp.stack(offsets)
 

@@ -173,9 +173,11 @@ def attained(
     """
     start, facts = horizon.start, horizon.facts[: len(multipliers)]
     width = max(row.columns.shape[1], facts.columns.shape[1])
-    weighed = row.widened(width).columns[0] + multipliers @ facts.widened(width).columns
+    own, others = row.widened(width).columns[0], facts.widened(width).columns
+    weighed = own + multipliers @ others
     first, rest = np.split(weighed, [start.count])
-    there, near = np.sign(weighed), NEAR * abs(weighed).sum()
+    there = np.sign(weighed)
+    near = NEAR * (abs(own) + abs(multipliers) @ abs(others)).sum()  # they may cancel
     varying = horizon.varying
     varying = varying[varying < len(columns)]
     there[varying] = columns[varying]

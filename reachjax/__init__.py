@@ -41,6 +41,7 @@ from reachjax.loops import (
     runge_kutta,
     zero_order_hold,
 )
+from reachjax.numerics.archives import UnreadableError
 from reachjax.numerics.compilations import keep_compilations
 from reachjax.programs.basis import ChangeOfBasis, change_of_basis
 from reachjax.programs.relaxations import (
@@ -95,6 +96,7 @@ from reachjax.tubes.loading import load
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
 from reachjax.tubes.plotting import plot_cells, plot_set, plot_tube
 from reachjax.tubes.reach import ReachTube, reach, reach_step
+from reachjax.tubes.rechecks import DisagreementError
 from reachjax.tubes.requirements import shortfall
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.tubes.soundness import UnsoundError
@@ -150,6 +152,7 @@ __all__ = [
     "CuttingPlanes",
     "CvxpySolver",
     "DecidedCell",
+    "DisagreementError",
     "Ellipsoid",
     "EllipsoidCertificate",
     "EllipsoidTemplate",
@@ -188,6 +191,7 @@ __all__ = [
     "Square",
     "Tanh",
     "Template",
+    "UnreadableError",
     "UnsoundError",
     "Verdict",
     "VerdictStatus",

@@ -26,6 +26,10 @@ TURNS = 1000
 """A loop that takes more turns than this is taken to be endless."""
 
 
+PASSED = ("copy", "copy_p", "optimization_barrier", "stop_gradient")
+"""Primitives whose results are their operands, of whatever kind."""
+
+
 class Constants:
     """The numbers of a function that depend on its parameters alone and are rounded, in order.
 
@@ -86,6 +90,14 @@ class Interpreter(abc.ABC):
     def stacked(self, column: Sequence[Operand]) -> Operand:
         """Operands, some of which depend on inputs, as one."""
 
+    def whole(self, equation: Any, operands: Sequence[Operand]) -> list[Operand] | None:
+        """The results of a call that is known as a whole; None if it is followed."""
+        return None
+
+    @abc.abstractmethod
+    def either(self, which: Operand, cases: Sequence[Operand]) -> Operand:
+        """One of several operands, by a number that depends on inputs."""
+
     def walk(self, closed: Any, operands: Sequence[Operand]) -> list[Operand]:
         """What a jaxpr makes of operands.
 
@@ -118,7 +130,10 @@ class Interpreter(abc.ABC):
         name, params = equation.primitive.name, equation.params
         varies = [not self.is_plain(each) for each in operands]
         if not any(varies):
-            return self._constants.of(equation, operands)
+            return [*operands] if name in PASSED else self._constants.of(equation, operands)
+        whole = self.whole(equation, operands)
+        if whole is not None:
+            return whole
         if name not in WAYS or not (self.follows_all or rounds_within(equation, varies)):
             return self.apply(equation, operands)
         if name in OWN_SLOPES and rounds_within(equation, varies):
@@ -179,17 +194,20 @@ class Interpreter(abc.ABC):
             if not bool(np.asarray(goes_on)):
                 return carry
             carry = self.walk(params["body_jaxpr"], [*done, *carry])
-        raise UnsupportedError(f"it has not ended after {TURNS} turns")
+        raise UnsupportedError(f"it has not ended after {TURNS} turns: use a loop of fewer")
 
     def _branch(self, params: dict[str, Any], operands: Sequence[Operand]) -> list[Operand]:
-        """The one that is taken."""
+        """The one that is taken; where inputs decide, all are, and one of their results."""
         which, *given = operands
-        if not self.is_plain(which) or not is_known(which):
-            raise UnsupportedError(
-                "which branch is taken must not depend on inputs or traced parameters: use "
-                "jnp.where between functions that agree where it changes"
-            )
         branches = params["branches"]
+        if not self.is_plain(which):
+            found = [self.walk(branch, given) for branch in branches]
+            return [self.either(which, cases) for cases in zip(*found, strict=True)]
+        if not is_known(which):
+            raise UnsupportedError(
+                "which branch is taken must not depend on traced parameters: use jnp.where "
+                "between functions that agree where it changes"
+            )
         return self.walk(branches[int(np.clip(which, 0, len(branches) - 1))], given)
 
 

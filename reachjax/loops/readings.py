@@ -8,23 +8,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.interpreter import Constants, Interpreter, bound, line_of
+from reachjax.loops.interpreter import PASSED, Constants, Interpreter, bound, line_of
 from reachjax.loops.primitives import Equation, recorded
+from reachjax.loops.primitives.choices import ONLY, chosen_by
+from reachjax.loops.primitives.functions import rule_of
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import equations
-from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value, is_plain
+from reachjax.loops.values import (
+    Choice,
+    Comparison,
+    Operand,
+    Unknown,
+    UnsupportedError,
+    Value,
+    is_plain,
+)
 
 DRAWS = ("random_", "rng_", "threefry")
 """How names of primitives begin that draw numbers."""
 
 CALLBACKS = ("pure_callback", "io_callback")
 """Primitives that call Python, where nothing can be traced."""
-
-PASSED = ("copy", "copy_p", "optimization_barrier", "stop_gradient")
-"""Primitives whose results are their operands, of whatever kind."""
 
 
 class Recording(Interpreter):
@@ -57,12 +65,22 @@ class Recording(Interpreter):
             recorder.known[key] = found if isinstance(found, list) else [found], operands
         return recorder.known[key][0]
 
+    def whole(self, equation: Any, operands: Sequence[Operand]) -> list[Operand] | None:
+        """The result of a function that has a rule as a whole."""
+        rule = rule_of(equation)
+        if rule is None or any(isinstance(each, Choice | Unknown) for each in operands):
+            return None
+        shape = tuple(equation.outvars[0].aval.shape)
+        return [rule(self._recorder, [*operands], shape)]
+
     def entry(self, operand: Operand, k: int) -> Operand:
         """An entry along the first axis."""
         if isinstance(operand, Comparison):
             return Comparison(self.entry(operand.value, k))
+        if not isinstance(operand, Value):
+            raise UnsupportedError(ONLY)
         index = np.arange(operand.size).reshape(operand.shape)[k]
-        return self._recorder.picked(operand, index)
+        return self._recorder.taken(operand, index)
 
     def stacked(self, column: Sequence[Operand]) -> Operand:
         """Operands of one kind, or plain ones, as one."""
@@ -76,6 +94,19 @@ class Recording(Interpreter):
         shape = next(each.shape for each in column if isinstance(each, Value))
         index = np.arange(joined.size).reshape(len(column), *shape)
         return self._recorder.picked(joined, index)
+
+    def either(self, which: Operand, cases: Sequence[Operand]) -> Operand:
+        """Results of branches, which must agree where the choice changes."""
+        if all(each is cases[0] for each in cases):
+            return cases[0]
+        if not isinstance(which, Choice):
+            raise UnsupportedError(
+                "which branch is taken must not depend on numbers that depend on inputs, other "
+                "than by comparing them: use jnp.where between functions that agree where it "
+                "changes"
+            )
+        shape = np.shape(cases[0]) if is_plain(cases[0]) else cases[0].shape
+        return chosen_by(self._recorder, which, cases, shape)
 
 
 def _identity(operand: Operand) -> Any:
@@ -111,6 +142,10 @@ class Evaluation(Interpreter):
         """The results of an equation."""
         return [*map(Number, bound(equation, [*map(_array, operands)]))]
 
+    def whole(self, equation: Any, operands: Sequence[Operand]) -> list[Operand] | None:
+        """The result of a function that is not looked into."""
+        return None if rule_of(equation) is None else self.apply(equation, operands)
+
     def entry(self, operand: Operand, k: int) -> Operand:
         """An entry along the first axis."""
         return Number(operand.array[k])
@@ -118,6 +153,17 @@ class Evaluation(Interpreter):
     def stacked(self, column: Sequence[Operand]) -> Operand:
         """Operands as one."""
         return Number(jnp.stack([*map(_array, column)]))
+
+    def either(self, which: Operand, cases: Sequence[Operand]) -> Operand:
+        """The result of one branch."""
+        index = jnp.clip(_array(which), 0, len(cases) - 1)
+        return Number(jax.lax.select_n(*_alike(index, [*map(_array, cases)])))
+
+
+def _alike(index: Any, cases: Sequence[Any]) -> list[Any]:
+    """A place, and arrays of one kind."""
+    kind = jnp.result_type(*cases)
+    return [index.astype(jnp.int32), *(jnp.asarray(each, kind) for each in cases)]
 
 
 def _array(operand: Any) -> Any:
@@ -137,12 +183,20 @@ class ConstantPart(Interpreter):
         """Nothing of an equation whose operands depend on inputs."""
         return [None] * len(equation.outvars)
 
+    def whole(self, equation: Any, operands: Sequence[Operand]) -> list[Operand] | None:
+        """Nothing of a function that is not looked into."""
+        return None if rule_of(equation) is None else self.apply(equation, operands)
+
     def entry(self, operand: Operand, k: int) -> Operand:
         """An entry along the first axis."""
         return None
 
     def stacked(self, column: Sequence[Operand]) -> Operand:
         """Operands as one."""
+        return None
+
+    def either(self, which: Operand, cases: Sequence[Operand]) -> Operand:
+        """Nothing, as it depends on inputs which one it is."""
         return None
 
 
@@ -160,7 +214,7 @@ def require_traced(jaxpr: Any) -> None:
                 "put modules into evaluation mode"
             )
         if name in CALLBACKS:
-            why = "what Python computes outside of JAX has no bounds"
+            why = "what Python computes outside of JAX has no bounds: use functions of JAX"
         if why:
             error = UnsupportedError(why)
             error.primitive, error.line = name, line_of(equation)

@@ -165,6 +165,22 @@ class Recorder:
         key = "picked", value.place, flat.tobytes()
         return self.layer(shape, step, key, source=(self.values[value.place], flat))
 
+    def taken(self, value: Value, index: Int[np.ndarray, ...]) -> Value:
+        """Entries as `picked`, but of sums as sums of entries, which comparisons look into."""
+        if value.terms is None:
+            return self.picked(value, index)
+        found: Any = None
+        for term in value.terms:
+            part = self.taken(term.value, index)
+            factor, divisor = (_entries_of(plain, value, index) for plain in term[1:])
+            part = (
+                part if is_constant(factor) and np.all(factor == 1) else self.scaled(part, factor)
+            )
+            one = is_constant(divisor) and np.all(divisor == 1)
+            part = part if one else self.divided(part, divisor)
+            found = part if found is None else self.added(found, part)
+        return self.shifted(found, _entries_of(value.offset, value, index))
+
     def broadcast(self, value: Value, shape: Shape) -> Value:
         """The same entries in a larger array."""
         index = np.arange(value.size).reshape(value.shape)
@@ -194,7 +210,10 @@ class Recorder:
         divisor = _flat(divisor, value)
         normal = (abs(divisor) >= TINY) & (abs(divisor) <= 1 / TINY)
         if is_known(divisor) and not np.all(np.asarray(normal)):
-            raise UnsupportedError("it divides by zero, or by what has no inverse in 64 bits")
+            raise UnsupportedError(
+                "it divides by zero, or by what has no inverse in 64 bits: keep divisors away from "
+                "zero"
+            )
         xp = namespace(divisor)
         inverse = xp.where(normal, 1.0 / xp.where(normal, divisor, 1.0), np.nan)
 
@@ -405,6 +424,10 @@ def _size(y: Ball) -> Ball:
     """Sizes `|y|` of intervals."""
     least = larger(larger(y.lower, -y.upper), 0.0)
     return Ball.between(least, larger(larger(-y.lower, y.upper), least))
+
+
+def _entries_of(plain: Any, value: Value, index: np.ndarray) -> Any:
+    return _flat(plain, value)[np.asarray(index)] if np.ndim(plain) else plain
 
 
 def _flat(plain: Any, value: Value) -> Any:

@@ -28,6 +28,9 @@ POOL = 500
 PULL = 1 - 1e-12
 """How far a rounded point is brought towards the middle of its set."""
 
+NEXT = 1e-9
+"""A state is next to a set that is no further beside it than this; of flat sets none is in it."""
+
 Rows = Float[Array | np.ndarray, "*batch s"]
 
 
@@ -235,6 +238,15 @@ class Scenarios(Replaceable):
         for draws, points in zip((self.disturbances, self.noises), drawn, strict=True):
             if draws is not None:
                 inside = inside & _contain(draws, points)
+        return inside
+
+    def nearly_contains(self, scenarios: Float[np.ndarray, "c s"]) -> Bool[np.ndarray, " c"]:
+        """Which scenarios begin in the initial set or next to it, the rest being in its sets."""
+        states, *drawn = self.split(scenarios)
+        inside = np.asarray(self.X0.contains(states, NEXT))
+        for draws, points in zip((self.disturbances, self.noises), drawn, strict=True):
+            if draws is not None:
+                inside = inside & np.asarray(_contain(draws, points))
         return inside
 
     def surely_contains(self, scenario: Float[np.ndarray, " s"]) -> bool:

@@ -11,7 +11,7 @@ import itertools
 import operator
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,27 @@ class UpdatedError(Exception):
     """A function changes variables of its own when it is called: it is another one afterwards."""
 
 
+class Kind(NamedTuple):
+    """What a parameter is besides its numbers.
+
+    Attributes:
+        shape: of the array.
+        name: of its precision; None for that of all floats.
+        is_weak: whether it is a number of Python's, which takes the precision of others.
+    """
+
+    shape: Sizes
+    name: str | None
+    is_weak: bool
+
+    @classmethod
+    def of(cls, leaf: Any) -> Kind:
+        """The kind of an array, or of a number."""
+        found = jnp.result_type(leaf)
+        name = None if found == jnp.result_type(float) else found.name
+        return cls(jnp.shape(leaf), name, type(leaf) is float)
+
+
 class _Held:
     """An array that is no number to be differentiated, such as a key."""
 
@@ -44,31 +65,29 @@ class Trace:
     Args:
         tree: the structure of the tree that the function is.
         others: its leaves that are no arrays of floats; None for those that are.
-        shapes: of the parameters, which are these.
+        kinds: of the parameters, which are these.
         inputs: the sizes of the vectors.
     """
 
-    def __init__(
-        self, tree: Any, others: tuple[Any, ...], shapes: tuple[Sizes, ...], inputs: Sizes
-    ):
-        self._parts = tree, others, shapes, inputs
+    def __init__(self, tree: Any, others: tuple[Any, ...], kinds: tuple[Kind, ...], inputs: Sizes):
+        self._parts = tree, others, kinds, inputs
         self._closed: dict[bool, core.ClosedJaxpr] = {}
         self._rounds: bool | None = None
-        self.described = _description(self.closed)
+        self.described = description(self.closed)
 
     @classmethod
     def of(cls, function: Callable, inputs: Sizes) -> tuple[Trace, tuple[Any, ...]]:
         """The trace of a function, and the parameters of the tree that it is, which are copied."""
         leaves, tree = jax.tree.flatten(function)
         numbers = [_is_float(leaf) for leaf in leaves]
-        parameters = tuple(
-            jnp.array(leaf, float) for leaf, own in zip(leaves, numbers, strict=True) if own
-        )
+        mine = [leaf for leaf, own in zip(leaves, numbers, strict=True) if own]
+        kinds = tuple(map(Kind.of, mine))
+        parameters = tuple(jnp.array(leaf, float) for leaf in mine)
         others = tuple(
             None if own else _Held(leaf) if hasattr(leaf, "dtype") else leaf
             for leaf, own in zip(leaves, numbers, strict=True)
         )
-        return cls(tree, others, tuple(map(jnp.shape, parameters)), inputs), parameters
+        return cls(tree, others, kinds, inputs), parameters
 
     @property
     def closed(self) -> core.ClosedJaxpr:
@@ -77,15 +96,24 @@ class Trace:
         if double not in self._closed:
             for other in self._closed:
                 with jax.enable_x64(other):
-                    _require_same(_description(self._traced()), self.described)
+                    _require_same(description(self._traced()), self.described)
             self._closed[double] = self._traced()
         return self._closed[double]
 
     def _traced(self) -> core.ClosedJaxpr:
-        """What the function is now."""
-        _, _, shapes, inputs = self._parts
-        parameters = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
+        """What the function is now.
+
+        Parameters are floats of 64 bits. Where those of fewer bits are computed with in these, so
+        that it makes a difference, they are brought back to them.
+        """
+        _, _, kinds, inputs = self._parts
         vectors = [jax.ShapeDtypeStruct((size,), float) for size in inputs]
+
+        def of(names: Sequence[str | None]) -> list[Any]:
+            return [
+                jax.ShapeDtypeStruct(each.shape, name or float, weak_type=each.is_weak)
+                for each, name in zip(kinds, names, strict=True)
+            ]
 
         def called(parameters: Sequence[Any], *vectors: Any) -> Any:
             function = self.function(parameters)
@@ -96,12 +124,28 @@ class Trace:
                 raise UpdatedError
             return found
 
-        return _owned(jax.make_jaxpr(called)(parameters, *vectors))
+        def brought_back(parameters: Sequence[Any], *vectors: Any) -> Any:
+            own = [
+                each if name is None else jnp.asarray(each, name)
+                for each, name in zip(parameters, names, strict=True)
+            ]
+            return called(own, *vectors)
+
+        names, whole = [each.name for each in kinds], of([None] * len(kinds))
+        made = called
+        if any(names):
+            own = jax.make_jaxpr(called)(of(names), *vectors)
+            varies = [number >= len(kinds) for number in range(len(own.jaxpr.invars))]
+            made = brought_back if rounds_plain(own, varies) else called
+        return _owned(jax.make_jaxpr(made)(whole, *vectors))
 
     def function(self, parameters: Sequence[Any]) -> Callable:
         """The function with these parameters, as it is now."""
-        tree, others, _, _ = self._parts
-        numbers = iter(parameters)
+        tree, others, kinds, _ = self._parts
+        numbers = (
+            float(number) if each.is_weak and is_concrete(number) else number
+            for number, each in zip(parameters, kinds, strict=True)
+        )
         leaves = [
             next(numbers) if other is None else other.array if isinstance(other, _Held) else other
             for other in others
@@ -214,7 +258,7 @@ def _copied(constant: Any) -> Any:
     return jnp.array(constant, copy=True) if is_number else constant
 
 
-def _description(closed: core.ClosedJaxpr) -> str | None:
+def description(closed: core.ClosedJaxpr) -> str | None:
     """What a jaxpr computes, as a hash; None if it holds numbers that are traced.
 
     It is the same in another process, and says nothing of names and places of functions.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,7 +63,11 @@ class Term(NamedTuple):
     divisor: Any = 1.0
 
 
-class Comparison:
+class Choice:
+    """What is decided by comparisons of numbers, and may only choose between others."""
+
+
+class Comparison(Choice):
     """Whether numbers are above zero; at zero it must not matter.
 
     Attributes:
@@ -79,8 +83,61 @@ class Comparison:
         return self.value.shape
 
 
+class Conditions(Choice):
+    """Comparisons, or known truth values, one behind the other along a first axis.
+
+    Attributes:
+        parts: these.
+        counted: whether they are numbers of those so far that hold.
+    """
+
+    def __init__(self, parts: Sequence[Any], counted: bool = False):
+        self.parts, self.counted = tuple(parts), counted
+
+    @property
+    def shape(self) -> Shape:
+        """The shape of the array."""
+        return len(self.parts), *np.shape(self.parts[0])
+
+
+class Index(Choice):
+    """The place of the first, or of the last, condition that holds; zero if none does.
+
+    Attributes:
+        conditions: comparisons, or known truth values.
+        last: whether it is the last one.
+    """
+
+    def __init__(self, conditions: Sequence[Any], last: bool = False):
+        self.conditions, self.last = tuple(conditions), last
+
+    @property
+    def shape(self) -> Shape:
+        """The shape of the array of places."""
+        return np.shape(self.conditions[0])
+
+
+class Unknown:
+    """A result that has no bounds, and may be passed on, but not computed with.
+
+    Attributes:
+        primitive: what made it.
+        why: it has none, and what to do.
+    """
+
+    def __init__(self, primitive: str, why: str):
+        self.primitive, self.why = primitive, why
+
+    @property
+    def error(self) -> UnsupportedError:
+        """The error where it is used."""
+        error = UnsupportedError(self.why)
+        error.primitive = self.primitive
+        return error
+
+
 Operand = Any
-"""A `Value`, a `Comparison`, or a plain array that depends on no input."""
+"""A `Value`, a `Choice`, an `Unknown`, or a plain array that depends on no input."""
 
 Fact = Callable[[Callable[[Operand], Any]], Any]
 """Limits of a value, from a function that gives those of others."""
@@ -117,7 +174,7 @@ class Parameter(np.ndarray):
 
 def is_plain(operand: Operand) -> bool:
     """Whether an operand depends on no input."""
-    return not isinstance(operand, Value | Comparison)
+    return not isinstance(operand, Value | Choice | Unknown)
 
 
 def is_constant(plain: Any) -> bool:

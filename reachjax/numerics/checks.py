@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import jax
@@ -15,6 +16,11 @@ from jax.core import Tracer
 def is_concrete(*trees: Any) -> bool:
     """Whether every leaf holds numbers, and none stands for them inside `jax.jit` or `vmap`."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def evaluated(*trees: Any) -> AbstractContextManager[Any]:
+    """A scope: what is computed in it from known numbers is known, inside `jax.jit` as well."""
+    return jax.ensure_compile_time_eval() if is_concrete(*trees) else nullcontext()
 
 
 def owned(tree: Any) -> Any:
@@ -103,7 +109,7 @@ def as_floats(value: Any, name: str) -> jax.Array:
         _require_one_device(value, name)
         return jnp.asarray(value, dtype=float)
     try:
-        if is_concrete(value) and (isinstance(value, jax.Array) or not _inside_jit()):
+        if is_concrete(value):
             array = np.array(value)
             if array.dtype.kind in "biuf":
                 floats = array.astype(jax.dtypes.canonicalize_dtype(float))
@@ -111,11 +117,6 @@ def as_floats(value: Any, name: str) -> jax.Array:
         return jnp.array(value, dtype=float)
     except ValueError as error:
         raise TypeError(str(error)) from None
-
-
-def _inside_jit() -> bool:
-    """Whether operations on numbers are traced here."""
-    return not is_concrete(jnp.asarray(0.0))
 
 
 def require_exact(value: Any, name: str) -> None:

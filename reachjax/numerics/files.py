@@ -28,10 +28,16 @@ def writable(name: str, path: Any) -> Path:
 
     Raises:
         FileNotFoundError: its folder does not exist.
+        IsADirectoryError: it is that of a folder.
         TypeError: it is no path.
     """
     require_kind(name, path, (str, os.PathLike), "the path of a file")
     found = Path(path)
+    if found.is_dir():
+        raise IsADirectoryError(
+            f"{name} must be that of a file, but {found} is a folder: give the name of a file in "
+            f"it, such as {found / 'tube.reach'}"
+        )
     if not found.parent.is_dir():
         raise FileNotFoundError(f"{name} must lie in a folder, but there is none at {found.parent}")
     return found

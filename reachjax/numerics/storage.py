@@ -11,22 +11,26 @@ from __future__ import annotations
 import base64
 import dataclasses
 import enum
-import hashlib
+import importlib
 import importlib.metadata
-import json
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from reachjax.numerics.archives import UnreadableError, digest, read_archive, write_archive
+from reachjax.numerics.pytrees import unchecked
+from reachjax.numerics.structure import require_structure
+
 VERSION = 1
 """Of the format: files of another one are refused."""
 
 PACKAGE = __name__.partition(".")[0]
-DOCUMENT = "document"
+SEAL = "seal"
+"""A field with a hash of all others, which differs where another version writes them otherwise."""
+
 PLAIN = bool | int | float | str | None
 
 
@@ -50,6 +54,7 @@ class Writer:
         self.left_out = False
         self._outside = outside
         self._known: dict[int, tuple[Any, int]] = {}
+        self._numbers: dict[str, int] = {}
 
     def described(self, value: Any) -> Any:
         """A value as plain data, its arrays by their numbers.
@@ -87,8 +92,11 @@ class Writer:
 
     def _placed(self, array: Any) -> int:
         if id(array) not in self._known:
-            self._known[id(array)] = array, len(self.arrays)  # kept alive: numbers stay its own
-            self.arrays.append(np.asarray(array))
+            held = np.asarray(array)
+            number = self._numbers.setdefault(digest(None, [held]), len(self.arrays))
+            self._known[id(array)] = array, number  # kept alive: no other one has its place
+            if number == len(self.arrays):
+                self.arrays.append(held)
         return self._known[id(array)][1]
 
     def _object(self, value: Any) -> Any:
@@ -110,6 +118,8 @@ def _name(kind: type) -> str:
 
 def _class(name: str) -> Any:
     """A class that this package defines, by name; what it merely imports is none of its own."""
+    if not isinstance(name, str):
+        raise ValueError(f"it names a class by {name!r:.60}")
     module, _, path = name.partition(":")
     if module.partition(".")[0] != PACKAGE:
         raise ValueError(f"it names {name}, which is not of {PACKAGE}")
@@ -147,50 +157,95 @@ def _restorable(name: str) -> Any:
     return found
 
 
-def _read(described: Any, arrays: list[np.ndarray], outside: Any) -> Any:
-    """The value of plain data."""
-    if described is None or isinstance(described, PLAIN):
-        return described
+class Reader:
+    """Objects on their way out of a file; what is there more than once is one object again.
 
-    def read(each: Any) -> Any:
-        return _read(each, arrays, outside)
+    Args:
+        arrays: by their numbers.
+        outside: takes the place of objects that were left out.
+    """
 
-    match described:
-        case {"enum": name, "member": member}:
-            return _enumeration(name)[member]
-        case {"bytes": text}:
-            return base64.b64decode(text)
-        case {"array": number, "on": where}:
-            return jax.device_put(arrays[number]) if where else arrays[number]
-        case {"outside": _}:
-            return outside
-        case {"named": name, "parts": parts}:
-            return _named_tuple(name)(*map(read, parts))
-        case {"tuple": parts}:
-            return tuple(map(read, parts))
-        case {"list": parts}:
-            return [*map(read, parts)]
-        case {"mapping": items}:
-            return {read(key): read(each) for key, each in items}
-        case {"stored": name, "as": parts}:
-            return _restorable(name).restored(read(parts))
-        case {"object": name, "fields": fields}:
-            return _rebuilt(_class(name), {key: read(each) for key, each in fields.items()})
-    raise ValueError(f"it describes {described!r:.60}, which is unknown")
+    def __init__(self, arrays: Sequence[np.ndarray], outside: Any):
+        self._arrays, self._outside = arrays, outside
+        self._known: dict[Any, tuple[Any, Any]] = {}
+
+    def value(self, described: Any) -> Any:
+        """The value of plain data.
+
+        Raises:
+            Exception: of any kind: it describes nothing that there is.
+        """
+        if described is None or isinstance(described, PLAIN):
+            return described
+        match described:
+            case {"enum": name, "member": member}:
+                return _enumeration(name)[member]
+            case {"bytes": text}:
+                return base64.b64decode(text)
+            case {"array": number, "on": where}:
+                return self._once("on" if where else "off", self._placed, number)
+            case {"outside": _}:
+                return self._outside
+            case {"named": name, "parts": parts}:
+                return self._once(_named_tuple(name), _named, *map(self.value, parts))
+            case {"tuple": parts}:
+                return self._once(tuple, _tuple, *map(self.value, parts))
+            case {"list": parts}:
+                return [*map(self.value, parts)]
+            case {"mapping": items}:
+                return {self.value(key): self.value(each) for key, each in items}
+            case {"stored": name, "as": parts}:
+                return self._once(_restorable(name), _restored, self.value(parts))
+            case {"object": name, "fields": fields}:
+                values = map(self.value, fields.values())
+                return self._once((_class(name), *fields), _rebuilt, *values)
+        raise ValueError(f"it describes {described!r:.60}, which is unknown")
+
+    def _once(self, kind: Any, make: Callable[..., Any], *parts: Any) -> Any:
+        """What is made of parts, the same if it was made of them before."""
+        key = kind, *(repr(part) if isinstance(part, PLAIN) else id(part) for part in parts)
+        if key not in self._known:
+            self._known[key] = parts, make(kind, *parts)  # kept alive: no other one has their place
+        return self._known[key][1]
+
+    def _placed(self, where: str, number: int) -> Any:
+        array = self._arrays[number]
+        return jax.device_put(array) if where == "on" else array
 
 
-def _rebuilt(kind: Any, fields: dict[str, Any]) -> Any:
-    """An object as it was, without the checks of what a user gives."""
+def _tuple(kind: Any, *parts: Any) -> tuple[Any, ...]:
+    return parts
+
+
+def _named(kind: Any, *parts: Any) -> Any:
+    made = kind(*parts)
+    require_structure(kind, made._asdict())
+    return made
+
+
+def _restored(kind: Any, parts: Any) -> Any:
+    return kind.restored(parts)
+
+
+def _rebuilt(named: tuple[Any, ...], *values: Any) -> Any:
+    """An object as it was, down to the last bit, if a user might have made it.
+
+    What a class has got since a file was written is as it is by default.
+    """
+    kind, *names = named
     if not hasattr(kind, "__dataclass_fields__"):
         raise ValueError(f"it names {kind.__qualname__}, which has no fields")
-    expected = {f.name for f in dataclasses.fields(kind)}
-    if expected != set(fields):
-        differ = sorted(expected ^ set(fields))
-        raise ValueError(f"its {kind.__qualname__} has other fields than this version's: {differ}")
-    made = object.__new__(kind)
-    for name, value in fields.items():
-        object.__setattr__(made, name, value)
-    return made
+    known = dataclasses.fields(kind)
+    later = {f.name: f.default for f in known if f.default is not dataclasses.MISSING}
+    fields = later | dict(zip(names, values, strict=True))
+    if differ := {f.name for f in known} ^ set(fields):
+        raise ValueError(
+            f"its {kind.__qualname__} has other fields than this version's: {sorted(differ)}"
+        )
+    require_structure(kind, fields)
+    if SEAL not in fields:  # else the parts are checked where they are sealed again
+        kind(**{f.name: fields[f.name] for f in known if f.init})
+    return unchecked(kind, **fields)
 
 
 def write(path: Path, value: Any, outside: type) -> None:
@@ -208,16 +263,8 @@ def write(path: Path, value: Any, outside: type) -> None:
     writer = Writer(outside)
     described = writer.described(value)
     head = {"format": PACKAGE, "version": VERSION, "release": _release(), "value": described}
-    head |= {"left_out": writer.left_out, "digest": _digest(described, writer.arrays)}
-    arrays = {f"a{number}": array for number, array in enumerate(writer.arrays)}
-    arrays[DOCUMENT] = np.frombuffer(json.dumps(head).encode(), np.uint8)
-    partial = path.with_name(path.name + ".part")
-    try:
-        with partial.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    head |= {"left_out": writer.left_out, "digest": digest(described, writer.arrays)}
+    write_archive(path, head, writer.arrays)
 
 
 def _release() -> str:
@@ -227,16 +274,8 @@ def _release() -> str:
         return "of a checkout"
 
 
-def _digest(described: Any, arrays: list[np.ndarray]) -> str:
-    found = hashlib.blake2b(json.dumps(described).encode(), digest_size=32)
-    for array in arrays:
-        found.update(f"{array.dtype.str}{array.shape}".encode())
-        found.update(array.tobytes())
-    return found.hexdigest()
-
-
 def read(path: Path, outside: Any, missing: str) -> Any:
-    """What a file holds.
+    """What a file holds, each object being as its class says.
 
     Args:
         path: of the file.
@@ -244,47 +283,40 @@ def read(path: Path, outside: Any, missing: str) -> Any:
         missing: what to say if one is needed.
 
     Raises:
-        ValueError: it is none of the package's, of another version, or broken; or something was
-            left out that is not given.
+        UnreadableError: it is none of the package's, of another version, or broken; or something
+            was left out that is not given.
     """
     head, arrays = _opened(path)
-    if head["left_out"] and outside is None:
-        raise ValueError(f"{path} {missing}")
+    if head.get("left_out") and outside is None:
+        raise UnreadableError(f"{path} {missing}")
     try:
-        return _read(head["value"], arrays, outside)
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
+        return Reader(arrays, outside).value(head["value"])
+    except Exception as error:  # whoever wrote it may have written anything
+        raise UnreadableError(f"{path} cannot be read: {_said(error)}") from error
 
 
 def _opened(path: Path) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The document and the arrays of a file."""
-    if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path} is no file that {PACKAGE} wrote, or it is cut off")
     try:
-        with np.load(path, allow_pickle=False) as found:
-            if DOCUMENT not in found:
-                raise ValueError(f"{path} is no file that {PACKAGE} wrote")
-            head = json.loads(found[DOCUMENT].tobytes())
-            _require_version(path, head)
-            arrays = [found[f"a{number}"] for number in range(len(found.files) - 1)]
-    except _RefusedError:
-        raise
+        head, arrays = read_archive(path)
+        if head.get("format") != PACKAGE:
+            raise UnreadableError("its document is of another format")
+        same = head.get("version") != VERSION or head.get("digest") == digest(head["value"], arrays)
     except Exception as error:  # one bit is enough for any of a dozen kinds of zip's and numpy's
-        raise ValueError(f"{path} is no file that {PACKAGE} wrote, or broken: {error}") from error
-    if head.get("digest") != _digest(head.get("value"), arrays):
-        raise ValueError(f"{path} was changed after it was written: what it says is not proved")
+        raise UnreadableError(
+            f"{path} is no file that {PACKAGE} wrote, or it is cut off or broken: {_said(error)}"
+        ) from error
+    if head.get("version") != VERSION:
+        raise UnreadableError(
+            f"{path} is of version {head.get('version')!r:.20} of the format (written by {PACKAGE} "
+            f"{head.get('release')!s:.20}), but this {PACKAGE} reads version {VERSION}"
+        )
+    if not same:
+        raise UnreadableError(
+            f"{path} was changed after it was written: what it says is not proved"
+        )
     return head, arrays
 
 
-class _RefusedError(ValueError):
-    """That a file is of the package, but cannot be read."""
-
-
-def _require_version(path: Path, head: Any) -> None:
-    if not isinstance(head, dict) or head.get("format") != PACKAGE:
-        raise _RefusedError(f"{path} is no file that {PACKAGE} wrote")
-    if head.get("version") != VERSION:
-        raise _RefusedError(
-            f"{path} is of version {head.get('version')!r} of the format (written by {PACKAGE} "
-            f"{head.get('release')}), but this {PACKAGE} reads version {VERSION}"
-        )
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if not isinstance(error, ValueError) else f"{error}"

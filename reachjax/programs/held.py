@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns
@@ -27,7 +27,8 @@ NEAR = 1e-7
 LARGE = 4e6
 """Multipliers up to this many have one shape for all steps, which is compiled once."""
 
-Facets = tuple[np.ndarray, np.ndarray]
+Facets = tuple[Float[Array | np.ndarray, "r n"], Float[Array | np.ndarray, " r"]]
+"""Normals and offsets."""
 
 
 class Attained(NamedTuple):
@@ -169,7 +170,7 @@ def attained(
         horizon: of whose first facts they are.
         row: one.
         multipliers: of the facts.
-        columns: where a program says that it is attained; those of rounding errors do not matter.
+        columns: where a program says that it is attained; NaN where none does.
     """
     start, facts = horizon.start, horizon.facts[: len(multipliers)]
     width = max(row.columns.shape[1], facts.columns.shape[1])
@@ -180,6 +181,7 @@ def attained(
     near = NEAR * (abs(own) + abs(multipliers) @ abs(others)).sum()  # they may cancel
     varying = horizon.varying
     varying = varying[varying < len(columns)]
+    varying = varying[np.isfinite(columns[varying])]
     there[varying] = columns[varying]
     by_norm = start.bounds(first[None])[1][0]
     largest = by_norm + abs(rest).sum()
@@ -233,7 +235,7 @@ def _of_layer(horizon: Horizon, layer: _Layer, facets: Facets | None) -> list[li
     sides = (-inputs, -layer.forms.lower), (inputs, layer.forms.upper)
     for side, (rows, ends) in enumerate(sides):
         found.append(sources(horizon.start, rows, np.asarray(ends), facets))
-        for end in horizon.tightened:
+        for end in horizon.better:
             if (end.step, end.layer, end.side) == (layer.step, layer.number, side):
                 row = rows[end.unit : end.unit + 1]
                 found[side][end.unit] = attained(horizon, row, end.multipliers, end.columns)
@@ -241,7 +243,7 @@ def _of_layer(horizon: Horizon, layer: _Layer, facets: Facets | None) -> list[li
 
 
 def _near(rows: AffineForms) -> Float[np.ndarray, " k"]:
-    return NEAR * abs(rows.columns).sum(axis=1)
+    return NEAR * np.asarray(abs(rows.columns).sum(axis=1))
 
 
 def _layers(horizon: Horizon, steps: int) -> tuple[list[_Layer], list[Int[np.ndarray, " n"]]]:

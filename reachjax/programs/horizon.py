@@ -37,10 +37,10 @@ Multipliers = Callable[
     [AffineForms], tuple[Float[np.ndarray, "k m"], Float[np.ndarray, "k n"]] | None
 ]
 """Multipliers of the facts so far that bound each of these forms from above, and the columns where
-they say that it is attained; None if none do."""
+it is attained then, NaN where they are not known; None if none do."""
 
 
-class Tightened(NamedTuple):
+class RangeEnd(NamedTuple):
     """An end of the range of a unit's input that multipliers of facts proved.
 
     Attributes:
@@ -83,7 +83,9 @@ class Horizon:
         merged: of each step, what a smooth controller leaves out.
         states: forms of the states after each step, with intervals of the step's own arithmetic.
         ends: bounds of the states after each step, the best that are known.
-        tightened: ends of ranges that are better known than by forms and intervals.
+        better: ends of ranges that are better known than by forms and intervals.
+        tightened: multipliers `(2 k, m)` by which ranges of the last step's units were bounded, for
+            each time that they were asked for; none of no forms where there were none.
 
     Example:
         >>> import jax
@@ -105,7 +107,8 @@ class Horizon:
         self.merged: list[Merged | None] = []
         self.states: list[AffineForms] = []
         self.ends: list[Ends] = []
-        self.tightened: list[Tightened] = []
+        self.better: list[RangeEnd] = []
+        self.tightened: list[np.ndarray] = []
         self._varying = np.zeros(0, dtype=int)
         self._width = self.start.count
         self._facts: list[AffineForms] = []
@@ -166,28 +169,27 @@ class Horizon:
             if multipliers is None or unit.free or not (len(switching) and self._count):
                 return ends
             inputs = y[switching]
-            both = joined([-inputs, inputs])
+            both = joined([inputs, -inputs])
             given = multipliers(both)
+            weights = np.zeros((0, self._count)) if given is None else given[0]
+            self.tightened.append(weights)
             if given is None:
                 return ends
-            (lower, upper), found_ends = (
-                (np.array(end) for end in ends),
-                self.bounds(both, given[0]),
-            )
-            least, most = np.split(found_ends, 2)
-            better = np.stack([-least > lower[switching], most < upper[switching]])
+            lower, upper = (np.array(end) for end in ends)
+            most, least = np.split(self.bounds(both, weights), 2)
+            better = np.stack([most < upper[switching], -least > lower[switching]])
             for number in np.flatnonzero(better):
-                side, unit = divmod(int(number), len(switching))
+                side, place = divmod(int(number), len(switching))
                 proof = (part[number] for part in given)
-                self.tightened.append(
-                    Tightened(len(self.steps), len(found), int(switching[unit]), side, *proof)
+                self.better.append(
+                    RangeEnd(len(self.steps), len(found), int(switching[place]), 1 - side, *proof)
                 )
             known = lower[switching], upper[switching]
             lower[switching], upper[switching] = met(known, (-least, most))
             return lower, upper
 
         t = self._t + len(self.steps)
-        self._stated = 0
+        self._stated, self.tightened = 0, []
         with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
             self.state, units, merged = step_forms(
                 self.loop, self.state, t, self.start, ranges=ranges

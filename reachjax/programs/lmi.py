@@ -23,11 +23,29 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float
 
-from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.numerics.rounding import Ball, gamma
 from reachjax.programs.basis import Rows
 from reachjax.programs.relaxations import Products
 from reachjax.sets import NormalForm
+
+
+class Origin(NamedTuple):
+    """What a program was made of, so that it can be made again from the loop and its sets.
+
+    Attributes:
+        start: the time of the first set of its window.
+        steps: how many the window has.
+        prune: whether units that bounds prove to be affine left the basis.
+        linear: whether bounds are those of supports and linear relaxations.
+        drop_columns: whether units that left the basis take no columns either.
+    """
+
+    start: int
+    steps: int
+    prune: bool
+    linear: bool
+    drop_columns: bool
 
 
 @pytree
@@ -42,12 +60,14 @@ class Program(Replaceable):
         transform: `(n, n)`, `T` with `xi = T eta`: midpoints in the last column, on the diagonal
             radii, zero where the entry is unused or has one value. The states of an ellipsoid are
             those of the unit ball, and the block is its factor.
+        origin: of which window it is; None where that is not known.
     """
 
     facts: Rows
     objective: Rows
     products: Products
     transform: Float[Array, "n n"]
+    origin: Origin | None = static(default=None)
 
     @property
     def used(self) -> Bool[Array, " n"]:

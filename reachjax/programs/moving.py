@@ -164,7 +164,7 @@ def _values(
         (state, total), (k, given, ranges_known, of_ranges, *of_state) = carry, step
         told = done = 0
 
-        def attained(rows: AffineForms, which: Any) -> Float[Array, " k"]:
+        def attained(rows: AffineForms, which: Any) -> Any:
             weighed = jnp.where(which < count, total[jnp.minimum(which, count - 1)], 0.0)
             return rows.rows[:, 0] + (rows.columns * columns[which]).sum(axis=1) + weighed
 

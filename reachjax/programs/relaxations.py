@@ -64,7 +64,7 @@ class AbstractRelaxation(abc.ABC):
     by_forms: ClassVar[bool] = False
 
     def __post_init__(self):
-        for name in ("repeated", "remove_stable"):
+        for name in ("repeated", "remove_stable", "programs"):
             value = getattr(self, name, True)
             require_kind(f"{type(self).__name__}.{name}", value, bool, "True or False")
 
@@ -160,6 +160,14 @@ class LinearBounds(AbstractRelaxation):
     It bounds facets, of a `Template`. Neither `window` nor `solver` matter: forms always go back to
     the initial set, and there is nothing to solve.
 
+    Args:
+        programs: whether linear programs over the facets of an `X0` that is a polytope make bounds
+            tighter. Compiled code has none, and penalties, which are the same function compiled or
+            not, have none either: there a polytope counts as the box around it.
+
+    Raises:
+        TypeError: `programs` is neither True nor False.
+
     Example:
         >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach
         >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
@@ -169,6 +177,7 @@ class LinearBounds(AbstractRelaxation):
         [0.432, -0.216]
     """
 
+    programs: bool = True
     remove_stable: bool = dataclasses.field(default=True, init=False, repr=False)
 
     linear_bounds: ClassVar[bool] = True

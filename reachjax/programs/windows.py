@@ -27,7 +27,7 @@ from reachjax.numerics.rounding import Ball
 from reachjax.programs.basis import Rows, columns, loop_rows
 from reachjax.programs.bounds import LoopBounds, loop_bounds
 from reachjax.programs.facts import FactLayout, Kind, StepFacts
-from reachjax.programs.lmi import Program
+from reachjax.programs.lmi import Origin, Program
 from reachjax.programs.preactivations import bounds_over, known_inputs
 from reachjax.programs.relaxations import AbstractRelaxation
 from reachjax.programs.scaling import scaled_states, scaled_units
@@ -155,7 +155,9 @@ class Window(Replaceable):
         """
         one, objective = _ends(directions, self.state, self.transform)
         facts = _joined(one, *self.facts, self.cone)
-        return Program(facts, objective, relaxation.products(self.layout), self.transform)
+        products, flags = relaxation.products(self.layout), (self.prune, self.linear)
+        origin = Origin(self.start, len(self), *flags, self.drop_columns)
+        return Program(facts, objective, products, self.transform, origin)
 
     def _places(self, bounds: LoopBounds) -> tuple[Int[np.ndarray, " k"], int]:
         """The column of each unit of one more step, and how many are taken then."""

@@ -85,7 +85,10 @@ class BranchCertificate(AbstractProof):
         by_products: `(p,)`, numbers of the facets of `products`.
         rungs: `(f,)`, values of `Rung`.
         nodes: `(f,)`, how many linear programs were solved for each facet.
+        ranges: multipliers `(2 k, m)` that tightened the ranges of the step's units, in the order
+            in which they were asked for; None where that is not known.
         least: whether there is one bound, of the least of all rows.
+        time: of the states that are bounded; None where that is not known.
 
     Raises:
         ValueError: there are not as many bounds as rows, or more than one of their least.
@@ -97,7 +100,9 @@ class BranchCertificate(AbstractProof):
     by_products: Int[Array | np.ndarray, " p"]
     rungs: Int[Array | np.ndarray, " f"]
     nodes: Int[Array | np.ndarray, " f"]
+    ranges: tuple[Float[Array | np.ndarray, "k m"], ...] | None = None
     least: bool = static(default=False)
+    time: int | None = static(default=None)
 
     def __post_init__(self):
         rows, bounds = len(self.about.rows.rows), len(self.bounds)

@@ -48,7 +48,7 @@ class AbstractProof(Replaceable, abc.ABC):
     codes: Int[Array | np.ndarray, " f"]
     bounds: Float[Array | np.ndarray, " f"]
     witnesses: Float[Array | np.ndarray, " f"]
-    witness_states: Float[Array | np.ndarray, "f n_x"]
+    witness_states: Float[Array | np.ndarray, "f s"]
     seconds: Float[Array | np.ndarray, " f"]
 
     @property

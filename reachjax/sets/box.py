@@ -58,8 +58,8 @@ class Box(PolyhedralSet):
         if not is_concrete(lower, upper):
             # an empty box inside jax.jit: what is computed from it is NaN
             self._set(upper=jnp.where(lower <= upper, upper, jnp.nan))
-        elif bool(jnp.any(lower > upper)):
-            where = tuple(int(i) for i in np.argwhere(np.asarray(lower > upper))[0])
+        elif (above := np.asarray(lower) > np.asarray(upper)).any():
+            where = tuple(int(i) for i in np.argwhere(above)[0])
             raise ValueError(
                 f"Box.lower must not exceed Box.upper, but at {where} "
                 f"lower is {lower[where]} and upper {upper[where]}: the box is empty"

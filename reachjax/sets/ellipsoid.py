@@ -18,6 +18,7 @@ from scipy.optimize import lsq_linear
 
 from reachjax.numerics.checks import (
     Numbers,
+    evaluated,
     is_concrete,
     require_double_precision,
     same_size,
@@ -71,7 +72,8 @@ class Ellipsoid(AbstractSet):
         )
         if is_concrete(shape):
             _require_positive_definite(np.asarray(shape))
-        object.__setattr__(self, "shape", (shape + shape.T) / 2)
+        with evaluated(shape):
+            object.__setattr__(self, "shape", (shape + shape.T) / 2)
 
     @property
     def dimension(self) -> int:
@@ -81,9 +83,10 @@ class Ellipsoid(AbstractSet):
     @property
     def normal_form(self) -> NormalForm:
         """The pair `(A, b)`: the set is `|A x + b| <= 1`, up to rounding."""
-        factor = jnp.linalg.cholesky(self.shape)
-        A = solve_triangular(factor, jnp.eye(self.dimension), lower=True)
-        return NormalForm(A, -A @ self.center)
+        with evaluated(self):
+            factor = jnp.linalg.cholesky(self.shape)
+            A = solve_triangular(factor, jnp.eye(self.dimension), lower=True)
+            return NormalForm(A, -A @ self.center)
 
     @classmethod
     def enclosing(

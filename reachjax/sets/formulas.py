@@ -10,12 +10,15 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from reachjax.numerics.checks import is_concrete
 
 ROUNDED = 8 * float(np.finfo(float).eps)
 """What rounding leaves of unit normals that are parallel, and of facets that are the same."""
+
+TOUCHING = 1e-9
+"""A facet that is closer to a set, as a part of their distances from zero, touches it."""
 
 EMPTY = 1e-9
 """A polygon whose facets miss one another by a larger part of its size is empty, not a point."""
@@ -45,29 +48,35 @@ def boxes_apart(
     one: tuple[Float[Array, " n"], Float[Array, " n"]],
     other: tuple[Float[Array, " n"], Float[Array, " n"]],
 ) -> Float[Array, ""]:
-    """How far the facets of one box may move outward before it meets another one; rounded down."""
-    gap = jnp.maximum(one[0] - other[1], other[0] - one[1]).max()
+    """How far the facets of the other box may move outward before it meets the one; rounded down.
+
+    They move inward where the boxes overlap: until the other one is away, or has no point left.
+    """
+    empty = (other[0] - other[1]) / 2
+    gap = jnp.maximum(jnp.maximum(one[0] - other[1], other[0] - one[1]), empty).max()
     return gap - ROUNDED * jnp.abs(jax.lax.stop_gradient(gap))
 
 
 def offsets_along(
     A: Float[Array, "m n"], b: Float[Array, " m"], directions: Float[Array, "k n"]
-) -> Float[Array, " k"] | None:
+) -> tuple[Float[Array, " k"], Bool[Array | np.ndarray, " k"]]:
     """The least offset of the facets whose normal is each direction, up to length and rounding.
 
-    None if there is a direction without a facet, or normals or directions are traced.
+    Returns:
+        The offsets, infinite where no facet has that normal, and whether one has: known numbers
+        where normals and directions are.
     """
-    if not is_concrete((A, directions)):
-        return None
-    normals, wanted = np.asarray(A), np.asarray(directions)
-    sizes, lengths = (np.abs(rows).max(axis=1) for rows in (normals, wanted))
-    if not (sizes.all() and lengths.all()):
-        return None
-    apart = wanted[:, None] / lengths[:, None, None] - normals / sizes[:, None]
-    same = np.abs(apart).max(axis=2) <= ROUNDED
-    if not same.any(axis=1).all():
-        return None
-    return jnp.where(same, b * (lengths[:, None] / sizes), jnp.inf).min(axis=1)
+    known = is_concrete((A, directions))
+    xp = np if known else jnp
+    held = (A, directions) if known else jax.lax.stop_gradient((A, directions))
+    normals, wanted = map(xp.asarray, held)
+    sizes, lengths = (xp.abs(rows).max(axis=1) for rows in (normals, wanted))
+    along = [xp.where(size > 0, size, 1.0) for size in (sizes, lengths)]
+    apart = (wanted / along[1][:, None])[:, None] - normals / along[0][:, None]
+    same = (xp.abs(apart).max(axis=2) <= ROUNDED) & (sizes > 0) & (lengths > 0)[:, None]
+    xp = np if known and is_concrete(b) else jnp
+    scaled = xp.asarray(b) * (lengths[:, None] / along[0])
+    return jnp.asarray(xp.where(same, scaled, np.inf).min(axis=1)), same.any(axis=1)
 
 
 def _unless(bad: Array) -> Float[Array, ""]:

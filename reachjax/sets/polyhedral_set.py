@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from reachjax.numerics.checks import is_concrete, require_double_precision
+from reachjax.numerics.checks import evaluated, is_concrete, require_double_precision
 from reachjax.numerics.rounding import TINY, exponents, gamma, lengths, shifted
 from reachjax.sets import envelopes, formulas, outlines
 from reachjax.sets.balance import balanced
@@ -79,18 +79,26 @@ class PolyhedralSet(AbstractSet):
                 C, d = balanced(np.asarray(A), np.asarray(b), inner)
                 return jnp.asarray(C), jnp.asarray(d), jnp.asarray(np.linalg.norm(C, axis=1))
         C, d = self.facets
-        by = exponents(C)
-        C, d = shifted(C, -by[:, None]), shifted(d, -by)
-        return C, d, lengths(C)
+        with evaluated(C):  # normals may be known where offsets are not
+            by = exponents(C)
+            C, norms = shifted(C, -by[:, None]), lengths(shifted(C, -by[:, None]))
+        return C, shifted(d, -by), norms
 
     def bounds_along(self, directions: Float[Array, "m n"]) -> Float[Array, " m"]:
-        """The support; in compiled code offsets of the facets, if each direction is one's normal.
+        """Offsets of the facets whose normal is a direction, and the support of other directions.
 
         An offset is looser than the support where its facet does not touch the set.
         """
         A, b = self.facets
-        known = None if is_concrete((A, b)) else formulas.offsets_along(A, b, directions)
-        return self.support(directions) if known is None else known
+        offsets, found = formulas.offsets_along(A, b, directions)
+        known = is_concrete((A, directions))
+        if known and np.all(found):
+            return offsets
+        support = self.support(directions)
+        if not known:  # where a facet touches, its normal has a derivative too
+            rounding = formulas.TOUCHING * (abs(offsets) + abs(support))
+            found = found & (offsets - support > rounding)
+        return jnp.where(found, offsets, support)
 
     def separation(self, other: PolyhedralSet) -> Float[Array, ""]:
         """How far the facets of another set may move outward before it meets this bounded one."""

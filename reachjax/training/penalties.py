@@ -57,7 +57,8 @@ def volume_penalty(
         options: keyword arguments of `reach`, such as `relaxation`. For a `Template` that is
             `LinearBounds()`, which takes milliseconds, unless they say otherwise; for ellipsoids,
             or where a `solver` or a `window` is given, `LocalBounds()`. The window is 1, but for
-            `BranchAndCut()` outside of compiled code, which has none.
+            `BranchAndCut()` outside of compiled code, which has none. With `LinearBounds()` an `X0`
+            that is a polytope counts as the box around it, compiled or not.
 
     Raises:
         RuntimeError, TypeError, ValueError: as `reach` does; `measure` gives no number; `cells` are
@@ -177,6 +178,8 @@ def _completed(
     by_programs = not isinstance(template, Template) or "solver" in options or "window" in options
     relaxation = options.get("relaxation", LocalBounds() if by_programs else LinearBounds())
     of_numbers = is_concrete(jax.lax.stop_gradient((loop, X0, template)))
+    if isinstance(relaxation, LinearBounds):  # with programs it would change when it is compiled
+        relaxation = LinearBounds(programs=False)
     window = None if isinstance(relaxation, BranchAndCut) and of_numbers else 1
     return {"window": window} | options | {"relaxation": relaxation}
 

@@ -75,16 +75,15 @@ def sets_by_branching(
     budget = setting.budget.with_work(of_programs)
     scenarios = Scenarios.of(loop, begun, horizon, setting.start)
     ladder = Ladder(loop, begun, around, scenarios, setting.start, nodes, budget, setting.note)
-    X, steps, ends = X0, list[Step](), list[Array]()
+    X, steps, ends = X0, list[Step](), list[Array | np.ndarray]()
     for k, (region, proof, *_) in enumerate(known, start=1):
         steps.append(Step(setting, X, k - 1, tuple(steps)))
         X = region
-        ladder.advance()
+        ladder.repeat(proof)
         if isinstance(proof, BranchCertificate):
             ladder.spend(int(np.sum(proof.nodes)))
             work -= len(proof.by_products) * ladder.width**4
-        ends.append(_ends(*_facets(X)))
-        ladder.horizon.narrow(*jax.device_get(jax.lax.stop_gradient(ends[-1])))
+        ends.append(ladder.narrow(X))
     left = (horizon - len(known)) / horizon
     budget.grant(left * of_programs)
     work = max(work, left * PRODUCTS)
@@ -128,10 +127,11 @@ def sets_by_branching(
         seconds = time.perf_counter() - began
         shut = np.asarray(jax.lax.stop_gradient(offsets)) - climbed.attained <= setting.gap * ranges
         codes = np.where(shut, int(SolverStatus.SOLVED), climbed.codes)
-        proof = _certificate(climbed, codes, offsets, products, opened, seconds)
+        proof = _certificate(climbed, codes, offsets, products, opened, seconds).replace(
+            ranges=tuple(ladder.horizon.tightened), time=setting.start + k
+        )
         yield Reached(X, proof, climbed.ended, climb=False)
-        ends.append(_ends(directions, offsets))
-        ladder.horizon.narrow(*jax.device_get(jax.lax.stop_gradient(ends[-1])))
+        ends.append(ladder.narrow(X))
 
 
 def _moving(
@@ -141,7 +141,7 @@ def _moving(
     directions: Float[Array, "f n_x"],
     climbed: Climbed,
     ladder: Ladder,
-    known: Sequence[Float[Array, "2 n_x"]],
+    known: Sequence[Float[Array | np.ndarray, "2 n_x"]],
     horizon: int,
 ) -> Float[Array, " f"]:
     """Numbers with the derivatives of what is proved.
@@ -175,25 +175,6 @@ def _with_products(
     found, proof = facets_by_products(step, directions[opened], budget)
     better = found < offsets[opened]
     return offsets.at[opened].set(jnp.where(better, found, offsets[opened])), proof
-
-
-def _facets(X: AbstractSet) -> tuple[Array, Array]:
-    """Directions and offsets of a set's facets."""
-    flat, _ = X.parts
-    assert flat is not None  # as templates have it
-    return flat.facets
-
-
-def _ends(rows: Float[Array, "f n"], offsets: Float[Array, " f"]) -> Float[Array, "2 n"]:
-    """Bounds of the state that facets along the axes are; infinite where there is none."""
-    fixed, n = np.asarray(jax.lax.stop_gradient(rows)), rows.shape[1]
-    found = jnp.stack([jnp.full(n, -jnp.inf), jnp.full(n, jnp.inf)])
-    for row, offset in zip(fixed, offsets, strict=True):
-        (there,) = np.nonzero(row)
-        if len(there) == 1 and abs(row[there[0]]) == 1.0:
-            i = there[0]
-            found = found.at[1, i].min(offset) if row[i] > 0 else found.at[0, i].max(-offset)
-    return found
 
 
 def _certificate(

@@ -25,6 +25,7 @@ ENDS = SolverStatus.AFFINE_FORM, SolverStatus.FAILED
 def sets_by_forms(
     loop: ClosedLoop,
     X0: AbstractSet,
+    held: AbstractSet,
     box: Box,
     template: AbstractTemplate,
     horizon: int,
@@ -33,6 +34,15 @@ def sets_by_forms(
     """The smallest sets that affine forms show to hold the states, one step after the other.
 
     Concrete numbers are propagated in numpy as the sets are asked for, traced ones all at once.
+
+    Args:
+        loop: the closed loop.
+        X0: the initial set.
+        held: what forms begin from: the initial set, or a larger one.
+        box: around it.
+        template: the directions.
+        horizon: the number of steps.
+        start: the time of the initial set.
 
     Raises:
         TypeError: the template has no facets.
@@ -50,9 +60,9 @@ def sets_by_forms(
     if template.steps is None:
         directions = jnp.broadcast_to(directions, (horizon, *directions.shape))
     if is_concrete(loop, X0, box, directions):
-        steps = _timed(unrolled(loop, X0, box, np.asarray(directions[:horizon]), start), start)
+        steps = _timed(unrolled(loop, held, box, np.asarray(directions[:horizon]), start), start)
     else:
-        steps = _at_once(unrolled_at_once(loop, X0, box, directions[:horizon], start))
+        steps = _at_once(unrolled_at_once(loop, held, box, directions[:horizon], start))
     for k, (step, seconds) in enumerate(steps, start=1):
         shaped, facets = template.at(k), len(template)
         proof = LinearCertificate(

@@ -81,7 +81,7 @@ def _held(
     for _ in range(k + 1):
         horizon.advance()
     forms, facets, cut = directions[k] @ horizon.state, None, isinstance(X0, Polytope)
-    if cut:
+    if isinstance(X0, Polytope):
         room = LOOSE * np.max(box.upper - box.lower)
         facets = X0.cut(Box(box.lower - room, box.upper + room)).facets
     bounds = sources(horizon.start, forms, forms.ends(horizon.start, cut=cut)[1], facets)

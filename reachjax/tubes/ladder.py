@@ -9,16 +9,26 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.linalg import block_diag
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import Budget
+from reachjax.numerics.rounding import namespace
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, joined
-from reachjax.proofs.branches import Branches, HorizonFacts, Rung, bounds_of, leaf_bounds
+from reachjax.proofs.branches import (
+    BranchCertificate,
+    Branches,
+    HorizonFacts,
+    Rung,
+    bounds_of,
+    leaf_bounds,
+)
+from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box
@@ -135,6 +145,39 @@ class Ladder:
         ranges = partial(self._ranges, budget or self._budget) if tighten and self._nodes else None
         self.horizon.advance(ranges)
 
+    def repeat(self, proof: AbstractProof) -> None:
+        """One step more, whose set is known with its proof.
+
+        Ranges of units are those of the proof's multipliers, which are sound whatever they are. A
+        proof that does not say them has them found again; one of another kind had none.
+        """
+        if not isinstance(proof, BranchCertificate):
+            self.horizon.advance()
+            return
+        if proof.ranges is None:
+            self.advance()
+            return
+        known = iter(proof.ranges)
+
+        def multipliers(forms: AffineForms) -> tuple[np.ndarray, np.ndarray] | None:
+            given, facts = np.asarray(next(known, np.zeros((0, 0)))), self.horizon.facts
+            if given.shape != (len(forms.rows), len(facts.rows)):
+                return None
+            unknown = np.full((len(given), facts.columns.shape[1]), np.nan)
+            return np.where(np.isfinite(given), np.fmax(given, 0.0), 0.0), unknown
+
+        self.horizon.advance(multipliers)
+
+    def narrow(self, X: AbstractSet) -> Float[Array | np.ndarray, "2 n"]:
+        """Meet the state with a set that surely holds it: with its facets along the axes.
+
+        Returns:
+            The bounds that these are, with their derivatives; infinite where there are none.
+        """
+        ends = _ends(*X.facets)
+        self.horizon.narrow(*np.asarray(jax.lax.stop_gradient(ends)))
+        return ends
+
     def _ranges(
         self, budget: Budget, forms: AffineForms
     ) -> tuple[Float[np.ndarray, "k m"], Float[np.ndarray, "k n"]] | None:
@@ -150,11 +193,17 @@ class Ladder:
             if budget.work <= 0 or budget.late:
                 break
             self.spend(1)
-            vertex = self._programs.largest(row[None], forms.rows[number, :1], (), budget)
+            constant = np.asarray(forms.rows)[number, :1]
+            vertex = self._programs.largest(row[None], constant, (), budget)
             if vertex is not None and len(vertex.columns):
                 found[number] = np.maximum(vertex.multipliers, 0.0)
                 there[number] = vertex.columns
         return found, there
+
+    def about(self, forms: AffineForms) -> HorizonFacts:
+        """What branches are about that bound these forms."""
+        horizon, rows = self.horizon, forms.widened(self.width)
+        return HorizonFacts(horizon.start, horizon.facts, horizon.zero, rows)
 
     @property
     def _size(self) -> int:
@@ -302,8 +351,7 @@ class Ladder:
             multipliers=multipliers,
             weights=np.asarray(block_diag(*(each.weights for each in found))),
         )
-        rows = joined([forms.widened(width) for forms in target.forms])
-        about = HorizonFacts(horizon.start, horizon.facts, horizon.zero, rows)
+        about = self.about(joined([forms.widened(width) for forms in target.forms]))
         each = leaf_bounds(about, leaves)
         uppers = [forms.ends(horizon.start)[1].min() for forms in target.forms]
         mine = (np.flatnonzero(owner == number) for number in range(count))
@@ -344,3 +392,19 @@ class Ladder:
             if given is not None:
                 found[facet], columns[facet], there[facet] = given, at, True
         return columns, found, there
+
+
+def _ends(
+    rows: Float[Array | np.ndarray, "f n"], offsets: Float[Array | np.ndarray, " f"]
+) -> Float[Array | np.ndarray, "2 n"]:
+    """Bounds of the state that facets along the axes are; infinite where there is none."""
+    fixed, values = (np.asarray(jax.lax.stop_gradient(part)) for part in (rows, offsets))
+    which = np.full((2, fixed.shape[1]), -1)
+    for number, row in enumerate(fixed):
+        (there,) = np.nonzero(row)
+        if len(there) == 1 and abs(row[there[0]]) == 1.0:
+            place = int(row[there[0]] > 0), there[0]
+            if which[place] < 0 or values[number] < values[which[place]]:
+                which[place] = number
+    signs = np.array([[-1.0], [1.0]])
+    return namespace(offsets).where(which >= 0, signs * offsets[which], signs * np.inf)

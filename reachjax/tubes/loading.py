@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from reachjax.loops import ClosedLoop
+from reachjax.numerics.archives import UnreadableError
 from reachjax.numerics.checks import (
     owned,
     require_bar,
@@ -19,10 +20,9 @@ from reachjax.numerics.files import existing_file
 from reachjax.numerics.storage import read
 from reachjax.tubes.kept import Kept
 from reachjax.tubes.partitions import Bar, PartitionedTube
+from reachjax.tubes.propagation import Options, Task, check_task
 from reachjax.tubes.reach import ReachTube
-
-ROUNDING = 1e-9
-"""Of a bound's size: what a recheck may differ by on another machine."""
+from reachjax.tubes.rechecks import Recheck, require_partition
 
 MISSING = (
     "was written without its loop, whose functions cannot be stored: give the loop again, "
@@ -43,15 +43,19 @@ def load(
         path: of the file.
         loop: needed if the loop has functions that a user wrote, which no file can keep. It must be
             the one that was left out, in every equation that JAX traces of it and in every number.
-        recheck: whether all bounds are proved anew from their certificates.
+        recheck: whether everything that the tube says of its loop is proved anew, which takes about
+            as long as it took to compute, or less. The file is believed in nothing: of the loop,
+            the initial set, template and start that it has, all else follows.
         progress: wraps the iteration over steps that are rechecked, such as `tqdm.tqdm`.
 
     Raises:
         FileNotFoundError: there is no such file.
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind.
-        ValueError: the file is none of reachjax, of another version, broken or changed; a loop is
-            needed or is another one; or a recheck does not prove a bound.
+        DisagreementError: a recheck does not prove what the file says.
+        UnreadableError: the file is none of reachjax, of another version, broken or changed, or a
+            loop is needed.
+        ValueError: the loop is another one, or the progress bar leaves out steps.
 
     Example:
         >>> import pathlib, tempfile
@@ -66,38 +70,70 @@ def load(
     require_bar(progress)
     if loop is not None:
         require_kind("loop", loop, ClosedLoop, "a ClosedLoop")
-    kept = read(existing_file("path", path), owned(loop), MISSING)
-    if not isinstance(kept, Kept) or not isinstance(kept.tube, ReachTube | PartitionedTube):
-        raise ValueError(f"{path} must hold a tube, but something else arrived")
-    tube = _sealed(kept.tube)
-    tubes = tube.tubes if isinstance(tube, PartitionedTube) else (tube,)
+    found = existing_file("path", path)
+    kept = read(found, owned(loop), MISSING)
+    try:
+        tube = _sealed(kept)
+    except Exception as error:  # whoever wrote it may have written anything
+        raise UnreadableError(
+            f"{path} must hold a tube, but something else arrived: {error}"
+        ) from (error)
     if loop is not None and not kept.is_of(loop):
         raise ValueError(
             f"loop must be that of the tube in {path}, with the same equations and numbers, but "
             "another one arrived (or another version of JAX, which writes its equations otherwise)"
         )
-    if recheck:
-        steps = [(each, t) for each in tubes for t in range(1, each.horizon + 1)]
-        for each, t in wrapped(progress, steps):
-            _require_proved(each, t)
-    return tube
+    return _rechecked(tube, progress) if recheck else tube
 
 
-def _sealed(tube: Any) -> ReachTube | PartitionedTube:
-    """The same, with the seal of what was read."""
+def _rechecked(tube: ReachTube | PartitionedTube, progress: Bar | None) -> Any:
+    """The tube as it is proved anew.
+
+    Raises:
+        DisagreementError: it says what is not proved.
+        ValueError: the progress bar leaves out steps.
+    """
+    parts = tube.tubes if isinstance(tube, PartitionedTube) else (tube,)
     if isinstance(tube, PartitionedTube):
-        return PartitionedTube.sealed(tube.X0, tuple(map(_sealed, tube.tubes)))  # type: ignore[arg-type]
+        require_partition(tube)
+    steps = [each for each in map(Recheck, parts) for _ in range(each.left)]
+    for each in wrapped(progress, steps):
+        each.advance()
+    done = {id(each): each for each in steps}
+    found = tuple(each.finished() for each in done.values())
+    if isinstance(tube, PartitionedTube):
+        return PartitionedTube.sealed(tube.X0, found)
+    return found[0]
+
+
+def _sealed(kept: Any) -> ReachTube | PartitionedTube:
+    """The tube that was read, its parts being what a tube has, with the seal of what was read.
+
+    Raises:
+        Exception: of any kind: they are something else.
+    """
+    require_kind("it", kept, Kept, "a tube with the seal of its loop")
+    if isinstance(kept.tube, PartitionedTube):
+        parts = tuple(map(_whole, kept.tube.tubes))
+        if not parts:
+            raise ValueError("it has no cells")
+        return PartitionedTube.sealed(kept.tube.X0, parts)
+    return _whole(kept.tube)
+
+
+def _whole(tube: Any) -> ReachTube:
+    """A tube whose sets and proofs are as many and as large as they should be."""
+    require_kind("it", tube, ReachTube, "a tube")
+    check_task(Task(tube.loop, tube.sets[0], tube.horizon, tube.template, tube.start), Options())
+    if len(tube.certificates) != len(tube.sets) or tube.certificates[0] is not None:
+        raise ValueError(f"it has {len(tube.sets)} sets, but {len(tube.certificates)} certificates")
+    for k in range(1, tube.horizon + 1):
+        region, proof = tube.sets[k], tube.proof(k)
+        bounds = np.asarray(proof.bounds)
+        if region.dimension != tube.loop.states or bounds.shape != region.limits.shape:
+            raise ValueError(f"sets[{k}] is not of the loop's states, or not of its certificate")
+        if not np.isfinite(bounds).all():
+            raise ValueError(f"certificates[{k}] has bounds that are no numbers")
+        if len(proof.statuses) != len(bounds):
+            raise ValueError(f"certificates[{k}] has not as many statuses as bounds")
     return ReachTube.sealed(tube.loop, tube.template, tube.sets, tube.certificates, tube.start)
-
-
-def _require_proved(tube: ReachTube, t: int) -> None:
-    proof = tube.proof(t)
-    bounds, again = np.asarray(proof.bounds), np.asarray(proof.recheck())
-    size = np.fmax(abs(bounds), abs(np.asarray(proof.gaps)))
-    missing = ~(again <= bounds + ROUNDING * size) & np.isfinite(bounds)
-    if np.any(missing):
-        facet = int(np.flatnonzero(missing)[0])
-        raise ValueError(
-            f"the recheck of step {t} proves {again[facet]:g} for facet {facet}, but the tube says "
-            f"{bounds[facet]:g}: it was computed for another loop, or by another version"
-        )

@@ -186,7 +186,8 @@ def _following(
     relaxation, window = options.relaxation, options.window
     box = boxed(X0, "X0")
     if relaxation.by_forms:  # forms go back to the initial set: they take milliseconds
-        steps = sets_by_forms(loop, X0, box, template, horizon, start)
+        held = X0 if getattr(relaxation, "programs", False) else X0.closed_form(box)
+        steps = sets_by_forms(loop, X0, held, box, template, horizon, start)
         return itertools.islice(steps, len(known), None)
     if window is None and isinstance(relaxation, BranchAndCut) and isinstance(template, Template):
         if loop.curved and relaxation.cells > 1 and X0.parts[1] is None:

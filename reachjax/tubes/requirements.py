@@ -75,11 +75,16 @@ class Requirement:
         """What every state surely does not exceed, and should not: of each facet, or of the set."""
         return self.compared_with(tube.sets[self.time])
 
-    def compared_with(self, reached: AbstractSet) -> Compared:
-        """The same, of a set that holds every state at this time."""
+    def compared_with(self, reached: AbstractSet, by_offsets: bool = False) -> Compared:
+        """The same, of a set that holds every state at this time.
+
+        Args:
+            reached: the set.
+            by_offsets: whether its facets' offsets will do where its support takes programs.
+        """
         if self.inside:
             C, d, norms = self.region.facets_in_units(inner=True)
-            return Compared(reached.bounds_along(C), d, norms)
+            return Compared((reached.bounds_along if by_offsets else reached.support)(C), d, norms)
         return Compared(-reached.separation(self.region)[None], jnp.zeros(1), jnp.ones(1))
 
     def simulated(self, trajectories: np.ndarray) -> np.ndarray:
@@ -211,7 +216,8 @@ def shortfall(
 
     The sum of `max(0, margin - m)` over the certified margins `m` of all requirements: one for each
     facet of the goal and of the safe set at each time, one for each avoided set at each time.
-    Differentiable, also inside `jax.jit`.
+    Differentiable, and the same inside `jax.jit`: where a facet of a tube's set has the normal of a
+    facet of the goal or of the safe set, its offset counts, though others may cut it off.
 
     Args:
         tube: certified sets for `t = 0 .. horizon`.
@@ -237,7 +243,8 @@ def shortfall(
     check_margin(margin)
     missing = jnp.zeros(())
     for item in of_tube(tube, goal, avoid, safe):
-        missing += jnp.sum(jnp.maximum(0.0, margin - item.compared(tube).margins))
+        margins = item.compared_with(tube.sets[item.time], by_offsets=True).margins
+        missing += jnp.sum(jnp.maximum(0.0, margin - margins))
     return missing
 
 

@@ -141,17 +141,18 @@ class Step:
     def _reaching_back(self, before: tuple[Step, ...]) -> Window:
         """The window over these steps and this one."""
         if before and len(before[-1].window) == len(before):
-            return self._added_to(before[-1].window)
+            return self.added_to(before[-1].window)
         first, *others = (*before, self)
         setting = self.setting
         window = Window.beginning(
             setting.loop, first.X, first.box, first.t, setting.relaxation, setting.drop_columns
         )
         for step in (first, *others):
-            window = step._added_to(window)
+            window = step.added_to(window)
         return window
 
-    def _added_to(self, window: Window) -> Window:
+    def added_to(self, window: Window) -> Window:
+        """A window that ends at the step's set of states, and this step."""
         return window.extended(self.setting.loop, self.X, self.box, self.first_inputs)
 
     @cached_property

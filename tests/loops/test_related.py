@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.loops.widths import widths
 
 RNG = np.random.default_rng(0)
 WEIGHTS = [jnp.asarray(RNG.normal(size=shape) / 2) for shape in ((6, 2), (6, 6), (1, 6))]
@@ -71,15 +72,8 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_quotients_are_bounded_by_what_their_parts_have_in_common(name):
     step, ends, horizon, relaxation, network, most = CASES[name]
-    controller = rj.Network(network or (lambda x: -x[:1]), inputs=2, outputs=1)
-    loop, X0 = rj.ClosedLoop(rj.NonlinearPlant(step, 2, 1), controller), rj.Box(*ends)
-    region = rj.reach(loop, X0, horizon, rj.Template.box(2), relaxation).sets[horizon]
-    starts = jnp.concatenate([X0.sample(jax.random.key(0), 4000), X0.corners()])
-    values = np.asarray(loop.simulate(starts, horizon)[:, horizon] @ np.asarray(region.A).T)
-    assert np.all(values <= np.asarray(region.b))
-    widths = np.asarray(region.b[::2] + region.b[1::2])
-    sampled = np.max(values[:, ::2], axis=0) + np.max(values[:, 1::2], axis=0)
-    assert np.all(widths <= most * sampled), widths / sampled
+    bounds, sampled = widths(step, rj.Box(*ends), relaxation, horizon=horizon, controller=network)
+    assert np.all(bounds <= most * sampled), bounds / sampled
 
 
 def test_traced_parameters_beside_a_quotient_are_recorded_alike():

@@ -169,7 +169,7 @@ def repeated(x):
     [
         (branching, r"'sign' \(in branching, .*test_tracing\.py:\d+\).* discontinuous"),
         (jumping, r"'select_n' \(in jumping, .*test_tracing\.py:\d+\).* agree where it changes"),
-        (chosen, r"\(in chosen, .*a comparison of numbers may only choose between two"),
+        (chosen, r"'cond' \(in chosen, .*known to agree where it changes"),
         (rounded, r"'convert_element_type' \(in rounded, .*rounds to float32"),
         (unknown, r"'lgamma' \(in unknown, .*test_tracing\.py:\d+\).* no bounds for it"),
         (repeated, r"'while' \(in repeated"),

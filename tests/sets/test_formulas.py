@@ -121,15 +121,20 @@ def test_offsets_along_facets_bound_the_support_and_are_found_by_direction_alone
     A = np.array([[2.0, 0.0], [0.0, 1.0], [-1.0, -1.0], [1.0, 0.0], [3.0, 3.0]])
     b = np.array([2.0, 1.0, 1.0, 0.5, 30.0])
     wanted = np.array([[4.0, 0.0], [-0.5, -0.5], [1.0, 1.0]])
-    found = np.asarray(formulas.offsets_along(A, b, wanted))
+    found, known = (np.asarray(part) for part in formulas.offsets_along(A, b, wanted))
+    assert known.all()
     np.testing.assert_allclose(found, [2.0, 0.5, 10.0])  # the least of two; the last is redundant
     assert np.all(found >= np.asarray(Polytope(A, b).support(wanted)) * (1 - 1e-12))
-    assert formulas.offsets_along(A, b, np.array([[1.0, 2.0]])) is None
-    assert formulas.offsets_along(A, b, np.zeros((1, 2))) is None
-    assert jax.jit(lambda A: formulas.offsets_along(A, b, wanted) is None)(A)
+    for others in (np.array([[1.0, 2.0]]), np.zeros((1, 2))):
+        offsets, known = formulas.offsets_along(A, b, others)
+        assert np.isinf(offsets).all()
+        assert not known.any()
+    traced = jax.jit(formulas.offsets_along)(A, b, wanted)
+    np.testing.assert_array_equal(traced[0], found)
+    np.testing.assert_array_equal(traced[1], True)
 
 
-def test_compiled_bounds_are_offsets_along_facets_and_supports_elsewhere():
+def test_bounds_are_offsets_along_facets_and_supports_elsewhere():
     A, b, _ = polygon(5)
     bounds = jax.jit(lambda b, D: Polytope(A, b).bounds_along(D))
     elsewhere = np.array([[0.3, -0.8]])
@@ -155,3 +160,15 @@ def test_boxes_are_as_far_apart_as_linear_programs_say_with_the_same_slopes(seed
     assert float(value) == pytest.approx(float(apart(lower, upper)), rel=1e-9, abs=1e-12)
     assert np.count_nonzero(by_lower) + np.count_nonzero(by_upper) == 1
     assert by_lower.sum() - by_upper.sum() == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_overlapping_boxes_are_as_deep_in_one_another_as_linear_programs_say(seed):
+    """The other box may have no point left before its facets have left the one."""
+    rng = np.random.default_rng(seed)
+    one = Box(*np.sort(rng.normal(size=(2, 2)) * 3, axis=0))
+    middle = np.asarray(one.center)
+    other = Box(middle - rng.uniform(0.1, 4, 2), middle + rng.uniform(0.1, 4, 2))
+    value = jax.jit(lambda box: box.separation(other))(one)
+    assert value < 0
+    assert float(value) == pytest.approx(float(one.separation(other)), rel=1e-9)

@@ -12,10 +12,19 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.primitives import affine, angles, bends, folds, moving, powers
-from reachjax.loops.primitives.equations import JUMPS, Equation, Rule, on_host
+from reachjax.loops.primitives import affine, angles, bends, choices, folds, moving, powers, solvers
+from reachjax.loops.primitives.equations import JUMPS, NOT_FINITE, Equation, Rule, on_host
 from reachjax.loops.recording import Recorder
-from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value, is_known
+from reachjax.loops.values import (
+    Choice,
+    Comparison,
+    Operand,
+    Unknown,
+    UnsupportedError,
+    Value,
+    is_known,
+    is_plain,
+)
 
 __all__ = ["Equation", "recorded"]
 
@@ -26,14 +35,28 @@ DISCONTINUOUS = (
 )
 """Primitives that jump."""
 
-SOLVERS = ("custom_linear_solve", "triangular_solve", "lu", "cholesky", "lu_solve")
-"""Primitives whose results are known up to rounding that is not bounded."""
-
 INFINITE = (
     "max", "min", "clamp", "select_n", "gt", "ge", "lt", "le", "eq", "ne", *moving.RULES,
 )
 """Primitives that may take numbers that are not finite."""
 # fmt: on
+
+INSTEAD = {
+    "cbrt": "use y ** (1 / 3) of numbers above zero",
+    "cumlogsumexp": "use jax.nn.logsumexp of each part",
+    "ragged_dot_general": "use jnp.dot of each group",
+    "reduce": "use jnp.sum, jnp.prod, jnp.max or jnp.min",
+    "reduce_precision": "leave it out, and give what it rounds by as a disturbance",
+    "scatter-max": "use x.at[i].set(jnp.maximum(x[i], y))",
+    "scatter-min": "use x.at[i].set(jnp.minimum(x[i], y))",
+    "top_k": "use jnp.sort, jnp.max or jnp.min",
+}
+"""What to do in place of primitives that have no rule."""
+
+OTHERWISE = (
+    "write it with arithmetic, powers, exponentials, logarithms and sines, or use a polynomial "
+    "that is close to it, and give the difference as a disturbance"
+)
 
 RULES: dict[str, Rule] = {
     **moving.RULES,
@@ -42,6 +65,7 @@ RULES: dict[str, Rule] = {
     **angles.RULES,
     **bends.RULES,
     **folds.RULES,
+    **solvers.RULES,
 }
 
 
@@ -56,23 +80,27 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
             f"it rounds to {equation.kind}: compute in 64-bit floats, for example by not giving "
             "layers a dtype"
             if jnp.issubdtype(equation.kind, jnp.floating)
-            else "it computes in complex numbers"
+            else "it computes in complex numbers: compute with their real and imaginary parts"
         )
-    rule = RULES.get(equation.name)
-    first = operands[0]
+    first, *others = operands
+    unknown = [each for each in operands if isinstance(each, Unknown)]
+    if unknown and equation.name == "select_n" and all(each is others[0] for each in others):
+        return others[0]
+    if unknown and equation.name != "custom_linear_solve":  # which needs no factors
+        raise unknown[0].error
+    rules = choices.RULES if any(isinstance(each, Choice) for each in operands) else RULES
     if isinstance(first, Comparison) and equation.name in moving.ALONE:
-        return Comparison(recorded(recorder, equation, [first.value, *operands[1:]]))
-    compared = any(isinstance(each, Comparison) for each in operands)
-    if compared and equation.name not in ("select_n", "not"):
-        raise UnsupportedError(
-            "a comparison of numbers may only choose between two of them that agree where it "
-            "changes, as jnp.where(y > 0, y, 0.1 * y) does"
-        )
+        return Comparison(recorded(recorder, equation, [first.value, *others]))
+    rule = (RULES if equation.name == "not" else rules).get(equation.name)
+    if rule is None and rules is choices.RULES:
+        raise UnsupportedError(choices.ONLY)
+    if rules is choices.RULES and rule is not None:
+        return rule(recorder, equation, operands)
     if rule is None or (equation.name == "convert_element_type" and not _is_float(equation)):
         raise UnsupportedError(_why(equation))
-    plain = [each for each in operands if not isinstance(each, Value | Comparison)]
+    plain = [*filter(is_plain, operands)]
     if equation.name not in INFINITE and not all(map(_is_finite, plain)):
-        raise UnsupportedError("one of its operands is a constant that is not finite")
+        raise UnsupportedError(NOT_FINITE)
     values = [each for each in operands if isinstance(each, Value)]
     if values and not any(each.size for each in values):  # vectors without entries are all alike
         return equation.evaluate(
@@ -84,12 +112,8 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
 def _why(equation: Equation) -> str:
     if equation.name in DISCONTINUOUS or equation.name == "convert_element_type":
         return JUMPS
-    if equation.name in SOLVERS:
-        return (
-            "what a solver's rounding may add is not known: multiply by jnp.linalg.inv(A), which "
-            "is taken as it is computed"
-        )
-    return "there are no bounds for it: write it with primitives that have some"
+    instead = INSTEAD.get(equation.name, OTHERWISE)
+    return f"there are no bounds for it: {instead}"
 
 
 def _is_float(equation: Equation) -> bool:

@@ -22,7 +22,9 @@ def _linear(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
     """Any primitive that is linear in its one operand that is no plain array: as a matrix."""
     where, *others = (k for k, each in enumerate(operands) if isinstance(each, Value))
     if others:
-        raise UnsupportedError("of its operands only one may depend on inputs")
+        raise UnsupportedError(
+            "of its operands only one may depend on inputs: write it as products and sums of these"
+        )
     value = operands[where]
 
     plain = [each for each in operands if each is not value]

@@ -41,7 +41,8 @@ def _beyond(recorder: Recorder, one: Operand, other: Operand, idle: float, rule:
         return rule(one, other)
     plain = np.asarray(other, float)
     if np.any(np.isnan(plain) | (plain == -idle)):
-        raise UnsupportedError(f"one of its operands is {plain[~np.isfinite(plain)].flat[0]}")
+        which = plain[~np.isfinite(plain)].flat[0]
+        raise UnsupportedError(f"one of its operands is {which}: use a finite one in its place")
     ignored = plain == idle
     if not np.any(ignored):
         return rule(one, other)
@@ -119,21 +120,26 @@ def _finite(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
     return np.full(equation.shape, True)
 
 
-def _selected(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
-    which, *cases = operands
-    if any(isinstance(each, Comparison) for each in cases):
-        raise UnsupportedError("what it chooses must be numbers, not comparisons of them")
-    cases = [shaped(recorder, each, equation.shape) for each in cases]
-    if isinstance(which, Value):
-        raise UnsupportedError("what is chosen must not depend on numbers that depend on inputs")
-    if not isinstance(which, Comparison):
-        return chosen(recorder, np.asarray(which) if is_known(which) else which, cases)
-    if len(cases) != 2:
-        raise UnsupportedError("it must choose between two numbers")
-    below, above = cases
+def decided(
+    recorder: Recorder, condition: Any, below: Operand, above: Operand, shape: tuple[int, ...]
+) -> Operand:
+    """`above` where a condition holds, else `below`, both of a shape."""
     if below is above:
         return below
-    return bent(recorder, shaped(recorder, which.value, equation.shape), below, above)
+    if not isinstance(condition, Comparison):
+        which = np.asarray(condition) if is_known(condition) else condition
+        return chosen(recorder, which, [below, above])
+    return bent(recorder, shaped(recorder, condition.value, shape), below, above)
+
+
+def _selected(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
+    which, *cases = operands
+    cases = [shaped(recorder, each, equation.shape) for each in cases]
+    if isinstance(which, Value):
+        raise UnsupportedError(
+            "what is chosen must not depend on numbers that depend on inputs: use jnp.where"
+        )
+    return chosen(recorder, np.asarray(which) if is_known(which) else which, cases)
 
 
 def _opposite(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:

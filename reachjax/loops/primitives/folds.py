@@ -73,7 +73,7 @@ def _over_windows(pair: Pair) -> Rule:
             parts.append(index[taken])
         inside = np.max(parts, axis=0)
         if np.any(inside < 0):
-            raise UnsupportedError("one of its windows is empty")
+            raise UnsupportedError("one of its windows is empty: use less padding")
         picked = [recorder.picked(value, np.where(each < 0, inside, each)) for each in parts]
         return _folded(recorder, picked, pair)
 
@@ -89,11 +89,15 @@ def _sorted(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
     (value, *others), axis = operands, equation.params["dimension"]
     if others:
         raise UnsupportedError(
-            "what is moved by the order of other numbers jumps where that changes"
+            "what is moved by the order of other numbers jumps where that changes: use jnp.sort of "
+            "the numbers themselves"
         )
     index = np.moveaxis(np.arange(value.size).reshape(value.shape), axis, 0)
     if len(index) > SORTED:
-        raise UnsupportedError(f"it sorts {len(index)} numbers, but {SORTED} at most have bounds")
+        raise UnsupportedError(
+            f"it sorts {len(index)} numbers, but {SORTED} at most have bounds: use jnp.max or "
+            "jnp.min"
+        )
     parts = [recorder.picked(value, each) for each in index]
     for turn in range(len(parts)):
         for k in range(turn % 2, len(parts) - 1, 2):

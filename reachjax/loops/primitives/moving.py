@@ -11,11 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.primitives.equations import (
-    Equation,
-    Rule,
-    shape_of,
-)
+from reachjax.loops.primitives.equations import NOT_FINITE, Equation, Rule, shape_of
 from reachjax.loops.recording import Recorder
 from reachjax.loops.values import Operand, UnsupportedError, Value, is_known
 
@@ -48,7 +44,8 @@ def _require_known(places: Sequence[Operand]) -> None:
 def _require_inside(index: np.ndarray, size: int) -> None:
     if index.size and not (index.min() >= 0 and index.max() < size):
         raise UnsupportedError(
-            "it takes entries that there are not: an index is out of range, where JAX takes others"
+            "it takes entries that there are not: an index is out of range, where JAX takes "
+            "others; keep it within, or clip it, as jnp.clip(i, 0, len(x) - 1)"
         )
 
 
@@ -60,7 +57,7 @@ def _taken(recorder: Recorder, operands: Sequence[Operand], index: Any) -> Value
         if not isinstance(each, Value) and is_known(each):
             finite = np.isfinite(np.asarray(each))
             if np.any(np.isin(numbers[~finite], index)):
-                raise UnsupportedError("one of its operands is a constant that is not finite")
+                raise UnsupportedError(NOT_FINITE)
             each = each if np.all(finite) else np.where(finite, np.asarray(each), 0.0)
         parts.append(each)
     return recorder.picked(recorder.joined(parts), index)
@@ -124,7 +121,9 @@ def _require_once(equation: Equation, whole: Operand, places: Operand, part: Ope
     """Raise an error if an entry is set twice: which one counts is not said."""
     zeros, ones = np.zeros(shape_of(whole)), np.ones(shape_of(part))
     if np.any(np.asarray(_scattered(equation, zeros, places, ones, adding=True)) > 1):
-        raise UnsupportedError("it sets an entry more than once")
+        raise UnsupportedError(
+            "it sets an entry more than once, and which one counts is not said: give it one value"
+        )
 
 
 def _scattered(equation: Equation, whole: Any, places: Any, part: Any, adding: bool = False) -> Any:
@@ -148,7 +147,9 @@ def _set(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) ->
     whole, places, part = operands
     _require_known([places])
     if equation.params.get("update_jaxpr") is not None and equation.name == "scatter":
-        raise UnsupportedError("it applies a function of its own to entries")
+        raise UnsupportedError(
+            "it applies a function of its own to entries: write x.at[i].set(f(x[i]))"
+        )
     _require_once(equation, whole, places, part)
     before, new = _numbers([whole, part])
     index = _scattered(equation, before, places, new)
@@ -163,8 +164,8 @@ def _added(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) 
     if not isinstance(part, Value):
         return recorder.added(whole, equation.evaluate(zeros, places, part))
     ones = np.eye(part.size).reshape(part.size, *part.shape)
-    columns = [_scattered(equation, zeros, places, one, adding=True).reshape(-1) for one in ones]
-    matrix = np.stack([np.asarray(column) for column in columns], axis=1)
+    columns = [np.asarray(_scattered(equation, zeros, places, one, adding=True)) for one in ones]
+    matrix = np.stack([column.reshape(-1) for column in columns], axis=1)
     return recorder.added(recorder.mapped(part, matrix, equation.shape), whole)
 
 
@@ -205,7 +206,7 @@ ALONE = (
 # fmt: on
 
 RULES: dict[str, Rule] = {
-    **dict.fromkeys((*ALONE, "split"), _moved),
+    **dict.fromkeys((*ALONE, "split", "unstack"), _moved),
     **dict.fromkeys(["concatenate", "stack"], _joined),
     "gather": _gathered,
     "pad": _padded,

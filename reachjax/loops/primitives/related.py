@@ -181,7 +181,7 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
     columns = _columns(rows)
     if columns is None:
         return None
-    first, logarithm = _logarithm(recorder, columns)
+    first, logarithm = _logarithm(recorder, columns, other.shape)
     difference = (mine - first).recorded(recorder, other.shape)
     if not isinstance(difference, Value) and not isinstance(logarithm, Value):
         return None
@@ -196,8 +196,7 @@ def of_sum(recorder: Recorder, value: Value) -> Value | None:
     columns = None if terms is None else _columns(terms)
     if columns is None or len(columns) < 2:
         return None
-    first, logarithm = _logarithm(recorder, columns)
-    logarithm = recorder.reshaped(logarithm, value.shape)
+    first, logarithm = _logarithm(recorder, columns, value.shape)
     return recorder.added(first.recorded(recorder, value.shape), logarithm)
 
 
@@ -238,12 +237,14 @@ def _columns(rows: list[list[Combination]]) -> list[Combination] | None:
     return [Combination.stacked([row[k] for row in rows]) for k in range(count)]
 
 
-def _logarithm(recorder: Recorder, columns: list[Combination]) -> tuple[Combination, Any]:
+def _logarithm(
+    recorder: Recorder, columns: list[Combination], shape: tuple[int, ...]
+) -> tuple[Combination, Any]:
     """`log(sum_k exp a_k)` as `a_0` and what is added to it: one softplus for each other term."""
     first, *others = columns
-    found: Any = np.zeros(len(first.offset))
+    found: Any = np.zeros(shape)
     for each in others:
-        rise = (each - first).recorded(recorder, first.offset.shape)
+        rise = (each - first).recorded(recorder, shape)
         rise = recorder.added(rise, found, -1)
         rise = (
             recorder.unit(Softplus(), rise) if isinstance(rise, Value) else np.logaddexp(0.0, rise)

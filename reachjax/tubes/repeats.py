@@ -1,0 +1,213 @@
+"""What the proofs of a tube rest on, made again from its loop, initial set, template and start.
+
+From a proof comes only what it proposes, of which any is sound: multipliers, slopes, cells, which
+products of facts, ellipsoids. Each step rests on the sets that are proved by then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.loops.scenarios import Scenarios
+from reachjax.numerics.budget import ENDLESS
+from reachjax.programs.facts import FactLayout
+from reachjax.programs.lmi import Origin, Program
+from reachjax.programs.relaxations import AllProducts, LinearBounds, LocalBounds, Products
+from reachjax.programs.unrolled import ByForms, unrolled
+from reachjax.programs.windows import Window
+from reachjax.proofs.branches import BranchCertificate
+from reachjax.proofs.cells import CellCertificate
+from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
+from reachjax.proofs.linear import LinearCertificate
+from reachjax.sets import AbstractSet
+from reachjax.sets.cells import from_tree
+from reachjax.solvers import Auto
+from reachjax.tubes.ladder import Ladder
+from reachjax.tubes.reach import ReachTube
+from reachjax.tubes.steps import Setting, Step, boxed
+from reachjax.tubes.successors import goals_of
+
+Again = tuple[AbstractProof, Float[np.ndarray, " f"]]
+"""A proof with all that it rests on made again, and the bounds that it proves."""
+
+
+class _Unrolled(NamedTuple):
+    """Forms over parts of the initial set, step after step.
+
+    Attributes:
+        key: what they were made with.
+        parts: the steps of each part, so many of which were taken.
+        taken: how many.
+    """
+
+    key: Any
+    parts: list[Iterator[ByForms]]
+    taken: int = 0
+
+
+class Repeat:
+    """The propagation of a tube, as its proofs say that it was.
+
+    Args:
+        tube: whose parts have the kinds that they should have.
+        sets: those that are proved so far; they grow from outside.
+    """
+
+    def __init__(self, tube: ReachTube, sets: Sequence[AbstractSet]):
+        self._tube, self._sets = tube, sets
+        self._forms = _Unrolled(None, [])
+        self._windows: dict[Origin, Window] = {}
+
+    def of(self, k: int, proof: AbstractProof) -> Again:
+        """The proof of the set after `k` steps, made again; that is asked for in order.
+
+        Raises:
+            Exception: of any kind: it does not fit the tube.
+        """
+        tube = self._tube
+        own: dict[str, Any] = {"loop": tube.loop, "X0": tube.sets[0], "k": k, "start": tube.start}
+        own["directions"] = self._directions(k)
+        by_forms = isinstance(proof, LinearCertificate | CellCertificate)
+        if by_forms and (proof.k, proof.start) != (k, tube.start):
+            raise ValueError(f"it is of step {proof.k} from t = {proof.start}")
+        if isinstance(proof, LinearCertificate):
+            *_, last = (p for p in tube.certificates if isinstance(p, LinearCertificate))
+            slopes = np.asarray(last.slopes)
+            found = self._by_forms(k, ("slopes", last.k), [(tube.sets[0], self._box)], slopes)
+            return proof.replace(**own, slopes=last.slopes[:k]), found
+        if isinstance(proof, CellCertificate):
+            axes = np.asarray(proof.axes).tolist()
+            cells = ((cell.part, cell.box) for cell in from_tree(tube.sets[0], axes))
+            return proof.replace(**own), self._by_forms(k, axes, cells)
+        if isinstance(proof, BranchCertificate):
+            proof = self._branches(k, proof)
+        elif isinstance(proof, AbstractCertificate):
+            goals = goals_of(tube.template.at(k), self._step(k - 1))
+            rows = [goal.rows(tube.loop.states) for goal in goals]
+            proof = proof.replace(program=self._program(k, jnp.concatenate(rows), proof.program))
+        else:
+            raise TypeError(f"{type(proof).__name__} proves no set of a tube")
+        return proof, np.asarray(proof.recheck())
+
+    def _directions(self, k: int) -> Any:
+        """Those of the facets of the set after `k` steps; None of ellipsoids."""
+        return getattr(self._tube.template.at(k), "directions", None)
+
+    @cached_property
+    def _box(self) -> Any:
+        return boxed(self._tube.sets[0], "X0")
+
+    def _by_forms(
+        self, k: int, key: Any, parts: Any, slopes: Float[np.ndarray, "k units"] | None = None
+    ) -> Float[np.ndarray, " f"]:
+        """The largest bounds over these parts of the initial set."""
+        tube, forms = self._tube, self._forms
+        if forms.key != key or forms.taken >= k:
+            steps = range(1, tube.horizon + 1 if slopes is None else len(slopes) + 1)
+            directions = np.stack([np.asarray(self._directions(j)) for j in steps])
+            given: Any = directions, tube.start, slopes
+            forms = _Unrolled(key, [unrolled(tube.loop, *part, *given) for part in parts])
+        found = list[np.ndarray]()
+        for _ in range(forms.taken, k):
+            found = [np.asarray(next(each).offsets) for each in forms.parts]
+        self._forms = forms._replace(taken=k)
+        return np.max(np.where(np.isnan(found), np.inf, found), axis=0)
+
+    @cached_property
+    def _ladder(self) -> Ladder:
+        tube = self._tube
+        loop, X0, box = jax.device_get((tube.loop, tube.sets[0], self._box))
+        scenarios = Scenarios.of(loop, X0, tube.horizon, tube.start)
+        return Ladder(loop, X0, box, scenarios, tube.start, 1, ENDLESS)
+
+    def _branches(self, k: int, proof: BranchCertificate) -> BranchCertificate:
+        tube, ladder = self._tube, self._ladder
+        if proof.time not in (None, tube.start + k):
+            raise ValueError(f"it is of states at t = {proof.time}, not {tube.start + k}")
+        while (done := len(ladder.horizon.steps)) < k:
+            if done:
+                ladder.narrow(self._sets[done])
+            ladder.repeat(tube.proof(done + 1))
+        directions = self._directions(k)
+        about = ladder.about(np.asarray(directions) @ ladder.horizon.state)
+        products = proof.products
+        if products is not None:
+            which = np.asarray(proof.by_products)
+            program = self._program(k, directions[which], products.program)
+            products = products.replace(program=program)
+        return proof.replace(about=about, products=products, least=False)
+
+    def _step(self, k: int, linear: bool = False) -> Step:
+        """The step after `k` others, for the bounds of its set and of units over it."""
+        relaxation = AllProducts() if linear else LocalBounds()
+        setting = Setting(
+            self._tube.loop, self._tube.start, relaxation, Auto(), None, False, simulations=None
+        )
+        return Step(setting, self._sets[k], k, ())
+
+    def _program(self, k: int, directions: Any, said: Program) -> Program:
+        """The program of a window that ends after `k` steps, with products that hold in it.
+
+        Raises:
+            ValueError: it is not known what the program was made of, or a product does not hold.
+        """
+        origin = said.origin
+        if origin is None:
+            raise ValueError(
+                "it was written by an earlier version, which did not say over how many steps its "
+                "program was made: call reach again and save that tube, or load without recheck"
+            )
+        start, steps, prune, linear, drop = origin
+        first = k - steps
+        if not (0 <= first < k and start == self._tube.start + first):
+            raise ValueError(f"its program begins at t = {start}, and has {steps} steps")
+        relaxation = AllProducts(prune) if linear else LocalBounds(remove_stable=prune)
+        key = origin._replace(steps=0)
+        window = self._windows.get(key)
+        if window is None or len(window) >= steps:
+            begun = self._step(first)
+            given = self._tube.loop, begun.X, begun.box, begun.t
+            window = Window.beginning(*given, relaxation, drop)
+        while len(window) < steps:
+            window = self._step(first + len(window), linear).added_to(window)
+        self._windows[key] = window
+        program = window.program(directions, LinearBounds())
+        return program.replace(products=holding(said.products, window.layout))
+
+
+def holding(products: Products, layout: FactLayout) -> Products:
+    """The products themselves, each of which is known not to be negative, or to be zero.
+
+    Raises:
+        ValueError: one is not.
+    """
+    left, right, sign, owner, free = (
+        np.asarray(getattr(products, name))
+        for name in ("left", "right", "sign", "multiplier", "free")
+    )
+    pairs = np.sort(np.stack([left, right], axis=1), axis=1)
+    zero = {tuple(sorted(pair)) for pair in layout.zero}
+    vanishing = np.array([tuple(pair) in zero for pair in pairs.tolist()], bool)
+    facts, cone = len(layout.linear), layout.cone_rows
+    linear = (pairs[:, 0] >= 0) & (pairs[:, 1] < facts)
+    holds = vanishing | linear & (sign == 1) & ~free[owner]
+    if len(cone):  # the square of its level less those of its rows, all under one multiplier
+        for k in set(owner[~holds].tolist()):
+            mine = np.flatnonzero(owner == k)
+            squares = (pairs[mine, 0] == pairs[mine, 1]).all()
+            rows, signs = pairs[mine, 0].tolist(), sign[mine].tolist()
+            expected = {row: 1.0 if row == cone[0] else -1.0 for row in cone}
+            whole = len(rows) == len(cone) and dict(zip(rows, signs, strict=True)) == expected
+            if squares and whole and not free[k]:
+                holds[mine] = True
+    if not holds.all():
+        one = int(np.argmin(holds))
+        raise ValueError(f"its product of facts {left[one]} and {right[one]} may be negative")
+    return products

@@ -1,0 +1,99 @@
+"""Penalties are the same functions inside and outside of `jax.jit`, whatever is traced."""
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+import reachjax as rj
+from reachjax.tubes.requirements import requirements
+
+CORNERS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+ROUND = rj.Ellipsoid([0.3, 0.1], [[0.2, 0.05], [0.05, 0.1]])
+OCTAGON = rj.Template.octagonal(2).directions
+SLANTED = [[1.0, 0.2], [-1.0, 0.4], [0.1, -1.0], [0.3, 1.0]]
+
+REACHED = {
+    "box": rj.Box([0.2, -0.1], [0.8, 0.3]),
+    "polytope": rj.Polytope(SLANTED, [0.9, 0.1, 0.4, 0.5]),
+    "facets along the axes": rj.Polytope(CORNERS, [0.8, 0.3, -0.2, 0.1]),
+    "idle facet": rj.Polytope(np.vstack([CORNERS, [[1.0, 1.0]]]), [0.8, 0.3, -0.2, 0.1, 1.5]),
+    "zonotope": rj.Polytope(OCTAGON, [1.0, 0.1, 0.5, 0.2, 0.8, 0.3, 1.1, 0.1]),
+    "ellipsoid": ROUND,
+    "intersection": rj.Intersection(rj.Box([0.1, -0.2], [0.5, 0.5]), ROUND),
+}
+SLOW = "box", "ellipsoid", "intersection"
+"""Their derivatives take a while to be compiled; of a box the rest of this file speaks as well."""
+
+REGIONS = {
+    "box": rj.Box([0.3, -0.2], [0.7, 0.25]),
+    "polytope": rj.Polytope(OCTAGON, np.full(len(OCTAGON), 0.4)),
+    "triangle": rj.Polytope([[1.0, 0.3], [-0.2, 1.0], [-0.5, -1.0]], [0.7, 0.3, 0.2]),
+    "ellipsoid": rj.Ellipsoid([0.4, 0.0], [[0.06, 0.02], [0.02, 0.05]]),
+}
+
+
+def alike(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-8, atol=1e-9), one, other)
+
+
+def margins(reached, regions=REGIONS):
+    """Of being in each set and of staying out of it."""
+    asked = [requirements(2, 1, {1: one}, {1: [one]}, None) for one in regions.values()]
+    return [item.compared_with(reached, by_offsets=True).margins for both in asked for item in both]
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=[pytest.mark.costly] * (kind in SLOW)) for kind in REACHED],
+)
+def test_margins_and_their_slopes_are_the_same_in_compiled_code(kind):
+    reached = REACHED[kind]
+
+    def both(reached):
+        return margins(reached), jax.jacrev(margins)(reached)
+
+    plain = margins(reached), both(reached)[1]
+    alike(both(reached), plain)
+    alike(jax.jit(both)(reached), plain)
+    alike(jax.jit(lambda: margins(reached))(), plain[0])
+
+
+@pytest.mark.parametrize("name", REGIONS)
+def test_sets_that_are_made_in_compiled_code_are_required_there(name):
+    parts = jax.tree.map(np.asarray, jax.tree.leaves(REGIONS[name]))
+    made = jax.jit(lambda: margins(REACHED["box"], {name: type(REGIONS[name])(*parts)}))()
+    alike(made, margins(REACHED["box"], {name: REGIONS[name]}))
+
+
+@pytest.mark.parametrize("kind", ["goal", "safe", "avoid"])
+def test_an_ellipsoid_is_required_in_compiled_code(kind):
+    ball, X0, template = rj.Ellipsoid([0.0], [[1.0]]), rj.Box([0.5], [2.0]), rj.Template.box(1)
+
+    def penalty(net):
+        loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net)
+        asked = {kind: [ball] if kind == "avoid" else ball}
+        return rj.specification_penalty(loop, X0, 1, template, **asked, margin=0.1)
+
+    net = rj.MLP.from_layers([([[-0.5]], [0.0])])
+    assert penalty(net) > 0
+    alike(jax.jit(jax.value_and_grad(penalty))(net), jax.value_and_grad(penalty)(net))
+
+
+@pytest.mark.parametrize("X0", [REACHED["box"], REACHED["polytope"]], ids=["box", "polytope"])
+def test_penalties_are_the_same_whatever_is_traced(X0):
+    """An obstacle over the middle of the box is deeper in it than its axes' gaps say."""
+    plant = rj.AffinePlant([[0.9, 0.2], [-0.1, 0.8]], [[0.0], [0.3]])
+    obstacle = rj.Box([0.3, 0.0], [0.7, 0.25])
+
+    def penalty(net, X0):
+        loop, template = rj.ClosedLoop(plant, net), rj.Template.box(2)
+        return rj.specification_penalty(loop, X0, 1, template, avoid=[obstacle], safe=obstacle)
+
+    net = rj.MLP.from_layers([([[0.5, -0.4]], [0.1]), ([[-0.4]], [0.05])])
+    plain = float(penalty(net, X0))
+    assert float(jax.jit(penalty)(net, X0)) == pytest.approx(plain, rel=1e-9)
+    assert float(jax.jit(lambda net: penalty(net, X0))(net)) == pytest.approx(plain, rel=1e-9)
+    assert float(jax.value_and_grad(penalty)(net, X0)[0]) == pytest.approx(plain, rel=1e-9)

@@ -31,6 +31,7 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.pytrees import Replaceable, converted, pytree
 from reachjax.sets import AbstractSet, Box
+from reachjax.sets.unusable import ThinSetError
 
 
 class UnitLayer(NamedTuple):
@@ -148,7 +149,7 @@ class ClosedLoop(Replaceable):
             if is_concrete(W) and W.steps is None:
                 try:
                     W.bounding_box()
-                except (ValueError, RuntimeError) as error:
+                except (ValueError, ThinSetError) as error:
                     raise ValueError(f"ClosedLoop.{name} cannot be used: {error}") from None
         if self.disturbance is None and plant.disturbances:
             raise ValueError(

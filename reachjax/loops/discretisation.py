@@ -15,10 +15,12 @@ from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.loops.plants import AffinePlant
 from reachjax.numerics.checks import is_concrete, real_number
+from reachjax.numerics.flags import lenient
 
 RUNGE_KUTTA_DEGREE = 4
 
 
+@lenient
 def zero_order_hold(
     A: Float[ArrayLike, "n n"],
     B: Float[ArrayLike, "n m"],
@@ -48,6 +50,7 @@ def zero_order_hold(
     return _sampled(continuous, expm(period * _generator(continuous)))
 
 
+@lenient
 def runge_kutta(
     A: Float[ArrayLike, "n n"],
     B: Float[ArrayLike, "n m"],

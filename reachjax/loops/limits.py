@@ -66,7 +66,7 @@ class Limits:
         ends, off = [], []
         for one, another in ((self.least, other.least), (self.most, other.most)):
             ends.append(one + another)
-            off.append(np.where((one == 0) | (another == 0), 0.0, gamma(1) * abs(ends[-1])))
+            off.append(np.where(_is_exact(one, another), 0.0, gamma(1) * abs(ends[-1])))
         return self._outward(*ends, *off)
 
     __radd__ = __add__
@@ -82,7 +82,7 @@ class Limits:
 
     @np.errstate(invalid="ignore", over="ignore")
     def __mul__(self, other: Any) -> Limits:
-        """Products with plain numbers or with limits; those of 1 and -1 are exact."""
+        """Products with plain numbers or with limits; those with powers of two are exact."""
         other = other if isinstance(other, Limits) else self.of(other)
         corners = [
             _times(one, another)
@@ -90,9 +90,10 @@ class Limits:
             for another in (other.least, other.most)
         ]
         least, most = np.minimum.reduce(corners), np.maximum.reduce(corners)
-        exact = (abs(other.least) == 1) & (other.least == other.most)
+        exact = _is_power(other.least) & (other.least == other.most)
         off = (
-            np.where(exact, 0.0, gamma(1) * abs(end) + TINY * (end != 0)) for end in (least, most)
+            np.where(exact & (abs(end) >= TINY), 0.0, gamma(1) * abs(end) + TINY * (end != 0))
+            for end in (least, most)
         )
         return self._outward(least, most, *off)
 
@@ -100,12 +101,15 @@ class Limits:
 
     @np.errstate(invalid="ignore", over="ignore")
     def __rmatmul__(self, matrix: Any) -> Limits:
-        """A plain matrix times the numbers; where it only picks them nothing is rounded."""
+        """A plain matrix times the numbers; where it only picks them nothing is rounded.
+
+        Nor is it where it picks them times powers of two.
+        """
         if self._is_hidden(matrix):
             return self.unknown(matrix.shape[0])
         matrix = np.asarray(matrix, float)
         over, under = np.maximum(matrix, 0.0), np.minimum(matrix, 0.0)
-        picking = (abs(matrix) == 1) | (matrix == 0)
+        picking = _is_power(matrix) | (matrix == 0)
         picking = picking.all(axis=1) & ((matrix != 0).sum(axis=1) <= 1)
         error, ends, off = np.where(picking, 0.0, gamma(matrix.shape[1])), [], []
         for one, other in ((self.least, self.most), (self.most, self.least)):
@@ -139,6 +143,18 @@ class Limits:
         with np.errstate(all="ignore"):
             least, most = found(self.least, self.most)
         return type(self)(np.asarray(least, float), np.asarray(most, float))
+
+
+def _is_power(number: Any) -> Any:
+    """Whether numbers are powers of two, or these times -1, of moderate size."""
+    return (abs(np.frexp(number)[0]) == 0.5) & (abs(number) >= 2.0**-32) & (abs(number) <= 2.0**32)
+
+
+def _is_exact(one: Any, other: Any) -> Any:
+    """Whether sums are floats: what rounding takes from them is one (Knuth, Moller), here zero."""
+    total = one + other
+    part = total - one
+    return (one - (total - part)) + (other - part) == 0
 
 
 def _times(one: Any, other: Any) -> Any:

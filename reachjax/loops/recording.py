@@ -208,7 +208,9 @@ class Recorder:
             UnsupportedError: a divisor is zero, or has no inverse.
         """
         divisor = _flat(divisor, value)
-        normal = (abs(divisor) >= TINY) & (abs(divisor) <= 1 / TINY)
+        kind = np.finfo(divisor.dtype)  # of 32 bits where 64 are off
+        least, most = max(TINY, float(kind.tiny)), min(1 / TINY, float(kind.max))
+        normal = (abs(divisor) >= least) & (abs(divisor) <= most)
         if is_known(divisor) and not np.all(np.asarray(normal)):
             raise UnsupportedError(
                 "it divides by zero, or by what has no inverse in 64 bits: keep divisors away from "
@@ -218,7 +220,7 @@ class Recorder:
         inverse = xp.where(normal, 1.0 / xp.where(normal, divisor, 1.0), np.nan)
 
         def apply(unit: AtUnit, y: Any) -> Any:
-            return y.over(divisor) if isinstance(y, Rationals) else inverse * y
+            return y.over(divisor) if hasattr(y, "over") else inverse * y
 
         step = Step(
             apply,

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from reachjax.numerics.checks import is_concrete
+from reachjax.numerics.derivatives import ONLY_FIRST
 
 
 def shapes_of(tree: Any) -> Any:
@@ -97,10 +98,7 @@ def _held(leaf: Any) -> Any:
 
 @_held.defjvp
 def _refused(primals: Any, tangents: Any) -> Any:
-    raise TypeError(
-        "certified bounds have first derivatives in reverse mode only, and this is a second one: "
-        "hold what is differentiated once more by jax.lax.stop_gradient"
-    )
+    raise TypeError(ONLY_FIRST)
 
 
 def _halved(leaf: Array | np.ndarray) -> Array | np.ndarray:

@@ -13,6 +13,8 @@ from typing import Any, Self, TypeVar, dataclass_transform
 
 import jax
 
+from reachjax.numerics.flags import made_lenient
+
 T = TypeVar("T")
 
 
@@ -66,7 +68,14 @@ def unchecked(cls: type[T], **values: Any) -> T:
 
 
 class Replaceable:
-    """Copies with some fields changed, checked as a new object is."""
+    """Copies with some fields changed, checked as a new object is.
+
+    Public methods of what inherits from it heed none of JAX's strict flags (`flags`).
+    """
+
+    def __init_subclass__(cls, **given: Any):
+        super().__init_subclass__(**given)
+        made_lenient(cls)
 
     def replace(self, **changes: Any) -> Self:
         """A copy in which the named fields are replaced."""

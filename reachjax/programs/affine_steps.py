@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.limits import Limits
 from reachjax.loops.units import AbstractUnit, Quadratic, SmoothUnit, UnboundedError
 from reachjax.numerics.rounding import Ball, gamma, namespace
 from reachjax.programs.affine import AffineForms, Place
@@ -115,6 +116,7 @@ def step_forms(
     known: Box | None = None,
     ranges: Ranges | None = None,
     scratch: int = 0,
+    before: int = 0,
 ) -> StepForms:
     """One step of the loop, whose own forward pass is run over affine forms.
 
@@ -129,6 +131,7 @@ def step_forms(
         known: a box that surely holds the successor, where one is known.
         ranges: what else bounds the inputs of a layer, or the successor, if anything does.
         scratch: where the columns begin that a step needs in between, if there is a place.
+        before: how many steps there were since the initial set.
     """
     found: list[UnitForms] = []
     done, width, free = 0, state.columns.shape[1], place
@@ -142,6 +145,8 @@ def step_forms(
         ends = _cut(unit, y, start)
         if ranges is not None:
             ends = ranges(unit, y, ends, found)
+        if isinstance(unit, SmoothUnit) and place is None and _is_lost(unit, ends):
+            ends = met(ends, _ends_by_intervals(loop, start, int(t), before, len(found)))
         if isinstance(unit, SmoothUnit):
             z, forms = _smooth(unit, y, ends, free, start)
             if place is None:
@@ -175,6 +180,34 @@ def step_forms(
     if ranges is not None:
         ends = ranges(None, successor, ends, found)
     return StepForms(successor.within(Ball.between(*ends)), tuple(found), merged)
+
+
+def _is_lost(unit: SmoothUnit, ends: Ends) -> bool:
+    """Whether a unit has no bounds somewhere though its inputs have."""
+    known = np.isfinite(ends[0]) & np.isfinite(ends[1])
+    return bool(np.any(known & ~np.isfinite(unit.linear(*ends).gap)))
+
+
+def _ends_by_intervals(
+    loop: ClosedLoop, start: InitialColumns, t: int, before: int, number: int
+) -> Ends:
+    """Bounds of the inputs of a layer by intervals from the box around the initial set.
+
+    They are wider than forms, but do not round what need not be: a set that touches the edge of a
+    domain, as `[0, 1]` does that of a root, does not leave it.
+    """
+    if start.box is None:
+        return -np.inf, np.inf
+    state, found = Limits(*map(np.asarray, (start.box.lower, start.box.upper))), []
+
+    def apply(unit: AbstractUnit, y: Limits) -> Limits:
+        found.append((y.least, y.most))
+        return y.at(unit)
+
+    for k in range(before + 1):
+        found.clear()
+        state = loop.step(state, t - before + k, apply)
+    return found[number]
 
 
 def _require_bounds(forms: UnitForms, t: int) -> None:

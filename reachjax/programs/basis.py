@@ -22,6 +22,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Block, Facts, Line, Lines, Mark
 from reachjax.numerics.checks import require_double_precision, require_kind
+from reachjax.numerics.flags import lenient
 from reachjax.numerics.pytrees import pytree
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.bounds import LoopBounds
@@ -158,6 +159,7 @@ class ChangeOfBasis:
     E_out: Float[Array, "n_x+1 n"]
 
 
+@lenient
 def change_of_basis(loop: ClosedLoop, t: int = 0) -> ChangeOfBasis:
     """The paper's `E_in`, `E_mid`, `E_out` of one step at time `t`, every neuron kept.
 

@@ -192,7 +192,7 @@ class Horizon:
         self._stated, self.tightened = 0, []
         with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
             self.state, units, merged = step_forms(
-                self.loop, self.state, t, self.start, ranges=ranges
+                self.loop, self.state, t, self.start, ranges=ranges, before=len(self.steps)
             )
             self._state_facts(units)
         self.ends.append(self.state.ends_by_interval())

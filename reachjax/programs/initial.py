@@ -48,6 +48,7 @@ class InitialColumns(Replaceable):
         spread: `(n, n)`.
         back: `(n, n)`, nearly the pseudoinverse of `spread`.
         cut: a set that also holds `x_0`, where there is one: a box, or on the host a polytope.
+        box: around the initial set, on the host, where its ends are looked at without rounding.
         round: whether `|w| <= 1` in the 2-norm; in that of the largest entry if not.
         curved: whether products of the `w` are columns too.
     """
@@ -58,6 +59,7 @@ class InitialColumns(Replaceable):
     cut: PolyhedralSet | None
     round: bool = static()
     curved: bool = static(default=False)
+    box: Box | None = None
 
     @classmethod
     def of(cls, X: AbstractSet, box: Box, curved: bool = False) -> InitialColumns:
@@ -75,7 +77,7 @@ class InitialColumns(Replaceable):
             found = _of_ball(ball, cut)
         else:
             found = _of_box(box, cut if cut is not None and cut.needs_programs else None)
-        return found.replace(curved=curved)
+        return found.replace(curved=curved, box=box if namespace(box.lower) is np else None)
 
     @property
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:

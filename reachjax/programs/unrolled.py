@@ -77,7 +77,9 @@ def unrolled(
         with np.errstate(all="ignore"):
             given = None if slopes is None else np.asarray(slopes[k])
             held = None if known is None else known[k]
-            state, units, _ = step_forms(loop, state, t + k, start, slopes=given, known=held)
+            state, units, _ = step_forms(
+                loop, state, t + k, start, slopes=given, known=held, before=k
+            )
             forms = rows @ state
             found = _bounds(forms, units, start)
         here = [layer.places for layer in units if layer.unit.free]

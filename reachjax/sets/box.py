@@ -18,6 +18,7 @@ from reachjax.numerics.rounding import TINY, exponents, gamma, raised, shifted
 from reachjax.sets import outlines
 from reachjax.sets.base import Matrix, Vector
 from reachjax.sets.polyhedral_set import PolyhedralSet
+from reachjax.sets.unusable import UnusableSetError
 
 MOST_CORNERS = 2**16
 
@@ -108,7 +109,7 @@ class Box(PolyhedralSet):
 
     def _single(self) -> None:
         if self.steps is not None:
-            raise ValueError(
+            raise UnusableSetError(
                 f"a time-varying box (bounds of shape {self.lower.shape}) is a sequence of sets: "
                 "take one by at(t)"
             )

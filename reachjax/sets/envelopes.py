@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import is_concrete, require_double_precision
+from reachjax.numerics.flags import lenient
 from reachjax.numerics.host import all_finite, on_host
 from reachjax.sets import formulas, hulls, polyhedra
 from reachjax.sets.balance import lengths
@@ -98,6 +99,7 @@ def _forward(compute, count, *arrays):
     return on_host(computed, shapes, arrays)
 
 
+@lenient
 def _backward(compute, count, slopes, cotangent):
     return tuple(jnp.tensordot(cotangent, slope, 1) for slope in slopes)
 

@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull, Delaunay, HalfspaceIntersection, QhullErro
 
 from reachjax.sets.balance import Balanced, balanced, lengths
 from reachjax.sets.polyhedra import NOTHING, boxed, chebyshev, maximiser
+from reachjax.sets.unusable import ThinSetError
 
 TOO_THIN = "the polytope is too thin for its corners to be told apart"
 
@@ -57,7 +58,7 @@ def _corners(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, np.ndarray]:
     try:
         return region, middle + radii * _unit_vertices(*balanced(A * radii, b - A @ middle))
     except QhullError as error:
-        raise RuntimeError(f"{TOO_THIN}: {str(error).splitlines()[0]}") from None
+        raise ThinSetError(f"{TOO_THIN}: {str(error).splitlines()[0]}") from None
 
 
 def _unit_vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -93,7 +94,7 @@ def _affine_hull(A: np.ndarray, b: np.ndarray, point: np.ndarray, tolerance: flo
     extent = [-a @ maximiser(A, b, -a)[1] for a in A / norms[:, None]]
     tight = np.array(extent) + b / norms <= 4 * tolerance
     if not tight.any():
-        raise RuntimeError(TOO_THIN)
+        raise ThinSetError(TOO_THIN)
     _, values, rows = np.linalg.svd(A[tight] / norms[tight, None])
     rank = int(np.sum(values > 1e-6))
     return rows[rank:].T

@@ -19,6 +19,7 @@ from reachjax.sets.base import AbstractSet, Matrix, Vector
 from reachjax.sets.box import Box
 from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polyhedral_set import PolyhedralSet
+from reachjax.sets.unusable import ThinSetError, UnusableSetError
 
 DRAWS = (1, 9, 81)
 """So many times the points wanted are drawn, in turn, until enough of them lie in both parts."""
@@ -114,7 +115,7 @@ class Intersection(AbstractSet):
         box, other = (part.bounding_box() for part in self.parts)
         lower, upper = jnp.maximum(box.lower, other.lower), jnp.minimum(box.upper, other.upper)
         if is_concrete(lower, upper) and bool(jnp.any(lower > upper)):
-            raise ValueError("the polytope and the ellipsoid have no point in common")
+            raise UnusableSetError("the polytope and the ellipsoid have no point in common")
         return Box(lower, upper)
 
     def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
@@ -130,7 +131,7 @@ class Intersection(AbstractSet):
                 kept = np.asarray(points)[np.asarray(other.contains(points))]
                 if len(kept) >= count:
                     return jnp.asarray(kept[:count])
-        raise RuntimeError(
+        raise ThinSetError(
             f"fewer than {count} of {DRAWS[-1] * count} points of the polytope are in the "
             "ellipsoid, and the other way round: the intersection is empty, or too thin to be "
             "sampled"

@@ -15,6 +15,7 @@ from scipy.optimize import linprog
 
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.sets.balance import Balanced, balanced, lengths, upwards
+from reachjax.sets.unusable import ThinSetError, UnusableSetError
 
 UNEVEN = 10
 """Coordinates whose sizes are further from 1, as powers of two, are scaled anew."""
@@ -35,13 +36,13 @@ def maximiser(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> tuple[np.n
     """
     result = linprog(-direction, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
     if result.status == 2 or (result.status == 4 and is_empty(A, b)):
-        raise ValueError("the polytope A x <= b is empty: no point satisfies all its facets")
+        raise UnusableSetError("the polytope A x <= b is empty: no point satisfies all its facets")
     if result.status == 3:
-        raise ValueError(
+        raise UnusableSetError(
             f"the polytope A x <= b is unbounded in direction {np.round(direction, 6).tolist()}"
         )
     if result.status != 0:
-        raise RuntimeError(f"a linear program over the polytope failed: {result.message}")
+        raise ThinSetError(f"a linear program over the polytope failed: {result.message}")
     return np.maximum(-result.ineqlin.marginals, 0.0), result.x
 
 
@@ -150,7 +151,7 @@ def _box(region: Balanced) -> Maxima:
     values, residual = _proved(region, Y, D)
     leak = residual.sum(axis=1)
     if not leak.max() <= 0.5:
-        raise RuntimeError("the linear programs that bound the polytope are too inaccurate")
+        raise ThinSetError("the linear programs that bound the polytope are too inaccurate")
     radius = max(values.max(), 0.0) / (1 - leak.max())
     return Maxima(values + leak * radius * (1 + gamma(len(region.b) + 2)), Y, points)
 
@@ -196,7 +197,7 @@ def chebyshev(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
         method="highs",
     )
     if result.status == 2:
-        raise ValueError("the polytope A x <= b is empty: no point satisfies all its facets")
+        raise UnusableSetError("the polytope A x <= b is empty: no point satisfies all its facets")
     if result.status != 0:
-        raise ValueError("the polytope A x <= b is unbounded")
+        raise UnusableSetError("the polytope A x <= b is unbounded")
     return result.x[:-1], float(result.x[-1])

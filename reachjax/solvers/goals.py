@@ -40,6 +40,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.numerics.checks import is_concrete
+from reachjax.numerics.flags import lenient
 from reachjax.numerics.host import all_finite, on_host, shapes_of
 from reachjax.numerics.pytrees import Replaceable
 from reachjax.programs.lmi import Program, Slopes
@@ -135,6 +136,7 @@ def _forward(goal, facts, objective, program, judged):
     return _enveloped(goal, facts, objective, program, judged), (goal, program, judged.held)
 
 
+@lenient
 def _backward(residual, cotangents):
     goal, program, _ = residual
     value, proposal = cotangents

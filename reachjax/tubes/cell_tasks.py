@@ -18,6 +18,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.loops.units import SmoothUnit, UnboundedError
 from reachjax.numerics.budget import Budget
+from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet, Box
 from reachjax.sets.balance import balanced
 from reachjax.tubes.ladder import WORK, Ladder
@@ -95,6 +96,7 @@ class Outcome(NamedTuple):
         return smallest(self.margins)
 
 
+@lenient
 def outcome_of(
     task: CellTask, part: AbstractSet, budget: Budget, known: Margins | None = None
 ) -> Outcome:

@@ -25,7 +25,9 @@ from reachjax.numerics.checks import (
     whole_number,
     wrapped,
 )
+from reachjax.numerics.flags import lenient
 from reachjax.numerics.host import in_numpy
+from reachjax.numerics.logs import logged
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.programs.unrolled import unrolled
 from reachjax.sets import Box, Ellipsoid
@@ -67,6 +69,8 @@ class LargestSet(NamedTuple):
     verdict: Verdict
 
 
+@logged
+@lenient
 def largest_set(
     loop: ClosedLoop,
     X0: Kind,

@@ -17,6 +17,8 @@ from reachjax.numerics.checks import (
     wrapped,
 )
 from reachjax.numerics.files import existing_file
+from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.numerics.storage import read
 from reachjax.tubes.kept import Kept
 from reachjax.tubes.partitions import Bar, PartitionedTube
@@ -30,6 +32,8 @@ MISSING = (
 )
 
 
+@logged
+@lenient
 def load(
     path: str | os.PathLike[str],
     loop: ClosedLoop | None = None,

@@ -33,6 +33,8 @@ from reachjax.numerics.checks import (
     wrapped,
 )
 from reachjax.numerics.files import writable
+from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.sets import AbstractSet, Box, Template
@@ -171,6 +173,8 @@ class PartitionedTube(Replaceable):
         return self.bounds(t) - self.witnesses(t)
 
 
+@logged
+@lenient
 def reach_partitioned(
     loop: ClosedLoop,
     X0: AbstractSet,
@@ -380,6 +384,7 @@ def _question(*parts: Any) -> bytes:
     return np.asarray(seal_of(*jax.device_put(parts))).tobytes()
 
 
+@lenient
 def _tube(
     cell: AbstractSet,
     loop: ClosedLoop,

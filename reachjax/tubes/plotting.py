@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reachjax.numerics.checks import require_kind
+from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet
+from reachjax.sets.unusable import ThinSetError
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.verdicts import Verdict, VerdictStatus
@@ -29,6 +31,7 @@ ABOVE = {"loc": "lower center", "bbox_to_anchor": (0.5, 1), "ncols": 3, "frameon
 SAMPLE_STYLE = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
 
 
+@lenient
 def plot_set(
     region: AbstractSet,
     ax: Axes | None = None,
@@ -86,6 +89,7 @@ def _two_of(dimension: int, coordinates: Any) -> tuple[int, int]:
     return int(chosen[0]), int(chosen[1])
 
 
+@lenient
 def plot_tube(
     tube: ReachTube | PartitionedTube,
     ax: Axes | None = None,
@@ -121,6 +125,7 @@ def plot_tube(
     return ax
 
 
+@lenient
 def plot_cells(
     verdict: Verdict | WinningSet, ax: Axes | None = None, coordinates: tuple[int, int] = (0, 1)
 ) -> Axes:
@@ -175,7 +180,7 @@ def _plot_cell(
     simulated, initial, certified = labels
     try:
         trajectories = np.asarray(tube.simulate(samples))[:, :, [i, j]]
-    except RuntimeError:  # the initial set is too thin to be sampled: the sets alone
+    except ThinSetError:  # the initial set is too thin to be sampled: the sets alone
         trajectories = np.zeros((0, tube.horizon + 1, 2))
     for t, region in enumerate(tube.sets):
         ax.scatter(*trajectories[:, t].T, **SAMPLE_STYLE, label=None if t else simulated)

@@ -27,6 +27,7 @@ from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
+from reachjax.sets.unusable import ThinSetError, UnusableSetError
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.by_branching import sets_by_branching
 from reachjax.tubes.by_cells import sets_by_cells
@@ -219,9 +220,9 @@ def simulations_from(
     """
     try:
         return Simulations(loop, X0, horizon, start, samples, seed)
-    except ValueError as error:
+    except UnusableSetError as error:
         raise ValueError(f"X0 cannot be used: {error}") from None
-    except RuntimeError:
+    except ThinSetError:
         if X0.surely_empty():
             raise ValueError(
                 "X0 is empty: its polytope and its ellipsoid have no point in common"

@@ -17,6 +17,8 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.checks import floats_of, owned, require_double_precision, whole_number
 from reachjax.numerics.files import writable
+from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof, told
@@ -248,6 +250,7 @@ def tube_of(
     return tube
 
 
+@lenient
 def reach_step(
     loop: ClosedLoop,
     X: AbstractSet,
@@ -291,6 +294,8 @@ def reach_step(
     return tube.sets[1], tube.proof(1)
 
 
+@logged
+@lenient
 def reach(
     loop: ClosedLoop,
     X0: AbstractSet,

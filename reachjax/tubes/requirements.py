@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import is_concrete, real_number, require_kind
+from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet, Polytope
 from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
 from reachjax.sets.polyhedra import is_empty
@@ -143,7 +144,7 @@ def requirements(
     found = [Requirement("goal", t, G, True) for t, G in timed_goals(goal, horizon)]
     found += [Requirement("safe", t, safe, True) for t in everywhere if safe is not None]  # type: ignore[arg-type]
     for t, regions in timed_sets_to_avoid(avoid, horizon):
-        found += [Requirement(f"avoid[{i}]", t, A, False) for i, A in enumerate(regions)]  # type: ignore[arg-type]
+        found += [Requirement(f"avoid[{i}]", t, A, False) for i, A in regions]  # type: ignore[arg-type]
     if not found:
         raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")
     known: dict[tuple[int, bool], Requirement] = {}
@@ -204,6 +205,7 @@ def _depths(ball: Ellipsoid, points: np.ndarray) -> Float[np.ndarray, " c"]:
     return (1 - away) * np.sqrt(np.linalg.eigvalsh(np.asarray(ball.shape))[0])
 
 
+@lenient
 def shortfall(
     tube: ReachTube,
     goal: Timed | None = None,

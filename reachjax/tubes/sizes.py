@@ -13,10 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import described
+from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet
 from reachjax.tubes.reach import ReachTube
 
 
+@lenient
 def volume(X: AbstractSet) -> Float[Array, ""]:
     """The `n`-dimensional volume; of a polytope beyond four dimensions, that of its bounding box.
 
@@ -40,6 +42,7 @@ def volume(X: AbstractSet) -> Float[Array, ""]:
     return X.size()
 
 
+@lenient
 def log_widths(X: AbstractSet) -> Float[Array, " n"]:
     """Logarithms of the widths of a set along each coordinate; differentiable as `volume` is.
 
@@ -56,6 +59,7 @@ def log_widths(X: AbstractSet) -> Float[Array, " n"]:
     return jnp.log(X.bounding_box().widths)
 
 
+@lenient
 def log_volume(X: AbstractSet | ReachTube) -> Float[Array, ""]:
     """The logarithm of a set's volume; of a tube, the sum over `t = 1 .. horizon`.
 

@@ -15,9 +15,12 @@ import numpy as np
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, require_kind, whole_number
+from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.numerics.rounding import TINY
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet
+from reachjax.sets.unusable import ThinSetError
 from reachjax.tubes.partitions import BESIDE, PartitionedTube
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.recurrence import for_ever
@@ -27,6 +30,8 @@ from reachjax.tubes.soundness import Claim, require_unbroken
 from reachjax.tubes.verdicts import Verdict, VerdictStatus, of_cells
 
 
+@logged
+@lenient
 def verify(
     tube: ReachTube | PartitionedTube,
     goal: Timed | None = None,
@@ -136,7 +141,7 @@ def _runs(tube: ReachTube, samples: int, seed: int) -> Runs:
     found = [np.asarray(tube.proof(t).witness_states) for t in range(1, tube.horizon + 1)]
     if found[0].shape[1]:  # a tube from a thin set, or of jax.jit, has none
         given += found
-    with contextlib.suppress(RuntimeError):  # a set that is too thin to be sampled
+    with contextlib.suppress(ThinSetError):  # a set that is too thin to be sampled
         given.append(scenarios.drawn(initial_states(tube.sets[0], samples, seed), seed))
     every = np.concatenate(given)
     if not len(every):

@@ -22,6 +22,7 @@ from reachjax.programs.windows import Window
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, Box, Polytope
+from reachjax.sets.unusable import ThinSetError
 from reachjax.solvers import AbstractSolver
 from reachjax.solvers.cut_pool import NONE
 
@@ -34,7 +35,7 @@ def boxed(X: AbstractSet, name: str) -> Box:
     """
     try:
         return X.bounding_box()
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, ThinSetError) as error:
         raise ValueError(f"{name} cannot be used: {error}") from None
 
 

@@ -32,6 +32,8 @@ from reachjax.numerics.checks import (
     whole_number,
     wrapped,
 )
+from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.sets import Box
 from reachjax.tubes.cell_jobs import CellJobs
@@ -85,6 +87,8 @@ class Sorted(NamedTuple):
     promising: bool = False
 
 
+@logged
+@lenient
 def winning_set(
     loop: ClosedLoop,
     domain: Box,
@@ -271,6 +275,7 @@ class _Run:
             self.done.append(cell._replace(status=found.status, margin=found.margin))
 
 
+@lenient
 def sorted_cells(
     task: CellTask, boxes: Sequence[Ends], scale: Float[np.ndarray, " n"], budget: Budget
 ) -> list[Sorted]:

@@ -43,18 +43,16 @@ class WinningSet:
         return f"WinningSet(cells={len(self.cells)}, states={self.domain.dimension})"
 
     def __str__(self) -> str:
-        total = sum(map(self.volume, VerdictStatus))
         lines = [f"{'':10} {'cells':>7} {'volume':>10} {'part':>7}"]
         for status in VerdictStatus:
             size, count = self.volume(status), len(self.of(status))
-            part = self._part(status, total)
+            part = self._part(status)
             lines.append(f"{status.value:10} {count:7d} {size:10.4g} {part:>7}")
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        total = sum(map(self.volume, VerdictStatus))
         rows = [
-            [status.value, len(self.of(status)), self.volume(status), self._part(status, total)]
+            [status.value, len(self.of(status)), self.volume(status), self._part(status)]
             for status in VerdictStatus
         ]
         drawn = picture(self.plot) if self.domain.dimension > 1 else ""
@@ -66,8 +64,14 @@ class WinningSet:
 
         return plot_cells(self, ax, **options)
 
-    def _part(self, status: VerdictStatus, total: float) -> str:
-        return f"{self.volume(status) / total if total > 0 else np.nan:.2%}"
+    def _part(self, status: VerdictStatus) -> str:
+        """Its part of the domain, whose flat coordinates count for nothing."""
+        wide = np.asarray(self.domain.widths) > 0
+        sizes = [
+            sum(np.prod((cell.upper - cell.lower)[wide]) for cell in cells)
+            for cells in (self.of(status), self.cells)
+        ]
+        return f"{sizes[0] / sizes[1]:.2%}"
 
     def of(self, status: VerdictStatus) -> tuple[DecidedCell, ...]:
         """The cells of which this is known."""

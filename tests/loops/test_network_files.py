@@ -283,6 +283,8 @@ def test_files_are_read_without_warnings_in_thirty_two_bits(tmp_path):
     with jax.enable_x64(False), warnings.catch_warnings():
         warnings.simplefilter("error")
         assert rj.Network.from_onnx(path).inputs == 3
+        # 1e308, as the largest inverse that is known, is none of 32 bits
+        assert rj.Network(lambda x: x / np.array([2.0, 4.0, 8.0], np.float32), 3, 3).outputs == 3
 
 
 def test_the_error_of_another_activation_says_what_takes_it():

@@ -11,6 +11,8 @@ import pytest
 
 import reachjax as rj
 from tests.loops.widths import widths
+from tests.oracles.exact.exact_reader import images
+from tests.oracles.exact.varying import fractions
 
 RNG = np.random.default_rng(0)
 WEIGHTS = [jnp.asarray(RNG.normal(size=shape) / 2) for shape in ((6, 2), (6, 6), (1, 6))]
@@ -83,3 +85,30 @@ def test_traced_parameters_beside_a_quotient_are_recorded_alike():
         return rj.reach(loop, rj.Box(*AROUND), 1, rj.Template.box(2), FORMS).sets[1].b
 
     np.testing.assert_allclose(jax.jit(bound)(1.5), bound(1.5), rtol=1e-9)
+
+
+def cancelling(x, large):
+    """Factors of which few digits are left when they are subtracted: `0.3 x`, and `x`."""
+    return jnp.stack([large * x[0] + 0.3 * x[0], large * x[0]])
+
+
+CANCELLING = {
+    "softmax": lambda x: jax.nn.softmax(cancelling(x, 1e10)),
+    "softmax of quotients": lambda x: jax.nn.softmax(cancelling(x, 1e10) / 3),
+    "logarithm of a sum": lambda x: jax.nn.logsumexp(cancelling(x, 1e10)) - 1e10 * x,
+    "twice": lambda x: jax.nn.softmax(jax.nn.log_softmax(cancelling(x, 1e6)) / 3),
+    "norm": lambda x: jax.nn.standardize(cancelling(x, 1e10) - 1e10 * x[0], epsilon=1e-2),
+    "piecewise": lambda x: jax.nn.relu(jax.nn.log_softmax(0.1 * x + 0.2 * x) + 0.7 * x),
+}
+
+
+@pytest.mark.parametrize("name", CANCELLING)
+def test_rounding_of_factors_decides_nothing(name):
+    function, ends = CANCELLING[name], np.array([[-0.5, 0.25], [0.75, 1.0]])
+    plant = rj.NonlinearPlant(lambda x, u: function(x), 2, 1)
+    loop = rj.ClosedLoop(plant, rj.Network(lambda x: 0 * x[:1], inputs=2, outputs=1))
+    region = rj.reach(loop, rj.Box(*ends), 1, rj.Template.box(2), FORMS).sets[1]
+    x = np.concatenate([ends, RNG.uniform(*ends, size=(30, 2))])
+    values, off = images(function, x)
+    over = values @ fractions(region.A).T - fractions(region.b)
+    assert over.max() <= off * (1 + abs(values).max())

@@ -117,7 +117,7 @@ def compared(kind, seed):
 
 
 def errors(kind, seeds):
-    """Errors at generic points, where differences of two steps agree to a tenth of what is asked."""
+    """Errors where differences of two steps agree to a tenth of what is asked."""
     found = []
     for seed in seeds:
         for exact, wide, narrow in compared(kind, seed):

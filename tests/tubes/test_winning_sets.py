@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.closed_loops import autonomous
 from tests.tubes.test_forever import scalar
 
 HORIZON = 5
@@ -175,3 +176,11 @@ def test_bad_input_is_named(loop):
         few.contains([[0.0]])
     with pytest.raises(ValueError, match="cells"):
         rj.winning_set(loop, DOMAIN, HORIZON, cells=0, **WANTED)
+
+
+def test_of_a_flat_domain_parts_are_of_what_is_wide():
+    halves = autonomous(0.5 * np.eye(2))
+    domain = rj.Box([-2.0, 1.0], [2.0, 1.0])
+    found = rj.winning_set(halves, domain, 1, safe=rj.Box([-1.0] * 2, [1.0] * 2), cells=8)
+    assert "nan" not in str(found) + found._repr_html_()
+    assert "50.00%" in str(found)

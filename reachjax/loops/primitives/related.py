@@ -10,13 +10,14 @@ What a recording is made of rests on its steps and on constants, never on number
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from reachjax.loops.combinations import LARGEST, Combination
+from reachjax.loops.combinations import LARGEST, Combination, InexactError
 from reachjax.loops.limits import Limits
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import ISRU, Exp, Reciprocal, Softplus, Sqrt, Square, Tanh, Within
@@ -39,6 +40,34 @@ class Entries(NamedTuple):
 
     value: Value
     numbers: Int[np.ndarray, " k"]
+
+
+class Exponent(NamedTuple):
+    """The exponent of a term of a sum; 1 has the exponent zero.
+
+    Attributes:
+        entry: the place of the value that it is of, and its number there; None for zero.
+        number: what it is of values before.
+    """
+
+    entry: tuple[int, int] | None
+    number: Combination
+
+
+Found = Callable[..., Any]
+
+
+def _unless_inexact(rule: Found) -> Found:
+    """A rule that finds nothing where rounding would decide what it finds."""
+
+    @functools.wraps(rule)
+    def found(*given: Any) -> Any:
+        try:
+            return rule(*given)
+        except InexactError:
+            return None
+
+    return found
 
 
 def _entries(value: Value) -> Entries:
@@ -81,6 +110,7 @@ def _inputs(recorder: Recorder, entries: Entries, kind: type) -> Entries | None:
     return Entries(inner, before[entries.numbers])
 
 
+@_unless_inexact
 def over_norm(recorder: Recorder, one: Value, other: Value) -> Value | None:
     """The product of a number and the inverse of its norm with others; None if it is none."""
     for inverse, scales in _levels(other):
@@ -134,6 +164,7 @@ def _without_own(
 
     None unless each has its own, and the rest is positive whatever the inputs are.
     """
+    squares.require_near()
     weights, rest = np.zeros(len(own.numbers)), {}
     for place, matrix in squares.parts.items():
         value, step, matrix = recorder.values[place], recorder.steps[place], matrix.copy()
@@ -148,9 +179,10 @@ def _without_own(
         rest[place] = matrix
     if not (np.all(weights > 0) and np.all(squares.offset > 0)):
         return None
-    return weights, Combination(rest, squares.offset)
+    return weights, Combination(rest, squares.offset, squares.errors)
 
 
+@_unless_inexact
 def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
     """An exponential, or 1, over a sum of exponentials that it is one of; None if it is none.
 
@@ -160,6 +192,7 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
     if terms is None:
         return None
     mine: Combination | None = None
+    entries: list[Any] = [None] * other.size
     more: list[Term] = []
     if not isinstance(one, Value):
         is_one = is_constant(one) and bool(np.all(one == 1))
@@ -169,12 +202,14 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
             own = _inputs(recorder, _entries(number), Exp)
             if own is not None:
                 mine, more = Combination.of(recorder, own.value)[own.numbers], factors
+                entries = [(own.value.place, number) for number in own.numbers.tolist()]
                 break
     if mine is None:
         return None
     rows = []
     for k, each in enumerate(terms):
-        others = [term for term in each if not _is_zero(term - mine[[k]])]
+        own_term = Exponent(entries[k], mine[[k]])
+        others = [term for term in each if not _is_same(term, own_term)]
         if len(others) != len(each) - 1:
             return None
         rows.append(others)
@@ -190,6 +225,7 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
     return _scaled(recorder, recorder.shifted(half, np.array(0.5)), more)
 
 
+@_unless_inexact
 def of_sum(recorder: Recorder, value: Value) -> Value | None:
     """The logarithm of a sum of exponentials; None if it is of something else."""
     terms = _exponents(recorder, value)
@@ -200,17 +236,19 @@ def of_sum(recorder: Recorder, value: Value) -> Value | None:
     return recorder.added(first.recorded(recorder, value.shape), logarithm)
 
 
-def _exponents(recorder: Recorder, value: Value) -> list[list[Combination]] | None:
+def _exponents(recorder: Recorder, value: Value) -> list[list[Exponent]] | None:
     """What the exponentials are of whose sum each entry is, 1 being one; None if it is none."""
     base, index = _entries(value)
     if base.size > LARGEST:
         return None
     sums = Combination.of(recorder, base)[index]
-    found: list[list[Combination]] = []
+    if sums.errors:
+        return None
+    found: list[list[Exponent]] = []
     for offset in sums.offset:
         if offset not in (0, 1):
             return None
-        found.append([Combination({}, np.zeros(1))] if offset == 1 else [])
+        found.append([Exponent(None, Combination({}, np.zeros(1)))] if offset == 1 else [])
     for place, matrix in sums.parts.items():
         step = recorder.steps[place]
         if not np.any(matrix):
@@ -223,18 +261,19 @@ def _exponents(recorder: Recorder, value: Value) -> list[list[Combination]] | No
             return None
         if matrix.sum() > TERMS:
             return None
-        exponents = Combination.of(recorder, recorder.values[step.parents[0]])
+        inner, numbers = _entries(recorder.values[step.parents[0]])
+        exponents = Combination.of(recorder, inner)[numbers]
         for row, k in zip(*np.nonzero(matrix), strict=True):
-            found[row].append(exponents[[k]])
+            found[row].append(Exponent((inner.place, int(numbers[k])), exponents[[k]]))
     return found
 
 
-def _columns(rows: list[list[Combination]]) -> list[Combination] | None:
+def _columns(rows: list[list[Exponent]]) -> list[Combination] | None:
     """The first term of each row, the second, and so on; None if rows are not of one length."""
     count = len(rows[0]) if rows else 0
     if count == 0 or any(len(row) != count for row in rows):
         return None
-    return [Combination.stacked([row[k] for row in rows]) for k in range(count)]
+    return [Combination.stacked([row[k].number for row in rows]) for k in range(count)]
 
 
 def _logarithm(
@@ -253,5 +292,17 @@ def _logarithm(
     return first, found
 
 
-def _is_zero(difference: Combination) -> bool:
-    return not np.any(difference.offset) and not any(map(np.any, difference.parts.values()))
+def _is_same(one: Exponent, other: Exponent) -> bool:
+    """Whether two exponents are one.
+
+    Raises:
+        InexactError: they are but for rounding, which nobody knows.
+    """
+    if one.entry is not None and one.entry == other.entry:
+        return True
+    difference = one.number - other.number
+    if np.any(difference.offset) or any(map(np.any, difference.parts.values())):
+        return False
+    if difference.errors:
+        raise InexactError
+    return True

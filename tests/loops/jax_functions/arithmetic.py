@@ -74,6 +74,8 @@ POWERS = [
     lambda x: jnp.float_power(x + 1, 3),
     lambda x: jnp.sqrt(jnp.abs(x)),
     lambda x: jnp.sqrt(x**2 + 1e-8),
+    lambda x: jnp.hypot(x, 1.0),
+    lambda x: jnp.hypot(x[0], x[1]),
 ]
 
 SUMS = [
@@ -151,6 +153,8 @@ SPECIAL = [
     jnp.abs,
     lambda x: jnp.fabs(x - 0.1),
     lambda x: jnp.copysign(x, 1.0),
+    lambda x: jax.scipy.special.xlogy(x + 1, x + 1),
+    lambda x: jnp.interp(x, jnp.array([-1.0, 0.0, 2.0]), jnp.array([1.0, 0.0, 3.0])),
 ]
 
 REFUSED = [
@@ -162,8 +166,6 @@ REFUSED = [
     jnp.cbrt,
     lambda x: x // 1,
     lambda x: x % 1,
-    lambda x: jnp.hypot(x, 1.0),
-    lambda x: jnp.hypot(x[0], x[1]),
     lambda x: jnp.max(x, where=jnp.array([True, False]), initial=-1.0),
     lax.cumlogsumexp,
     lambda x: jnp.any(x > 0.3) * 1.0,
@@ -171,7 +173,6 @@ REFUSED = [
     lambda x: jnp.linalg.norm(x, 3),
     lambda x: jax.scipy.special.erfinv(x / 2),
     lambda x: jax.scipy.special.entr(x + 1),
-    lambda x: jax.scipy.special.xlogy(x + 1, x + 1),
     lambda x: jax.scipy.special.xlog1py(x, x),
     lambda x: jax.scipy.special.gammaln(x + 2),
     lambda x: jax.scipy.special.digamma(x + 2),
@@ -191,8 +192,24 @@ REFUSED = [
     lambda x: jnp.abs(x + 1j),
     lambda x: jnp.fft.rfft(x).real,
     lambda x: jnp.ldexp(x, 2),
-    lambda x: jnp.interp(x, jnp.array([-1.0, 0.0, 2.0]), jnp.array([1.0, 0.0, 3.0])),
 ]
 """What has no bounds, or not yet."""
 
-FAMILIES = {"products": PRODUCTS, "powers": POWERS, "sums": SUMS, "special functions": SPECIAL}
+LINEAR = [
+    lambda x: jnp.linalg.inv(jnp.outer(x, A[1]) + 3 * jnp.eye(2))[0],
+    lambda x: jnp.linalg.solve(jnp.diag(x + 2), jnp.ones(2)),
+    lambda x: jnp.linalg.solve(A, x),
+    lambda x: jnp.linalg.solve(jnp.outer(x, x) + jnp.eye(2), x),
+    lambda x: jnp.linalg.inv(jnp.diag(jnp.append(x, 1.0) + 2) + 0.1)[2, :2],
+    lambda x: jax.scipy.linalg.solve_triangular(jnp.outer(x, x) + jnp.eye(2), x),
+    lambda x: jax.scipy.linalg.solve(A @ A.T + jnp.eye(2), x, assume_a="pos"),
+    lambda x: jnp.linalg.det(jnp.diag(x) + 0.1),
+]
+
+FAMILIES = {
+    "linear equations": LINEAR,
+    "products": PRODUCTS,
+    "powers": POWERS,
+    "sums": SUMS,
+    "special functions": SPECIAL,
+}

@@ -71,6 +71,8 @@ OVER_MASKS = [
     lambda x: x * jnp.sum(MASKS),
     lambda x: x * jnp.mean(MASKS),
     lambda x: jnp.where(jnp.cumsum(MASKS)[:2] > 1, x, -x),
+    lambda x: lax.map(lambda p: jnp.where(p[0], p[1], 0.1 * p[1]), (x > 0, x)),
+    lambda x: lax.scan(lambda c, p: (c + jnp.where(p[0], p[1], -p[1]), p[0]), 0.0, (x > 0, x))[0],
 ]
 
 CHOICES = [
@@ -98,6 +100,9 @@ CHOICES = [
     lambda x: lax.switch(1, [lambda y: y, lambda y: 3 * y], x),
     lambda x: lax.switch(jnp.argmax(jnp.array([1.0, 3.0])), [jnp.sin, jnp.cos], x),
     lambda x: lax.platform_dependent(x, cpu=lambda y: 2 * y, default=lambda y: 2 * y),
+    lambda x: jnp.select([x > 0.3, x > 0], [x, x], 0.0),
+    lambda x: jnp.piecewise(x, [x < 0, x >= 0], [lambda y: -y, lambda y: y]),
+    lambda x: lax.cond(x[0] > 0, lambda y: y[0], lambda y: -y[0], x),
 ]
 
 ACTIVATIONS = [
@@ -224,16 +229,11 @@ LAYERS = [
 REFUSED = [
     lambda x: lax.while_loop(lambda y: y[0] > 0.3, lambda y: y / 2, x),
     lambda x: lax.map(lambda m: m.astype(float), x > 0.1),
-    lambda x: lax.map(lambda p: jnp.where(p[0], p[1], 0.1 * p[1]), (x > 0, x)),
-    lambda x: lax.scan(lambda c, p: (c + jnp.where(p[0], p[1], -p[1]), p[0]), 0.0, (x > 0, x))[0],
     lambda x: lax.scan(lambda m, y: (m & (y > 0), jnp.where(m, y, 2 * y)), True, x)[1],
     lambda x: jnp.where(x > 0, 1.0, -1.0),
     lambda x: jnp.where(x[0] > 0, x, 2 * x),
-    lambda x: jnp.select([x > 0.3, x > 0], [x, x], 0.0),
-    lambda x: jnp.piecewise(x, [x < 0, x >= 0], [lambda y: -y, lambda y: y]),
     lambda x: jnp.fmax(x, 0.2),
     lambda x: lax.cond(x[0] > 0, lambda y: y, lambda y: 2 * y, x),
-    lambda x: lax.cond(x[0] > 0, lambda y: y[0], lambda y: -y[0], x),
     lambda x: jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0),
     lambda x: jnp.sign(x) * x,
     lambda x: (x > 0) | (x < 1),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -35,6 +35,16 @@ OFF = Fraction(1, 10**40)
 
 TURNS = 1000
 """A loop that takes more turns is not read to its end."""
+
+
+class Unread(NamedTuple):
+    """What a primitive that has no rule makes of numbers that vary.
+
+    Attributes:
+        name: of the primitive.
+    """
+
+    name: str
 
 
 class Reader:
@@ -67,12 +77,13 @@ class Reader:
 
     def _read(self, equation: Any, operands: Sequence[Any]) -> list[Any]:
         """What one equation makes of its operands."""
-        if not any(isinstance(each, Varying) for each in operands):
+        if not any(isinstance(each, Varying | Unread) for each in operands):
             return _by_jax(equation, operands)
         name = equation.primitive.name
         rule = WAYS.get(name) or RULES.get(name)
-        if rule is None:
-            raise UnreadError(name)
+        unread = next((each for each in operands if isinstance(each, Unread)), None)
+        if rule is None or (unread and name not in IGNORING):
+            return [unread or Unread(name)] * len(equation.outvars)
         try:
             found = rule(self, equation, operands)
         except DisagreeError:
@@ -189,16 +200,6 @@ def _branched(reader: Reader, equation: Any, operands: Sequence[Any]) -> list[An
     return reader.walk(branches[which], operands[1:])
 
 
-def _solved(reader: Reader, equation: Any, operands: Sequence[Any]) -> list[Any]:
-    """A solver of one's own, by what it does."""
-    params = equation.params
-    counts, jaxprs = params["const_lengths"], params["jaxprs"]
-    before = counts.matvec + counts.vecmat
-    mine = operands[before : before + counts.solve]
-    right = operands[before + counts.solve + counts.transpose_solve :]
-    return reader.walk(jaxprs.solve, [*mine, *right])
-
-
 # fmt: off
 WAYS: dict[str, Callable[..., Any]] = {
     **dict.fromkeys(
@@ -208,12 +209,15 @@ WAYS: dict[str, Callable[..., Any]] = {
     "scan": _scanned,
     "while": _repeated,
     "cond": _branched,
-    "custom_linear_solve": _solved,
     "debug_callback": lambda reader, equation, operands: [],
     "debug_print": lambda reader, equation, operands: [],
 }
 """How jaxprs within equations are read."""
 # fmt: on
+
+
+IGNORING = (*WAYS, "custom_linear_solve")
+"""What may take no notice of operands that could not be read, such as factors of a matrix."""
 
 
 def images(function: Callable, points: np.ndarray) -> tuple[np.ndarray, Fraction]:
@@ -238,6 +242,8 @@ def images(function: Callable, points: np.ndarray) -> tuple[np.ndarray, Fraction
     closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct(points.shape[1:], float))
     reader = Reader(len(points))
     (found,) = reader.walk(closed, [Varying(fractions(points).T, points.shape[1:])])
+    if isinstance(found, Unread):
+        raise UnreadError(found.name)
     numbers = reader.of(found).numbers.T
     if not all(isinstance(each, Fraction | int) for each in numbers.flat):
         raise UndefinedError("a value is not finite")

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
+from tests.oracles.exact.exact_linear import LINEAR
 from tests.oracles.exact.exact_moves import MOVES, shape_of
 from tests.oracles.exact.varying import UndefinedError, Varying, fractions
 
@@ -182,6 +183,8 @@ EXACT: dict[str, Callable[..., Any]] = {
     "ne": operator.ne,
     "lt": operator.lt,
     "le": operator.le,
+    "lt_to": operator.lt,
+    "le_to": operator.le,
     "gt": operator.gt,
     "ge": operator.ge,
     "and": lambda a, b: a and b,
@@ -215,6 +218,7 @@ NOT_RATIONAL: dict[str, Callable[..., Any]] = {
 
 RULES: dict[str, Callable[..., Any]] = {
     **MOVES,
+    **LINEAR,
     **{name: _entrywise(function) for name, function in EXACT.items()},
     **{name: _digits(function) for name, function in NOT_RATIONAL.items()},
     "integer_pow": lambda reader, equation, operands: _entrywise(

@@ -1,0 +1,57 @@
+"""JAX's strict flags, under which everything here works as it does without them.
+
+With `jax_numpy_rank_promotion="raise"` or `jax_numpy_dtype_promotion="strict"` JAX refuses what
+mathematics writes every day: a vector beside a matrix, a whole number beside a real one. They are
+meant for the code of those who set them. So whatever is public opens a scope with JAX's own rules;
+the flags stay as they are for everybody else.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from types import FunctionType
+from typing import Any, TypeVar
+
+import jax
+
+Called = TypeVar("Called", bound=Callable[..., Any])
+
+
+def _as_usual() -> bool:
+    """Whether vectors and matrices, and numbers of all kinds, may stand beside one another."""
+    ranks, kinds = jax.config.jax_numpy_rank_promotion, jax.config.jax_numpy_dtype_promotion  # type: ignore[attr-defined]
+    return ranks != "raise" and kinds == "standard"
+
+
+def lenient(function: Called) -> Called:
+    """The function, in which strict flags of JAX's are off.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> with jax.numpy_rank_promotion("raise"):
+        ...     lenient(lambda: jnp.ones((2, 3)) * jnp.ones(3))().shape
+        (2, 3)
+    """
+
+    @functools.wraps(function)
+    def called(*given: Any, **named: Any) -> Any:
+        if _as_usual():
+            return function(*given, **named)
+        with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+            return function(*given, **named)
+
+    return called  # type: ignore[return-value]
+
+
+def made_lenient(cls: type) -> None:
+    """Let the public methods and properties that a class defines be `lenient`."""
+    for name, value in list(vars(cls).items()):
+        if name.startswith("_") and name not in ("__call__", "__post_init__"):
+            continue
+        if isinstance(value, FunctionType):
+            setattr(cls, name, lenient(value))
+        elif isinstance(value, classmethod):
+            setattr(cls, name, classmethod(lenient(value.__func__)))
+        elif isinstance(value, property) and value.fget is not None:
+            setattr(cls, name, property(lenient(value.fget), doc=value.__doc__))

@@ -161,10 +161,10 @@ def step_forms(
 
     measured, merged = loop.measured(state, t, apply), None
     if loop.smooth_controller:
-        first, kept, before = len(found), free, width
+        first, kept, own = len(found), free, width
         free = None if place is None else scratch
         u = loop.controller.propagate(measured, apply)
-        u, (gap, places) = _merged(u, before, kept, scratch)
+        u, (gap, places) = _merged(u, own, kept, scratch)
         merged = Merged(u, gap, places, range(first, len(found)))
         width = u.columns.shape[1]
         free = None if kept is None else kept + len(u.rows)

@@ -16,6 +16,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from reachjax.numerics.checks import described
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import LOGGER, LONG
 
 EVALUATIONS = 3000
 """What compiling a step of a loop takes, in evaluations of it in numpy: both grow with the number
@@ -86,6 +87,8 @@ class CompiledBeside:
             if early or left < price or known.began:
                 return False
             known.began = True
+        if price > LONG:
+            LOGGER.info("JAX compiles beside what goes on, for about %.0f s", price)
         thread = threading.Thread(target=self._compiled, args=(known, given, static))
         thread.start()
         if price <= CHEAP:  # beside others each would take twice as long

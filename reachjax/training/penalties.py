@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import described, is_concrete, whole_number
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import unlogged
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds, LocalBounds
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
 from reachjax.tubes.propagation import require_kinds
@@ -31,6 +32,7 @@ from reachjax.tubes.requirements import (
 from reachjax.tubes.sizes import log_volume
 
 
+@unlogged
 @lenient
 def volume_penalty(
     loop: ClosedLoop,
@@ -90,6 +92,7 @@ def volume_penalty(
     return _penalised(size, loop, X0, horizon, template, cells, options)
 
 
+@unlogged
 @lenient
 def specification_penalty(
     loop: ClosedLoop,

@@ -6,9 +6,17 @@ bounded once more in the calling process, as are all that come after them.
 
 from __future__ import annotations
 
+import pickle
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+)
 from concurrent.futures import wait as wait_for
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -42,7 +50,7 @@ class CellJobs(Generic[Kept]):
     """
 
     def __init__(self, executor: Executor | None, ahead: int):
-        self._executor = executor
+        self._executor, self._sent = executor, False
         self._running: dict[Future, _Job[Kept]] = {}
         self.workers = 1 if executor is None else getattr(executor, "_max_workers", WORKERS)
         self.most = 1 if executor is None else ahead * self.workers
@@ -54,11 +62,30 @@ class CellJobs(Generic[Kept]):
         """Begin a job; without an executor it is done once it is asked for."""
         future: Future = Future()
         if self._executor is not None:
+            self._require_sent(function, given)
             try:
                 future = self._executor.submit(function, *given)
             except BrokenExecutor as error:
                 self._give_up(error)
         self._running[future] = _Job(kept, function, given)
+
+    def _require_sent(self, function: Callable[..., Any], given: tuple[Any, ...]) -> None:
+        """Raise an error where processes would be sent what cannot travel; of the first job.
+
+        Raises:
+            TypeError: a function is none of a module.
+        """
+        if self._sent or not isinstance(self._executor, ProcessPoolExecutor):
+            return
+        try:
+            pickle.dumps((function, given))
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise TypeError(
+                "executor sends the loop to other processes, but a function that is a lambda or "
+                f"stands within another one cannot be sent ({error}): define it at the top of a "
+                "module, or take threads (ThreadPoolExecutor) or dask (client.get_executor())"
+            ) from None
+        self._sent = True
 
     def finished(self) -> Iterator[tuple[Kept, Any]]:
         """Those that are done, with their results, once there are any.

@@ -31,6 +31,7 @@ from reachjax.numerics.checks import (
     whole_number,
 )
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.numerics.rounding import TINY
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate
@@ -66,6 +67,7 @@ PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
 """How far an initial state is brought towards the middle of the set, so that it surely is in it."""
 
 
+@logged
 @lenient
 def decide(
     loop: ClosedLoop,
@@ -245,6 +247,8 @@ class _Decision:
         self._required = {(item.name, item.time): item for item in required}
         self._open = dict(self._required)
         self._margins = {item.name: np.full(horizon + 1, np.nan) for item in required}
+        for item in required:
+            self._margins[item.name][item.time] = -np.inf  # as long as nothing is known
         self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
         self._ends: dict[tuple[str, int], np.ndarray] = {}

@@ -27,6 +27,7 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.host import in_numpy
+from reachjax.numerics.logs import logged
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.programs.unrolled import unrolled
 from reachjax.sets import Box, Ellipsoid
@@ -68,6 +69,7 @@ class LargestSet(NamedTuple):
     verdict: Verdict
 
 
+@logged
 @lenient
 def largest_set(
     loop: ClosedLoop,

@@ -18,6 +18,7 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.files import existing_file
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.numerics.storage import read
 from reachjax.tubes.kept import Kept
 from reachjax.tubes.partitions import Bar, PartitionedTube
@@ -31,6 +32,7 @@ MISSING = (
 )
 
 
+@logged
 @lenient
 def load(
     path: str | os.PathLike[str],

@@ -34,6 +34,7 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.files import writable
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.sets import AbstractSet, Box, Template
@@ -172,6 +173,7 @@ class PartitionedTube(Replaceable):
         return self.bounds(t) - self.witnesses(t)
 
 
+@logged
 @lenient
 def reach_partitioned(
     loop: ClosedLoop,

@@ -18,6 +18,7 @@ from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.checks import floats_of, owned, require_double_precision, whole_number
 from reachjax.numerics.files import writable
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof, told
@@ -293,6 +294,7 @@ def reach_step(
     return tube.sets[1], tube.proof(1)
 
 
+@logged
 @lenient
 def reach(
     loop: ClosedLoop,

@@ -144,7 +144,7 @@ def requirements(
     found = [Requirement("goal", t, G, True) for t, G in timed_goals(goal, horizon)]
     found += [Requirement("safe", t, safe, True) for t in everywhere if safe is not None]  # type: ignore[arg-type]
     for t, regions in timed_sets_to_avoid(avoid, horizon):
-        found += [Requirement(f"avoid[{i}]", t, A, False) for i, A in enumerate(regions)]  # type: ignore[arg-type]
+        found += [Requirement(f"avoid[{i}]", t, A, False) for i, A in regions]  # type: ignore[arg-type]
     if not found:
         raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")
     known: dict[tuple[int, bool], Requirement] = {}

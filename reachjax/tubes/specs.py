@@ -16,6 +16,7 @@ from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, require_kind, whole_number
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.numerics.rounding import TINY
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet
@@ -29,6 +30,7 @@ from reachjax.tubes.soundness import Claim, require_unbroken
 from reachjax.tubes.verdicts import Verdict, VerdictStatus, of_cells
 
 
+@logged
 @lenient
 def verify(
     tube: ReachTube | PartitionedTube,

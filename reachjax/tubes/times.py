@@ -40,8 +40,14 @@ def timed_goals(goal: Timed | None, horizon: int) -> list[tuple[int, Any]]:
     return sorted(found.items(), key=lambda one: one[0])
 
 
-def timed_sets_to_avoid(avoid: AvoidSets | None, horizon: int) -> list[tuple[int, list[Any]]]:
+def timed_sets_to_avoid(
+    avoid: AvoidSets | None, horizon: int
+) -> list[tuple[int, list[tuple[int, Any]]]]:
     """The sets to be avoided at each time; what is named twice for a time is avoided all together.
+
+    Returns:
+        At each time the sets with their numbers, in the order in which they are given. A set that
+        is given more than once has one number.
 
     Raises:
         TypeError: a time is no whole number, or there is no sequence of sets.
@@ -50,14 +56,17 @@ def timed_sets_to_avoid(avoid: AvoidSets | None, horizon: int) -> list[tuple[int
     if avoid is None:
         return []
     given = avoid if isinstance(avoid, Mapping) else {range(horizon + 1): avoid}
-    found: dict[int, list[Any]] = {}
+    found: dict[int, list[tuple[int, Any]]] = {}
+    numbers: dict[int, int] = {}
     for t, regions in _by_times("avoid", given, horizon):
         if not isinstance(regions, Sequence):
             raise TypeError(
                 "avoid must be a sequence of sets, avoid=[A, ...], or a mapping from times to "
                 f"them, avoid={{t: [A, ...]}}, but {described(regions)} arrived"
             )
-        found.setdefault(t, []).extend(regions)
+        for region in regions:
+            number = numbers.setdefault(id(region), len(numbers))
+            found.setdefault(t, []).append((number, region))
     return sorted(found.items(), key=lambda one: one[0])
 
 

@@ -101,7 +101,9 @@ class Verdict:
     Attributes:
         status: proved, refuted or unknown.
         margins: for each requirement `(horizon + 1,)`, the certified margin at each time; NaN where
-            nothing is required. Negative: not proved.
+            nothing is required, minus infinity where nothing is known. Negative: not proved. Sets
+            to be avoided are called `avoid[0]`, `avoid[1]`, ... in the order in which they are
+            given, those of a mapping one after the other.
         simulated: the same for the sampled trajectories. Negative: broken.
         counterexample: the trajectory, when refuted.
         ends: how many of the bounds that it rests on ended in which way: those that are not
@@ -144,9 +146,16 @@ class Verdict:
     def __bool__(self) -> bool:
         raise TypeError("a verdict has three values: use verdict.proved, .refuted or .unknown")
 
+    def _simulated_at(self, name: str) -> tuple[float, int | str]:
+        """The smallest simulated margin, and when; where a trajectory refutes it, that one's."""
+        example = self.counterexample
+        if example is not None and example.requirement == name:
+            return -example.violation, example.time
+        return _least_at(self.simulated[name])
+
     def _repr_html_(self) -> str:
         rows = [
-            [name, *_least_at(self.margins[name]), *_least_at(self.simulated[name])]
+            [name, *_least_at(_known(self.margins[name])), *self._simulated_at(name)]
             for name in self.margins
         ]
         head = ["requirement", "certified margin", "at t", "simulated margin", "at t"]
@@ -172,15 +181,9 @@ class Verdict:
     def __str__(self) -> str:
         lines = [self.status.name]
         for name, margins in self.margins.items():
-            least, _ = _least_at(self.simulated[name])
-            simulated = "unknown" if np.isnan(least) else f"{least:+.4g}"
-            if np.isnan(margins).all():  # refuted before anything was bounded
-                lines.append(f"  {name}: simulated margin {simulated}")
-                continue
-            t = int(np.nanargmin(margins))
             lines.append(
-                f"  {name}: certified margin {margins[t]:+.4g} (smallest, at t = {t}), "
-                f"simulated margin {simulated}"
+                f"  {name}: certified margin {_certified(margins)}, "
+                f"simulated margin {_smallest(*self._simulated_at(name))}"
             )
         if self.counterexample is not None:
             e = self.counterexample
@@ -211,6 +214,24 @@ def _least_at(margins: Float[np.ndarray, " h+1"]) -> tuple[float, int | str]:
         return np.nan, ""
     t = int(np.nanargmin(margins))
     return float(margins[t]), t
+
+
+def _smallest(least: float, t: int | str) -> str:
+    """A margin with its time, if there is one."""
+    return f"{least:+.4g} (smallest, at t = {t})" if np.isfinite(least) else "unknown"
+
+
+def _certified(margins: Float[np.ndarray, " h+1"]) -> str:
+    """The smallest margin, where it is known at every time at which something is required."""
+    known, required = np.isfinite(margins).sum(), (~np.isnan(margins)).sum()
+    if 0 < known < required:
+        return f"known at {known} of {required} times"
+    return _smallest(*_least_at(_known(margins)))
+
+
+def _known(margins: Float[np.ndarray, " h+1"]) -> Float[np.ndarray, " h+1"]:
+    """Margins, if they are known wherever something is required; else not a number."""
+    return np.where(np.isinf(margins).any(), np.nan, margins)
 
 
 def _described(found: Recurrence) -> str:

@@ -33,6 +33,7 @@ from reachjax.numerics.checks import (
     wrapped,
 )
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.sets import Box
 from reachjax.tubes.cell_jobs import CellJobs
@@ -86,6 +87,7 @@ class Sorted(NamedTuple):
     promising: bool = False
 
 
+@logged
 @lenient
 def winning_set(
     loop: ClosedLoop,

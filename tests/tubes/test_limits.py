@@ -276,3 +276,25 @@ def test_a_process_that_is_killed_loses_nothing(small):
                 progress=bar,
             )
     assert len(tube) == 6
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda loop, X0, pool: rj.reach_partitioned(
+            loop, X0, 1, rj.Template.box(1), cells=(2,), executor=pool
+        ),
+        lambda loop, X0, pool: rj.winning_set(
+            loop, X0, 1, safe=rj.Box([-0.9], [2.0]), cells=8, executor=pool
+        ),
+    ],
+    ids=["reach_partitioned", "winning_set"],
+)
+def test_functions_that_no_process_can_be_sent_are_told_how_to(call):
+    plant = rj.NonlinearPlant(lambda x, u: 0.5 * x, states=1, inputs=1)
+    loop = rj.ClosedLoop(plant, rj.Network(lambda x: -x, inputs=1, outputs=1))
+    with (
+        ProcessPoolExecutor(1) as pool,
+        pytest.raises(TypeError, match=r"define it at the top of a module, or take threads"),
+    ):
+        call(loop, rj.Box([-1.0], [1.0]), pool)

@@ -128,7 +128,8 @@ class Recheck:
                 facet,
                 *numbers,
             )
-        proof, found = self._repeat.of(k, proof)
+        with np.errstate(all="ignore"):  # what overflows proves nothing
+            proof, found = self._repeat.of(k, proof)
         bounds = np.asarray(proof.bounds)
         slack = ROUNDING * np.fmax(abs(bounds), self._sizes(k, region))
         for facet in np.flatnonzero(~(found <= bounds + slack))[:1].tolist():
@@ -164,13 +165,14 @@ class Recheck:
 
     @cached_property
     def _states(self) -> np.ndarray:
-        """The size of the states of each time on trajectories from around the initial set."""
+        """The size of the states up to each time on trajectories from around the initial set."""
         tube = self._given
         loop, box = jax.device_get((tube.loop, tube.sets[0].bounding_box()))
         scenarios = Scenarios.of(loop, tube.sets[0], tube.horizon, tube.start)
         begun = np.stack([scenarios.middle(each) for each in (box.lower, box.center, box.upper)])
         runs = scenarios.runs(loop, begun, tube.horizon, tube.start)
-        return np.where(np.isfinite(runs), abs(runs), 0.0).max(axis=0)
+        sizes = np.where(np.isfinite(runs), abs(runs), 0.0).max(axis=0)
+        return np.maximum.accumulate(sizes, axis=0)
 
 
 def _require_template(tube: ReachTube, k: int, region: AbstractSet) -> None:
@@ -223,7 +225,7 @@ def _require_witnesses(tube: ReachTube) -> None:
     inside = np.isfinite(begun).all(axis=1) & scenarios.nearly_contains(begun)
     runs = scenarios.runs(loop, begun, tube.horizon, tube.start)
     for (k, facet, said, _), run, within in zip(claims, runs, inside, strict=True):
-        value, size = _value(tube.sets[k], facet, run[k])
+        value, size = _value(tube.sets[k], facet, run[: k + 1])
         if not within or not abs(value - said) <= ROUNDING * size:
             found = "it does not begin in the initial set" if not within else f"{value:.12g}"
             raise DisagreementError(
@@ -236,15 +238,19 @@ def _require_witnesses(tube: ReachTube) -> None:
             )
 
 
-def _value(region: AbstractSet, facet: int, x: np.ndarray) -> tuple[float, float]:
-    """What a facet, or the ellipsoid, of a set has at a state, and the size of its terms."""
+def _value(region: AbstractSet, facet: int, run: np.ndarray) -> tuple[float, float]:
+    """What a facet, or the ellipsoid, of a set has at the end of a run, and the size of its terms.
+
+    It is that of all states so far: what is left of a contracting loop's has their rounding.
+    """
+    x, largest = run[-1], abs(run).max(axis=0)
     A, _ = map(np.asarray, region.facets)
     if facet < len(A):
-        return float(A[facet] @ x), float(abs(A[facet]) @ abs(x))
+        return float(A[facet] @ x), float(abs(A[facet]) @ largest)
     _, ball = region.parts
     assert ball is not None
     form, center = np.asarray(ball.normal_form.A), np.asarray(ball.center)
-    terms = abs(form) @ (abs(x) + abs(center))
+    terms = abs(form) @ (largest + abs(center))
     return float(np.linalg.norm(form @ (x - center))), float(np.linalg.norm(terms))
 
 

@@ -81,7 +81,7 @@ class Repeat:
             *_, last = (p for p in tube.certificates if isinstance(p, LinearCertificate))
             slopes = np.asarray(last.slopes)
             found = self._by_forms(k, ("slopes", last.k), [(tube.sets[0], self._box)], slopes)
-            return proof.replace(**own, slopes=last.slopes[:k]), found
+            return proof.replace(**own, slopes=jax.device_put(slopes[:k])), found
         if isinstance(proof, CellCertificate):
             axes = np.asarray(proof.axes).tolist()
             cells = ((cell.part, cell.box) for cell in from_tree(tube.sets[0], axes))

@@ -49,6 +49,29 @@ def test_a_public_name_stands_on_one_page_of_the_reference():
     assert sorted(re.findall(r"^::: reachjax\.(\w+)$", pages, re.MULTILINE)) == sorted(rj.__all__)
 
 
+@pytest.mark.parametrize(
+    ("word", "page"),
+    {
+        "nonlinear": "nonlinear",
+        "argmax": "nonlinear",
+        "discontinuous": "nonlinear",
+        "float32": "elsewhere",
+        "gymnasium": "elsewhere",
+        "obstacles": "requirements",
+        "forward mode": "training",
+        "logging": "slow",
+    }.items(),
+)
+def test_a_word_that_is_searched_for_brings_its_page(word, page):
+    assert re.search(rf"\b{word}\b", (DOCS / "how-to" / f"{page}.md").read_text(), re.IGNORECASE)
+
+
+def test_the_first_page_leads_to_every_kind_of_loop():
+    told = (DOCS / "index.md").read_text()
+    for page in ("nonlinear", "elsewhere", "disturbances", "requirements"):
+        assert f"(how-to/{page}.md)" in told
+
+
 def test_the_picture_of_the_rooms_is_the_one_that_is_drawn():
     assert (DOCS / "reference" / "rooms.svg").read_text() == picture()
 

@@ -31,8 +31,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.pytrees import pytree
-from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
-from reachjax.programs.initial import Ends, InitialColumns, constant
+from reachjax.numerics.rounding import Ball, gamma, larger, namespace
+from reachjax.programs.initial import Ends, InitialColumns, constant, met
 
 Place = int | Array | None
 """Where new columns begin; None to append those that are needed (numpy)."""
@@ -132,28 +132,23 @@ class AffineForms:
             cut: whether what cuts the initial set is looked at as well (on the host, a linear
                 program for each end).
         """
-        w, n = len(start.spread), self.rows.shape[1]
-        center, middle = self.rows[:, 0], self.rows[:, 1]
-        first = self.rows[:, 2 : 2 + w]
-        lower, upper = start.cut_ends(first) if cut else start.ends(first)
-        own = w
-        if start.curved:
-            own = start.count
-            products = abs(self.rows[:, 2 + w : 2 + own]).sum(axis=1) * (1 + gamma(n))
-            ends = start.curved_ends(self.rows[:, 2 : 2 + own])
-            lower, upper = met(ends, (lower - products, upper + products))
+        return met(self.ends_by_form(start, cut), self.ends_by_interval())
+
+    def ends_by_form(self, start: InitialColumns, cut: bool = False) -> Ends:
+        """Lower and upper bounds `(k,)` by forms alone."""
+        own, n = start.count, self.rows.shape[1]
+        center = self.rows[:, 0]
+        lower, upper = start.bounds(self.rows[:, 2 : 2 + own], cut)
         largest = abs(constant(center)) + constant(larger(-lower, upper))
         rest = abs(self.rows[:, 2 + own :]).sum(axis=1) * (1 + gamma(n))
         slack = rest + (self.radii[:, 0] + gamma(8) * largest) * (1 + gamma(n))
-        by_forms = center + lower - slack, center + upper + slack
-        reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(constant(middle))
-        return met(by_forms, (middle - reach, middle + reach))
+        return center + lower - slack, center + upper + slack
 
-    def largest(self, there: Float[Array | np.ndarray, "k c"]) -> Float[Array | np.ndarray, " k"]:
-        """The largest value of each form where the first columns are these, but for rounding."""
-        count = there.shape[1]
-        first, rest = self.columns[:, :count], self.columns[:, count:]
-        return self.rows[:, 0] + (first * there).sum(axis=1) + abs(rest).sum(axis=1)
+    def ends_by_interval(self) -> Ends:
+        """Lower and upper bounds `(k,)` by intervals alone."""
+        middle = self.rows[:, 1]
+        reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(constant(middle))
+        return middle - reach, middle + reach
 
     def widened(self, width: int) -> AffineForms:
         """The same over at least so many columns, the new ones empty (numpy)."""
@@ -181,12 +176,6 @@ class AffineForms:
         rows[where, n + np.arange(count)] = by[where]
         places = np.where(needed, n - 3 + np.cumsum(needed), -1)
         return AffineForms(rows, self.radii), places
-
-
-def met(one: Ends, other: Ends) -> Ends:
-    """What both bounds hold; never empty. What is no number stays so in the first alone."""
-    lower = larger(one[0], other[0])
-    return lower, larger(smaller(one[1], other[1]), lower)
 
 
 def _sum(one: Any, other: Any) -> Any:

@@ -23,8 +23,8 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.limits import Limits
 from reachjax.loops.units import AbstractUnit, Quadratic, SmoothUnit, UnboundedError
 from reachjax.numerics.rounding import Ball, gamma, namespace
-from reachjax.programs.affine import AffineForms, Place, met
-from reachjax.programs.initial import Ends, InitialColumns, constant, settled
+from reachjax.programs.affine import AffineForms, Place
+from reachjax.programs.initial import Ends, InitialColumns, constant, met, settled
 from reachjax.sets import Box
 
 SPILL = 1e-13
@@ -88,8 +88,14 @@ class StepForms(NamedTuple):
     merged: Merged | None
 
 
-Ranges = Callable[[AbstractUnit, AffineForms, Ends, Sequence[UnitForms]], Ends]
-"""Bounds of a layer's inputs that are no worse than these, given the layers before."""
+Ranges = Callable[[AbstractUnit | None, AffineForms, Ends, Sequence[UnitForms]], Ends]
+"""Bounds of a layer's inputs that are no worse than these, given the layers before; or, of no unit,
+of the state after the step."""
+
+
+def states_facts(unit: AbstractUnit) -> bool:
+    """Whether facts of a unit say more than its form; columns of free units say all theirs do."""
+    return not (unit.free or isinstance(unit, SmoothUnit))
 
 
 def step_columns(loop: ClosedLoop) -> tuple[int, int]:
@@ -123,7 +129,7 @@ def step_forms(
         slopes: of the units that are not smooth; None for those of their lines. What is found holds
             for any.
         known: a box that surely holds the successor, where one is known.
-        ranges: what else bounds the inputs of a layer, if anything does.
+        ranges: what else bounds the inputs of a layer, or the successor, if anything does.
         scratch: where the columns begin that a step needs in between, if there is a place.
         before: how many steps there were since the initial set.
     """
@@ -155,10 +161,10 @@ def step_forms(
 
     measured, merged = loop.measured(state, t, apply), None
     if loop.smooth_controller:
-        first, kept, before = len(found), free, width
+        first, kept, own = len(found), free, width
         free = None if place is None else scratch
         u = loop.controller.propagate(measured, apply)
-        u, (gap, places) = _merged(u, before, kept, scratch)
+        u, (gap, places) = _merged(u, own, kept, scratch)
         merged = Merged(u, gap, places, range(first, len(found)))
         width = u.columns.shape[1]
         free = None if kept is None else kept + len(u.rows)
@@ -171,6 +177,8 @@ def step_forms(
     ends = successor.ends(start)
     if known is not None:
         ends = met(ends, (known.lower, known.upper))
+    if ranges is not None:
+        ends = ranges(None, successor, ends, found)
     return StepForms(successor.within(Ball.between(*ends)), tuple(found), merged)
 
 

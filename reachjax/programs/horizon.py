@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -25,14 +25,39 @@ from jaxtyping import Float, Int
 from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit, Mark, SmoothUnit
 from reachjax.numerics.rounding import Ball
-from reachjax.programs.affine import AffineForms, met
-from reachjax.programs.affine_steps import Merged, UnitForms, step_forms
-from reachjax.programs.initial import Ends, InitialColumns, product_facts
-from reachjax.programs.unrolled import FactWeights
+from reachjax.programs.affine import AffineForms
+from reachjax.programs.affine_steps import Merged, UnitForms, states_facts, step_forms
+from reachjax.programs.initial import Ends, InitialColumns, met, product_facts
 from reachjax.sets import AbstractSet, Box
 
-Multipliers = Callable[[AffineForms], Float[np.ndarray, "k m"] | None]
-"""Multipliers of the facts so far that bound each of these forms from above; None if none do."""
+OF_SET, OF_PRODUCTS = -1, -2
+"""In the place of a step: facts of the initial set, and of products of its columns."""
+
+Multipliers = Callable[
+    [AffineForms], tuple[Float[np.ndarray, "k m"], Float[np.ndarray, "k n"]] | None
+]
+"""Multipliers of the facts so far that bound each of these forms from above, and the columns where
+it is attained then, NaN where they are not known; None if none do."""
+
+
+class RangeEnd(NamedTuple):
+    """An end of the range of a unit's input that multipliers of facts proved.
+
+    Attributes:
+        step: of the horizon.
+        layer: of the step.
+        unit: of the layer.
+        side: 0 for the lower end, 1 for the upper one.
+        multipliers: `(m,)`, of the facts so far.
+        columns: `(n,)`, where it is attained.
+    """
+
+    step: int
+    layer: int
+    unit: int
+    side: int
+    multipliers: Float[np.ndarray, " m"]
+    columns: Float[np.ndarray, " n"]
 
 
 class Horizon:
@@ -45,6 +70,7 @@ class Horizon:
         t: the time of the initial set.
 
     Attributes:
+        loop: of numpy arrays.
         start: what the first columns are.
         state: forms of the state after the steps so far.
         steps: the forms of the units of each step, layer by layer.
@@ -53,8 +79,11 @@ class Horizon:
         enclosed: those that facts bound by themselves.
         gaps: `(p,)`, how much of its column a unit's value has.
         origins: `(m, 3)`, of each fact the step, the unit's number among those of a step, and which
-            of its facts it is; -1 of the initial set, -2 of products of its columns.
+            of its facts it is; `OF_SET` or `OF_PRODUCTS` for what is of no unit.
         merged: of each step, what a smooth controller leaves out.
+        states: forms of the states after each step, with intervals of the step's own arithmetic.
+        ends: bounds of the states after each step, the best that are known.
+        better: ends of ranges that are better known than by forms and intervals.
         tightened: multipliers `(2 k, m)` by which ranges of the last step's units were bounded, for
             each time that they were asked for; none of no forms where there were none.
 
@@ -71,11 +100,14 @@ class Horizon:
     """
 
     def __init__(self, loop: ClosedLoop, X0: AbstractSet, box: Box, t: int = 0):
-        self._loop, self._t = loop, t
+        self.loop, self._t = loop, t
         self.start = InitialColumns.of(X0, box, loop.curved)
         self.state = AffineForms.beginning(self.start)
         self.steps: list[tuple[UnitForms, ...]] = []
         self.merged: list[Merged | None] = []
+        self.states: list[AffineForms] = []
+        self.ends: list[Ends] = []
+        self.better: list[RangeEnd] = []
         self.tightened: list[np.ndarray] = []
         self._varying = np.zeros(0, dtype=int)
         self._width = self.start.count
@@ -87,9 +119,9 @@ class Horizon:
         self._count = self._stated = 0
         if self.start.cut is not None:
             A, b = (np.asarray(part) for part in self.start.cut.facets)
-            self._add(b - A @ self.state, np.full((len(b), 3), -1))
+            self._add(b - A @ self.state, np.full((len(b), 3), OF_SET))
         products = AffineForms(*product_facts(self.start))
-        self._add(products, np.full((len(products.rows), 3), -2))
+        self._add(products, np.full((len(products.rows), 3), OF_PRODUCTS))
 
     @property
     def facts(self) -> AffineForms:
@@ -124,37 +156,46 @@ class Horizon:
         """
 
         def ranges(
-            unit: AbstractUnit, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
+            unit: AbstractUnit | None, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
         ) -> Ends:
             self._state_facts(found)
+            if unit is None:
+                self.states.append(y)
+                return ends
             self._width = max(self._width, y.columns.shape[1])
             if isinstance(unit, SmoothUnit):  # its range is that of its form, but for little
                 return ends
             switching = np.flatnonzero(~unit.lines(*ends).affine)
             if multipliers is None or unit.free or not (len(switching) and self._count):
                 return ends
-            lower, upper = (end.copy() for end in ends)
             inputs = y[switching]
             both = joined([inputs, -inputs])
-            weights = multipliers(both)
-            self.tightened.append(np.zeros((0, self._count)) if weights is None else weights)
-            if weights is None:
+            given = multipliers(both)
+            weights = np.zeros((0, self._count)) if given is None else given[0]
+            self.tightened.append(weights)
+            if given is None:
                 return ends
-            found_ends = self.bounds(both, weights)
-            better = met(
-                (lower[switching], upper[switching]),
-                (-found_ends[len(switching) :], found_ends[: len(switching)]),
-            )
-            lower[switching], upper[switching] = better
+            lower, upper = (np.array(end) for end in ends)
+            most, least = np.split(self.bounds(both, weights), 2)
+            better = np.stack([most < upper[switching], -least > lower[switching]])
+            for number in np.flatnonzero(better):
+                side, place = divmod(int(number), len(switching))
+                proof = (part[number] for part in given)
+                self.better.append(
+                    RangeEnd(len(self.steps), len(found), int(switching[place]), 1 - side, *proof)
+                )
+            known = lower[switching], upper[switching]
+            lower[switching], upper[switching] = met(known, (-least, most))
             return lower, upper
 
         t = self._t + len(self.steps)
         self._stated, self.tightened = 0, []
         with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
             self.state, units, merged = step_forms(
-                self._loop, self.state, t, self.start, ranges=ranges, before=len(self.steps)
+                self.loop, self.state, t, self.start, ranges=ranges, before=len(self.steps)
             )
             self._state_facts(units)
+        self.ends.append(self.state.ends_by_interval())
         self.steps.append(units)
         self.merged.append(merged)
         # those of units of a smooth controller are summed up in the merged ones
@@ -195,7 +236,7 @@ class Horizon:
         values: Iterator[float],
     ) -> Float[np.ndarray, " n_x"]:
         """The state after one step more of a trajectory, whose columns are set."""
-        (layers, merged), loop, t = (self.steps[k], self.merged[k]), self._loop, self._t + k
+        (layers, merged), loop, t = (self.steps[k], self.merged[k]), self.loop, self._t + k
         summed = range(0) if merged is None else merged.layers
         numbers = itertools.count()
 
@@ -224,25 +265,29 @@ class Horizon:
             for layers in self.steps
         ]
 
-    def weights(self, multipliers: Float[np.ndarray, "f m"], steps: int) -> FactWeights:
-        """Multipliers of the facts so far by what they are of, for so many steps."""
+    @property
+    def kinds(self) -> int:
+        """How many facts a unit may have."""
+        return int(self.origins[:, 2].max(initial=0)) + 1
+
+    def of_units(
+        self, multipliers: Float[np.ndarray, "k m"], steps: int
+    ) -> Float[np.ndarray, "k N b units"]:
+        """Multipliers of all facts by step, fact and unit, zero of those that there are not."""
         step, unit, which = self.origins.T
         units = sum(len(layer.places) for layer in self.steps[0])
-        found = np.zeros((len(multipliers), steps, which.max(initial=0) + 1, units))
-        of_units = step >= 0
-        found[:, step[of_units], which[of_units], unit[of_units]] = multipliers[:, of_units]
-        ranges = np.zeros((steps, 2, units))
-        for known, layers in zip(ranges, self.steps, strict=False):
-            for number, name in enumerate(("lower", "upper")):
-                parts = [getattr(layer, name) for layer in layers]
-                known[number] = np.concatenate([np.zeros(0), *parts])
-        of_set, of_products = (multipliers[:, step == kind] for kind in (-1, -2))
-        nowhere = np.full((len(multipliers), self.start.count), np.nan)
-        return FactWeights(found, of_set, of_products, ranges, nowhere)
+        found = np.zeros((len(multipliers), steps, self.kinds, units))
+        there = np.flatnonzero(step >= 0)
+        found[:, step[there], which[there], unit[there]] = multipliers[:, there]
+        return found
+
+    def of_set(self, multipliers: Float[np.ndarray, "k m"]) -> Float[np.ndarray, "k r"]:
+        """Multipliers of the facets of what the initial set is cut by."""
+        return multipliers[:, self.origins[:, 0] == OF_SET]
 
     def narrow(self, lower: Float[np.ndarray, " n_x"], upper: Float[np.ndarray, " n_x"]) -> None:
         """Meet the state with bounds that surely hold it."""
-        ends = met(self.state.ends(self.start), (lower, upper))
+        self.ends[-1] = ends = met(self.state.ends(self.start), (lower, upper))
         self.state = self.state.within(Ball.between(*ends))
 
     def bounds(
@@ -259,12 +304,10 @@ class Horizon:
             switching = np.flatnonzero((layer.places >= 0) | layer.unit.stated)
             if layer.unit.closed:
                 self.enclosed = np.append(self.enclosed, found[number - 1].places)
-            if isinstance(layer.unit, SmoothUnit):  # it has none that are of the lines' sectors
-                continue
-            if layer.unit.free:  # its column says all that its facts do
+            if layer.unit.free:
                 self.free = np.append(self.free, layer.places)
                 self._varying = np.append(self._varying, layer.places)
-            elif len(switching):
+            elif states_facts(layer.unit) and len(switching):
                 first = sum(len(before.places) for before in found[:number])
                 self._add_units(layer, switching, first)
         self._stated = len(found)

@@ -109,6 +109,31 @@ class InitialColumns(Replaceable):
             below, above = below - rest, above + rest
         return below - constant(error * size), above + constant(error * size)
 
+    def bounds(self, rows: Rows, cut: bool = False) -> Ends:
+        """Bounds of each row over all columns, the better of all that are known.
+
+        Args:
+            rows: over these columns.
+            cut: whether what cuts the initial set is looked at as well.
+        """
+        w = self.spread.shape[1]
+        lower, upper = self.cut_ends(rows[:, :w]) if cut else self.ends(rows[:, :w])
+        if not self.curved:
+            return lower, upper
+        products = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(rows.shape[1]))
+        return met(self.curved_ends(rows), (lower - products, upper + products))
+
+    def attaining(self, rows: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k n"]:
+        """The columns where each row is largest as `bounds` has it, whatever the cut; in numpy."""
+        if self.curved:  # the gradient of what is positively homogeneous
+            count = 1 << max(len(rows) - 1, 0).bit_length()  # few shapes: each is compiled
+            filled = np.concatenate([rows, np.zeros((count - len(rows), rows.shape[1]))])
+            return np.asarray(_slopes(self.replace(cut=None), filled))[: len(rows)]
+        if not self.round:
+            return np.sign(rows)
+        lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+        return rows / np.where(lengths > 0, lengths, 1.0)
+
     def norms(self, rows: Rows) -> Any:
         """What `r . w` does not exceed for each row, whatever the cut."""
         if not self.round:
@@ -145,6 +170,18 @@ class InitialColumns(Replaceable):
         lower = least - at - constant((error + gamma(4) * abs(least)) * (1 + gamma(n)))
         upper = most - at + constant((error + gamma(4) * abs(most)) * (1 + gamma(n)))
         return larger(-norms, lower), smaller(norms, upper)
+
+
+def met(one: Ends, other: Ends) -> Ends:
+    """What both bounds hold; never empty. What is no number stays so in the first alone."""
+    lower = larger(one[0], other[0])
+    return lower, larger(smaller(one[1], other[1]), lower)
+
+
+@jax.jit
+def _slopes(start: InitialColumns, rows: Float[Array, "k n"]) -> Float[Array, "k n"]:
+    """Derivatives of the upper bound of each row over all columns."""
+    return jax.grad(lambda rows: start.bounds(rows)[1].sum())(rows)
 
 
 @lru_cache(maxsize=64)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,33 +16,11 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.functions import Compiled
-from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.host import in_numpy
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
-from reachjax.programs.initial import Ends, InitialColumns, constant, product_facts
+from reachjax.programs.initial import InitialColumns, constant
 from reachjax.sets import AbstractSet, Box
-
-Carry = tuple[AffineForms, AffineForms]
-
-
-class FactWeights(NamedTuple):
-    """Multipliers of the facts of a horizon, for each of some bounds.
-
-    Attributes:
-        of_units: `(f, N, b, units)`, of the facts of each unit, of which there are `b`.
-        of_set: `(f, r)`, of the facets of the initial set.
-        of_products: `(f, p)`, of the facts of products of its columns.
-        ranges: `(N, 2, units)`, lower and upper bounds of the units' inputs, as they were known.
-        attained: `(f, c)`, the initial columns where each bound is attained, which is that of a
-            form there then; NaN for the norms of its form.
-    """
-
-    of_units: Float[Array | np.ndarray, "f N b units"]
-    of_set: Float[Array | np.ndarray, "f r"]
-    of_products: Float[Array | np.ndarray, "f p"]
-    ranges: Float[Array | np.ndarray, "N 2 units"]
-    attained: Float[Array | np.ndarray, "f c"]
 
 
 class ByForms(NamedTuple):
@@ -152,72 +130,6 @@ def unrolled_from_boxes(
         return unrolled_at_once(loop, box, box, directions, t).offsets
 
     return jax.vmap(one)(lower, upper)
-
-
-@partial(Compiled, static_argnames="t")
-def weighed_at_once(
-    loop: ClosedLoop,
-    X0: AbstractSet,
-    box: Box,
-    directions: Float[Array, "f n_x"],
-    weights: FactWeights,
-    t: int = 0,
-) -> Float[Array, "N f"]:
-    """Upper bounds of directions after 1, ..., N steps by forms and weighed facts, compiled.
-
-    Each is that of its direction's form and the facts so far, as `Horizon.bounds` takes them, so it
-    has the derivative of a bound whose weights are held. Ranges of units that were better known
-    than by forms have the derivatives of these.
-
-    Args:
-        loop: the closed loop.
-        X0: the initial set.
-        box: around it.
-        directions: one row a bound.
-        weights: of the facts, for each bound.
-        t: the time of the initial set.
-    """
-    start = InitialColumns.of(X0, box, loop.curved)
-    (more, between), steps = step_columns(loop), weights.of_units.shape[1]
-    first, end = start.count, start.count + steps * more
-    state = AffineForms.beginning(start, end + between)
-    facts, radii = map(jnp.asarray, product_facts(start))
-    facts = jnp.pad(facts, ((0, 0), (0, end + between - start.count)))
-    total = weights.of_products @ AffineForms(facts, radii)
-    if weights.of_set.shape[1]:
-        A, b = X0.facets
-        total = total + weights.of_set @ (b - A @ state)
-
-    def advance(carry: Carry, step: tuple[Array, Array, Array]) -> tuple[Carry, Array]:
-        (state, total), (k, given, known), done = carry, step, 0
-
-        def ranges(
-            unit: AbstractUnit, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
-        ) -> Ends:
-            before = sum(len(each.gap) for each in found)
-            here = known[:, before : before + len(y.rows)]
-            low, high = (end - jax.lax.stop_gradient(end) for end in ends)
-            return here[0] + low, here[1] + high
-
-        place = first + k * more
-        state, units, _ = step_forms(
-            loop, state, t + k, start, place=place, scratch=end, ranges=ranges
-        )
-        for layer in units:
-            here, done = slice(done, done + len(layer.gap)), done + len(layer.gap)
-            ends: Any = layer.lower, layer.upper
-            said = layer.unit.facts(layer.inputs, layer.outputs, *ends)
-            sectors = (block.rows for block in said.blocks if block.mark is Mark.SECTOR)
-            for rows, weight in zip(sectors, jnp.moveaxis(given, 1, 0), strict=False):
-                total = total + weight[:, here] @ rows
-        forms = directions @ state + total
-        return (state, total), jnp.where(held, forms.largest(there), forms.ends(start)[1])
-
-    held = jnp.isfinite(weights.attained).all(axis=1)
-    there = jnp.where(held[:, None], weights.attained, 0.0)
-    of_units = jnp.moveaxis(weights.of_units, 1, 0)
-    given = jnp.arange(steps), of_units, jnp.asarray(weights.ranges)
-    return jax.lax.scan(advance, (state, total), given)[1]
 
 
 def _bounds(rows: AffineForms, units: tuple[UnitForms, ...], start: InitialColumns) -> ByForms:

@@ -77,9 +77,12 @@ class Replay(Replaceable):
                 np.concatenate([part[which] for part in parts] or [np.zeros((facets, 0))], axis=1)
                 for which in range(2)
             )
-        weights = horizon.weights(multipliers, steps)
+        of_units, of_set = (
+            horizon.of_units(multipliers, steps),
+            horizon.of_set(multipliers),
+        )
         initial = columns[:, : horizon.start.spread.shape[1]]
-        return cls(initial, slopes, offsets, weights.of_units, weights.of_set)
+        return cls(initial, slopes, offsets, of_units, of_set)
 
 
 def _lines(

@@ -18,7 +18,8 @@ from jaxtyping import Array, Float, Int
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, owned
-from reachjax.programs.unrolled import weighed_at_once
+from reachjax.programs.held import attained, held_bounds, sources
+from reachjax.programs.moving import Moving, moving
 from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import SolverStatus
@@ -74,7 +75,7 @@ def sets_by_branching(
     budget = setting.budget.with_work(of_programs)
     scenarios = Scenarios.of(loop, begun, horizon, setting.start)
     ladder = Ladder(loop, begun, around, scenarios, setting.start, nodes, budget, setting.note)
-    X, steps = X0, []
+    X, steps, ends = X0, list[Step](), list[Array | np.ndarray]()
     for k, (region, proof, *_) in enumerate(known, start=1):
         steps.append(Step(setting, X, k - 1, tuple(steps)))
         X = region
@@ -82,7 +83,7 @@ def sets_by_branching(
         if isinstance(proof, BranchCertificate):
             ladder.spend(int(np.sum(proof.nodes)))
             work -= len(proof.by_products) * ladder.width**4
-        ladder.narrow(X)
+        ends.append(ladder.narrow(X))
     left = (horizon - len(known)) / horizon
     budget.grant(left * of_programs)
     work = max(work, left * PRODUCTS)
@@ -106,10 +107,9 @@ def sets_by_branching(
             )
         offsets = proved = owned(climbed.bounds)
         if not is_concrete(setting.loop, X0, directions):
-            derivative = _weighed if loop.curved else _replayed
-            moving = derivative(setting, X0, box, directions, climbed, ladder, horizon, k)
-            moving = jnp.where(jnp.isfinite(moving), moving, 0.0)  # what overflows has none
-            offsets = proved + (moving - jax.lax.stop_gradient(moving))
+            moved = _moving(setting, X0, box, directions, climbed, ladder, ends, horizon)
+            moved = jnp.where(jnp.isfinite(moved), moved, 0.0)  # what overflows has none
+            offsets = proved + (moved - jax.lax.stop_gradient(moved))
         gaps = climbed.bounds - climbed.attained
         opened = np.flatnonzero(gaps > setting.gap * ranges)
         opened = opened[np.argsort(-gaps[opened], kind="stable")]
@@ -131,45 +131,37 @@ def sets_by_branching(
             ranges=tuple(ladder.horizon.tightened), time=setting.start + k
         )
         yield Reached(X, proof, climbed.ended, climb=False)
-        ladder.narrow(X)
+        ends.append(ladder.narrow(X))
 
 
-def _replayed(
+def _moving(
     setting: Setting,
     X0: AbstractSet,
     box: Box,
     directions: Float[Array, "f n_x"],
     climbed: Climbed,
     ladder: Ladder,
+    known: Sequence[Float[Array | np.ndarray, "2 n_x"]],
     horizon: int,
-    k: int,
 ) -> Float[Array, " f"]:
-    """Numbers with the derivatives of what is proved, as of trajectories that attain it."""
-    held = Replay.of(ladder.horizon, *ladder.settled(climbed), horizon)
-    return replayed(setting.loop, X0, box, directions, held, k, setting.start)
+    """Numbers with the derivatives of what is proved.
 
-
-def _weighed(
-    setting: Setting,
-    X0: AbstractSet,
-    box: Box,
-    directions: Float[Array, "f n_x"],
-    climbed: Climbed,
-    ladder: Ladder,
-    horizon: int,
-    k: int,
-) -> Float[Array, " f"]:
-    """Numbers with the derivatives of what forms and the facts that decide prove.
-
-    What a smooth loop's forms leave out is part of its bounds, which no trajectory attains.
+    Where trajectories attain all of it, theirs; else those of forms and of the facts that decide:
+    forms of smooth loops leave something out.
     """
-    by_form = climbed.rungs == Rung.AFFINE_FORM
-    multipliers = np.where(by_form[:, None], 0.0, climbed.multipliers)
-    held, begun = ladder.horizon.weights(multipliers, horizon), ladder.horizon.start
-    if not begun.round:  # of a program's solution, whose reduced costs are zero but for rounding
-        there = np.where(by_form[:, None], np.nan, climbed.columns[:, : begun.count])
-        held = held._replace(attained=there)
-    return weighed_at_once(setting.loop, X0, box, directions, held, setting.start)[k - 1]
+    k, begun = len(ladder.horizon.steps), ladder.horizon
+    columns, multipliers, settled = ladder.settled(climbed)
+    if settled.all():
+        held = Replay.of(begun, columns, multipliers, horizon)
+        return replayed(setting.loop, X0, box, directions, held, k, setting.start)
+    rows = climbed.about.rows
+    bounds = sources(begun.start, rows, climbed.bounds, None)
+    for i in np.flatnonzero(settled | (climbed.rungs != Rung.AFFINE_FORM)):
+        bounds[i] = attained(begun, rows[i : i + 1], multipliers[i], columns[i])
+    ends = [*known, *[jnp.zeros((2, len(directions.T)))] * (horizon - len(known))]
+    held = held_bounds(begun, bounds, horizon)
+    parts = Moving(setting.loop, X0, box, directions, jnp.stack(ends))
+    return moving(parts, held, k, setting.start)
 
 
 def _with_products(

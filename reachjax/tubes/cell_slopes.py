@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.programs.held import held_bounds, sources
 from reachjax.programs.horizon import Horizon
-from reachjax.programs.unrolled import FactWeights, weighed_at_once
+from reachjax.programs.moving import HeldBounds, Moving, moving
 from reachjax.sets import AbstractSet, Box, Polytope
 from reachjax.sets.cells import Cell
-from reachjax.sets.polyhedra import support
 from reachjax.tubes.steps import Setting
 
 LOOSE = 1e-6
@@ -49,6 +49,7 @@ def moving_offsets(
     sides = np.where(upper > lower, upper - lower, 1.0)
     fixed = jax.lax.stop_gradient((setting.loop, X0, directions))
     loop, region, rows = jax.device_get(fixed)
+    everywhere = jnp.zeros((len(rows), 2, len(sides)))
     for facet, cell in enumerate(deciding):
         if id(cell) not in known:
             ends = (np.asarray(end) for end in (cell.box.lower, cell.box.upper))
@@ -56,8 +57,8 @@ def moving_offsets(
             around = Box(*(box.lower + share * (box.upper - box.lower) for share in shares))
             part = X0.cut(around) if isinstance(X0, Polytope) else around
             held = _held(loop, region, rows, cell, k, setting.start)
-            given = setting.loop, part, around, directions[k], held, setting.start
-            known[id(cell)] = weighed_at_once(*given)[k]
+            parts = Moving(setting.loop, part, around, directions[k], everywhere)
+            known[id(cell)] = moving(parts, held, k + 1, setting.start)
         offsets.append(known[id(cell)][facet])
     return jnp.stack(offsets)
 
@@ -69,37 +70,19 @@ def _held(
     cell: Cell,
     k: int,
     start: int,
-) -> FactWeights:
-    """Multipliers of facets of the initial set and of a cell's box that decide bounds there.
+) -> HeldBounds:
+    """What bounds over a cell rest on: forms, and what the initial set and its box are cut by.
 
     What a box is cut by decides where programs bound a form better than its norms do. The box is a
     little larger for them, so that where the initial set has a corner, its own facets decide.
     """
     loop, part, box = jax.device_get((loop, cell.part, cell.box))
     horizon = Horizon(loop, part, box, start)
-    forms = horizon.state
-    for step in range(len(directions)):
+    for _ in range(k + 1):
         horizon.advance()
-        forms = directions[k] @ horizon.state if step == k else forms
-    begun, count = horizon.start, len(directions[k])
-    weights = horizon.weights(np.zeros((count, len(horizon.facts.rows))), len(directions))
-    weights = weights._replace(
-        of_units=weights.of_units[:, :, :0]
-    )  # forms alone, no facts of units
-    if not isinstance(X0, Polytope):
-        return weights
-    room = LOOSE * np.max(box.upper - box.lower)
-    A, b = (np.asarray(each) for each in X0.cut(Box(box.lower - room, box.upper + room)).facets)
-    weights = weights._replace(of_set=np.zeros((count, len(b))))
-    first, products = np.split(forms.columns[:, : begun.count], [len(begun.spread)], axis=1)
-    by_cut = np.flatnonzero(forms.ends(begun, cut=True)[1] < forms.ends(begun)[1])
-    if not len(by_cut):
-        return weights
-    try:
-        _, Y, points = support(A, b, first[by_cut] @ begun.back)
-    except (ValueError, RuntimeError):  # too thin for programs
-        return weights
-    weights.of_set[by_cut] = Y
-    there = np.concatenate([(points - begun.center) @ begun.back.T, np.sign(products[by_cut])], 1)
-    weights.attained[by_cut] = there
-    return weights
+    forms, facets, cut = directions[k] @ horizon.state, None, isinstance(X0, Polytope)
+    if isinstance(X0, Polytope):
+        room = LOOSE * np.max(box.upper - box.lower)
+        facets = X0.cut(Box(box.lower - room, box.upper + room)).facets
+    bounds = sources(horizon.start, forms, forms.ends(horizon.start, cut=cut)[1], facets)
+    return held_bounds(horizon, bounds, len(directions), facets)

@@ -11,12 +11,13 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.linalg import block_diag
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import Budget
+from reachjax.numerics.rounding import namespace
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, joined
 from reachjax.proofs.branches import (
@@ -158,33 +159,46 @@ class Ladder:
             return
         known = iter(proof.ranges)
 
-        def multipliers(forms: AffineForms) -> np.ndarray | None:
-            given = np.asarray(next(known, np.zeros((0, 0))))
-            fits = given.shape == (len(forms.rows), len(self.horizon.facts.rows))
-            return np.where(np.isfinite(given), np.fmax(given, 0.0), 0.0) if fits else None
+        def multipliers(forms: AffineForms) -> tuple[np.ndarray, np.ndarray] | None:
+            given, facts = np.asarray(next(known, np.zeros((0, 0)))), self.horizon.facts
+            if given.shape != (len(forms.rows), len(facts.rows)):
+                return None
+            unknown = np.full((len(given), facts.columns.shape[1]), np.nan)
+            return np.where(np.isfinite(given), np.fmax(given, 0.0), 0.0), unknown
 
         self.horizon.advance(multipliers)
 
-    def narrow(self, X: AbstractSet) -> None:
-        """Meet the state with a set that surely holds it: with its facets along the axes."""
-        self.horizon.narrow(*_ends(*map(np.asarray, jax.lax.stop_gradient(X.facets))))
+    def narrow(self, X: AbstractSet) -> Float[Array | np.ndarray, "2 n"]:
+        """Meet the state with a set that surely holds it: with its facets along the axes.
 
-    def _ranges(self, budget: Budget, forms: AffineForms) -> Float[np.ndarray, "k m"] | None:
-        """Multipliers that bound the inputs of units from both sides; None if there is no time."""
+        Returns:
+            The bounds that these are, with their derivatives; infinite where there are none.
+        """
+        ends = _ends(*X.facets)
+        self.horizon.narrow(*np.asarray(jax.lax.stop_gradient(ends)))
+        return ends
+
+    def _ranges(
+        self, budget: Budget, forms: AffineForms
+    ) -> tuple[Float[np.ndarray, "k m"], Float[np.ndarray, "k n"]] | None:
+        """Multipliers that bound inputs of units from both sides, and where; None without time."""
         if budget.late or budget.work <= 0:
             return None
         facts = self.horizon.facts
         self._programs.grow(facts, self.horizon.varying)
         self._note(f"ranges of {len(forms.rows) // 2} units")
         found = np.zeros((len(forms.rows), len(facts.rows)))
-        for row, constant, multipliers in zip(forms.columns, forms.rows, found, strict=True):
+        there = np.zeros((len(forms.rows), facts.columns.shape[1]))
+        for number, row in enumerate(forms.columns):
             if budget.work <= 0 or budget.late:
                 break
             self.spend(1)
-            vertex = self._programs.largest(row[None], constant[:1], (), budget)
+            constant = np.asarray(forms.rows)[number, :1]
+            vertex = self._programs.largest(row[None], constant, (), budget)
             if vertex is not None and len(vertex.columns):
-                multipliers[:] = np.maximum(vertex.multipliers, 0.0)
-        return found
+                found[number] = np.maximum(vertex.multipliers, 0.0)
+                there[number] = vertex.columns
+        return found, there
 
     def about(self, forms: AffineForms) -> HorizonFacts:
         """What branches are about that bound these forms."""
@@ -360,10 +374,11 @@ class Ladder:
 
     def settled(
         self, climbed: Climbed
-    ) -> tuple[Float[np.ndarray, "f n"], Float[np.ndarray, "f m"]]:
-        """Columns and multipliers that derivatives of facets' bounds hold."""
+    ) -> tuple[Float[np.ndarray, "f n"], Float[np.ndarray, "f m"], Bool[np.ndarray, " f"]]:
+        """Columns and multipliers that derivatives of bounds hold, and which are attained."""
         found = climbed.multipliers.copy()
         columns, owner = climbed.columns.copy(), climbed.branches.owner
+        there = np.zeros(len(found), bool)
         phases = np.asarray(climbed.branches.phases)
         self._programs.grow(self.horizon.facts, self.horizon.varying)
         for facet in range(len(found)):
@@ -375,20 +390,21 @@ class Ladder:
             leaves, bound = phases[owner == facet], climbed.bounds[facet]
             given = settled(self.horizon, self._programs, form, at, leaves, bound, self._budget)
             if given is not None:
-                found[facet], columns[facet] = given, at
-        return columns, found
+                found[facet], columns[facet], there[facet] = given, at, True
+        return columns, found, there
 
 
-def _ends(rows: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _ends(
+    rows: Float[Array | np.ndarray, "f n"], offsets: Float[Array | np.ndarray, " f"]
+) -> Float[Array | np.ndarray, "2 n"]:
     """Bounds of the state that facets along the axes are; infinite where there is none."""
-    n = rows.shape[1]
-    lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
-    for row, offset in zip(rows, offsets, strict=True):
+    fixed, values = (np.asarray(jax.lax.stop_gradient(part)) for part in (rows, offsets))
+    which = np.full((2, fixed.shape[1]), -1)
+    for number, row in enumerate(fixed):
         (there,) = np.nonzero(row)
         if len(there) == 1 and abs(row[there[0]]) == 1.0:
-            i = there[0]
-            if row[i] > 0:
-                upper[i] = min(upper[i], offset)
-            else:
-                lower[i] = max(lower[i], -offset)
-    return lower, upper
+            place = int(row[there[0]] > 0), there[0]
+            if which[place] < 0 or values[number] < values[which[place]]:
+                which[place] = number
+    signs = np.array([[-1.0], [1.0]])
+    return namespace(offsets).where(which >= 0, signs * offsets[which], signs * np.inf)

@@ -17,6 +17,7 @@ import mpmath
 import numpy as np
 
 import reachjax as rj
+from tests.campaign.functions import by_cases, masses
 from tests.campaign.oracle import WIDE, Region, exact
 from tests.input_polytopes import exact_multipliers
 
@@ -163,6 +164,8 @@ KINDS = (
     Kind("arctan, traced", sine, "arctan", skips=True, hidden=(3, 2)),
     Kind("tanh, polytope", affine, "tanh", inputs=2, facets=3, disturbed=("box",)),
     Kind("relu, round", affine, "relu", disturbed=ROUND, initial=("ellipsoid", "box"), horizon=3),
+    Kind("by cases", by_cases, "tanh"),
+    Kind("masses", masses, "relu", hidden=(4,)),
     Kind("tanh, to balls", affine, "tanh", template=lambda n: rj.EllipsoidTemplate(), horizon=1),
 )
 

@@ -219,7 +219,7 @@ def test_words_of_other_libraries_are_unclear(monkeypatch):
     loop = rj.ClosedLoop(
         rj.AffinePlant(np.eye(2), [[1.0], [0.0]]), rj.MLP.from_layers([([[0.1, 0.2]], [0.0])])
     )
-    with pytest.raises(ValueError, match="X0 cannot be used: points") as repeated:
+    with pytest.raises(ValueError, match="points must not contain NaN") as repeated:
         rj.reach(loop, X0, 1, rj.Template.box(2))
     assert unclear(repeated.value) == "words of a ValueError from elsewhere"
 

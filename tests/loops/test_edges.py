@@ -60,3 +60,12 @@ def test_a_set_that_leaves_a_domain_by_however_little_is_refused(least):
     )
     with pytest.raises(UnboundedError, match=r"Sqrt.* has inputs in \[-"):
         rj.reach(loop, rj.Box([least], [1.0]), 1, rj.Template.box(1), FORMS)
+
+
+def test_a_smooth_controller_touches_the_edge_of_its_domain():
+    # its inputs are those of this step, however many columns there are
+    loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[0.25]]), rj.Network(jnp.sqrt, 1, 1))
+    for options in ((FORMS,), ()):
+        tube = rj.reach(loop, rj.Box([0.0], [1.0]), 1, rj.Template.box(1), *options)
+        np.testing.assert_allclose(tube.sets[1].b, [0.25, 0.0], atol=1e-3)
+        assert tube.sets[1].b[0] >= 0.25

@@ -53,7 +53,9 @@ def horizon_of(loop, X0, start, multipliers=None):
         if multipliers is None:
             horizon.advance()
         else:
-            horizon.advance(lambda forms: multipliers(horizon, forms))
+            horizon.advance(
+                lambda forms: (multipliers(horizon, forms), np.zeros((len(forms.rows), 0)))
+            )
     return horizon
 
 

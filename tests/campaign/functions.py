@@ -1,0 +1,96 @@
+"""Plants of functions that JAX computes by cases or by LAPACK, beside the same by plain formulas.
+
+The library is given JAX's functions; a search and a judgement have formulas over their numbers.
+"""
+
+import itertools
+from fractions import Fraction
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+from scipy.special import erf
+
+PLACES, HEIGHTS = (-1.0, -0.25, 0.5, 2.0), (0.5, -1.0, 0.75, 0.0)
+TENTHS = 7
+
+
+def _sum_of_tenths() -> jax.Array:
+    """A sum in 32 bits, which is no matter of states: it is what JAX makes of it at rest."""
+    return jnp.sum(jnp.full((TENTHS,), 0.1, jnp.float32)).astype(float)
+
+
+JAX = SimpleNamespace(
+    arctan2=jnp.arctan2,
+    arcsinh=jnp.arcsinh,
+    erf=jax.scipy.special.erf,
+    hypot=jnp.hypot,
+    solve=jnp.linalg.solve,
+    inverse=jnp.linalg.inv,
+    table=lambda y: jnp.interp(y, jnp.array(PLACES), jnp.array(HEIGHTS)),
+    constant=_sum_of_tenths,
+)
+
+
+def _plain(m: Any, **functions: Any) -> SimpleNamespace:
+    """What JAX has, by formulas over a namespace."""
+
+    def inverse(A: Any) -> Any:
+        (a, b), (c, d) = A
+        return m.stack([m.stack([d, -b]), m.stack([-c, a])]) / (a * d - b * c)
+
+    def table(y: Any) -> Any:
+        steps = [Fraction(b) - Fraction(a) for a, b in itertools.pairwise(PLACES)]
+        slopes = [
+            (Fraction(b) - Fraction(a)) / step
+            for a, b, step in zip(HEIGHTS, HEIGHTS[1:], steps, strict=False)
+        ]
+        turns = [b - a for a, b in zip([0, *slopes], [*slopes, 0], strict=True)]
+        ramps = [m.maximum(y - at, 0 * y) for at in PLACES]
+        scaled = [r * t.numerator / t.denominator for r, t in zip(ramps, turns, strict=True)]
+        return HEIGHTS[0] + sum(scaled)
+
+    return SimpleNamespace(
+        hypot=lambda a, b: m.sqrt(a * a + b * b),
+        inverse=inverse,
+        solve=lambda A, b: inverse(A) @ b,
+        table=table,
+        constant=lambda: float(_sum_of_tenths()),
+        **functions,
+    )
+
+
+def _of(function: Any) -> Any:
+    return np.vectorize(function, otypes=[object])
+
+
+def of(m: Any) -> SimpleNamespace:
+    """The functions that go with a namespace of numbers: JAX's, numpy's or mpmath's.
+
+    Args:
+        m: that namespace.
+    """
+    if m is jnp:
+        return JAX
+    if m is np:
+        return _plain(np, arctan2=np.arctan2, arcsinh=np.arcsinh, erf=lambda y: erf(float(y)))
+    return _plain(m, arctan2=_of(mpmath.atan2), arcsinh=_of(mpmath.asinh), erf=_of(mpmath.erf))
+
+
+def by_cases(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
+    """Tables, lengths, angles in all quadrants but one, and a constant that is rounded."""
+    f, a = of(m), p["a"]
+    angle = f.arctan2(x[1] / 4, 3 + x[0] * x[0]) + f.hypot(x[0], x[1]) * a[0]
+    return m.stack([x[0] + a[1] * f.table(x[1]) + angle, a[2] * f.erf(x[0]) + u[0] * f.constant()])
+
+
+def masses(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
+    """Two joints, whose matrix of masses depends on the second angle."""
+    f, a = of(m), p["a"]
+    bend = m.cos(x[1])
+    M = m.stack([m.stack([3 + 2 * bend, 1 + bend]), m.stack([1 + bend, 1 + 0 * bend])])
+    push = f.solve(M, m.stack([a[0] * u[0], f.arcsinh(x[0])]))
+    return x + push / 8 + a[1] / 8 * (f.inverse(M) @ x)

@@ -118,6 +118,7 @@ def test_barriers_and_literals_are_passed_on():
     )
 
 
+@pytest.mark.costly
 def test_constants_of_parameters_have_derivatives():
     def bound(d):
         plant = rj.NonlinearPlant(

@@ -201,6 +201,7 @@ def test_the_tangent_of_an_angle_is_told_from_the_angle():
         rj.reach(loop, rj.Box([-0.1, 1.0], [0.1, 2.0]), 1, rj.Template.box(2))
 
 
+@pytest.mark.costly
 def test_what_is_recorded_does_not_depend_on_numbers_of_parameters():
     def largest(p):
         f = Partial(lambda p, x: jax.nn.relu(x - 0.1) - jax.nn.relu(p * x**2), p)

@@ -193,6 +193,7 @@ def test_weights_that_overflow_prove_nothing():
     assert not np.any(np.isfinite(bounds.upper[last]) & np.isfinite(bounds.lower[last]))
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("kind", ["box", "ellipsoid"])
 def test_every_fact_of_a_window_holds_on_trajectories(kind):
     data, X = random_loop(2, hidden=(5, 4), seed=2, steps=2), initial(kind, 2, seed=2)

@@ -116,6 +116,7 @@ def test_without_rounds_the_products_of_local_bounds_are_there_all_the_same():
     assert np.all(none.proof(1).bounds <= np.asarray(local.proof(1).bounds) + 1e-6)
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize(
     "solver",
     [

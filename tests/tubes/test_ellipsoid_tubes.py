@@ -48,6 +48,7 @@ def test_no_state_of_six_is_outside_an_ellipsoid_of_a_varying_loop():
     assert all(holds(tube))
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("X0", ["box", "polytope", "ellipsoid"])
 @pytest.mark.parametrize("template", ["facets", "minimum volume", "given shape"])
 def test_any_set_starts_a_tube_of_any_template(X0, template):
@@ -277,6 +278,7 @@ def test_the_recheck_of_an_ellipsoid_far_from_the_origin_is_no_larger_than_one(c
         assert all(tube.proof(t).recheck() <= 1 for t in (1, 2))
 
 
+@pytest.mark.costly
 def test_a_failed_solver_still_gives_a_sound_ellipsoid(monkeypatch):
     import cvxpy as cp
 

@@ -51,6 +51,7 @@ def with_margin():
     return rj.ClosedLoop(plant, net, rj.Box([-1.0], [1.0]))
 
 
+@pytest.mark.costly
 def test_the_double_integrator_is_safe_for_ever(with_margin):
     X0, safe = rj.Box([2.5, -0.25], [3.0, 0.25]), rj.Box([-1.0, -1.0], [5.0, 1.0])
     tube = rj.reach(with_margin, X0, 6, rj.Template.box(2))

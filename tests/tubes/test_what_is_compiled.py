@@ -70,6 +70,7 @@ def test_nothing_large_is_compiled_for_cells_under_a_limit(operations, call):
     assert 0 < max(operations) < SMALL
 
 
+@pytest.mark.costly
 def test_nothing_large_is_compiled_for_the_largest_set(operations):
     X0, safe = boxes(0.01, 0.05)
     found = rj.largest_set(cart_pole(), X0, 2, safe=safe, rounds=2, time_limit=5.0)

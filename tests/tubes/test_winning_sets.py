@@ -61,6 +61,7 @@ def attacked(found, loop):
     return won[: len(grid)].mean() * 32.0
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("name", ["loop", "smooth"])
 def test_what_is_proved_wins_and_what_is_refuted_loses(name, request):
     loop = request.getfixturevalue(name)

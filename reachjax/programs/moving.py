@@ -105,9 +105,7 @@ def _forward(parts: Moving, held: HeldBounds, k: int, t: int) -> Any:
 def _backward(t: int, given: Any, slopes: Float[Array, " f"]) -> tuple[Moving, None, None]:
     parts, held, k = given
     parts = parts._replace(loop=with_constants(parts.loop))
-    options = (
-        {} if not is_concrete(slopes, parts) else ONCE
-    )  # within what is compiled there are none
+    options = ONCE if is_concrete(slopes, parts) else {}  # code within other code takes none
     pulled = jax.jit(_pulled, static_argnames=("t", "intervals"), compiler_options=options)
     return pulled(parts, held, k, slopes, t=t, intervals=held.intervals), None, None
 

@@ -96,6 +96,7 @@ def test_sets_of_every_kind(kind):
     check_sound(tube_of(data, X0, CUTS, window=None), data, states)
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("seed", range(3))
 def test_as_tight_as_all_products(seed):
     data = random_loop(2, hidden=(4, 3), seed=seed)
@@ -153,6 +154,7 @@ class Counting(rj.AbstractSolver):
         return rj.InteriorPoint().solve(program)
 
 
+@pytest.mark.costly
 def test_products_found_once_are_not_sought_again():
     loop, (X0, _) = closed_loop(random_loop(2, hidden=(8, 6), seed=3)), initial("box", 2, seed=3)
     window = Window.beginning(loop, X0, X0, 0, CUTS).extended(loop, X0, X0)

@@ -250,6 +250,7 @@ FORKED = rj.MLP.from_layers(
 INTEGRATOR = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("widths", [(1e-3, 0.5), (1e-6, 0.5), (0.0, 0.5), (0.0, 0.0)])
 def test_flat_and_thin_sets_and_points_have_gradients(widths):
     """Of where they are, and of the loop: not of the width, which has a kink at zero."""
@@ -340,6 +341,7 @@ class Stubborn(rj.AbstractSolver):
         return self.said[0]
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("status", OF_SOLVERS)
 def test_the_gradient_of_an_inaccurate_bound_is_the_central_difference(status):
     """Multipliers off by a fifth prove less than the optimum, whatever the solver calls them."""

@@ -464,6 +464,7 @@ def test_programs_with_too_many_multipliers_are_left_alone(monkeypatch):
     assert np.all(found.multipliers == 0)
 
 
+@pytest.mark.costly
 def test_auto_chooses_by_size_alone_and_asks_the_small_one_where_the_large_one_fails(monkeypatch):
     small, large = program(), program(hidden=(20, 10), relaxation=rj.PaperQC(repeated=False))
     auto = rj.Auto()

@@ -44,6 +44,7 @@ def test_penalties_are_those_of_the_tube(case):
         assert missing > 0
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("relaxation", [rj.LinearBounds(), rj.LocalBounds(), rj.BranchAndCut()])
 def test_penalties_of_cells_are_the_mean_of_theirs(case, relaxation):
     loop, X0 = case

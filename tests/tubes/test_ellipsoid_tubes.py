@@ -86,6 +86,7 @@ def test_the_image_of_an_affine_loop_is_exact(n):
     np.testing.assert_allclose(facets.b, ends, atol=1e-6 * abs(ends).max())
 
 
+@pytest.mark.costly
 def test_a_given_shape_is_kept_and_larger_than_the_minimum_volume():
     loop, X0 = case(2, 0)
     shape = np.array([[2.0, 0.5], [0.5, 1.0]])
@@ -129,6 +130,7 @@ def test_a_flat_image_has_an_ellipsoid_that_is_nearly_flat():
     assert tube.sets[1].volume() < 1e-2
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("shape", [None, np.eye(2)], ids=["free", "given"])
 @pytest.mark.parametrize("point", [[0.0, 0.0], [1.0, 2.0], [1e-9, 1e9]])
 def test_the_image_of_a_constant_loop_is_nearly_a_point(point, shape):
@@ -138,6 +140,7 @@ def test_the_image_of_a_constant_loop_is_nearly_a_point(point, shape):
     assert tube.sets[2].volume() <= 1e-12 * np.dot(point, point) + 1e-150  # rounding
 
 
+@pytest.mark.costly
 def test_a_nilpotent_loop_comes_to_rest():
     loop = affine([[0.0, 1.0], [0.0, 0.0]])
     tube = recursion(loop, rj.Box([1.0, 1.0], [3.0, 2.0]), 4, rj.EllipsoidTemplate())

@@ -130,6 +130,7 @@ def test_what_leaves_after_any_simulation_is_unknown():
     assert verdict.recurrence is None or verdict.recurrence.margin < 0
 
 
+@pytest.mark.costly
 def test_disturbances_that_never_end():
     loop, X0 = turning(0.9), rj.Box([0.3, -0.1], [0.4, 0.1])
     noise, push = rj.Box([-0.01, -0.01], [0.01, 0.01]), rj.Box([-0.02, -0.01], [0.02, 0.01])
@@ -161,6 +162,7 @@ def test_what_cannot_be_asked_for_is_named():
         rj.verify(tube, safe=safe, forever=True)
 
 
+@pytest.mark.costly
 def test_a_set_to_return_into_of_which_nothing_is_safe_is_none():
     """Trajectories end beside what is safe, later than anything proved: that is unknown."""
     modes = np.array([[1.0, 1.0], [1.0, 0.3]])

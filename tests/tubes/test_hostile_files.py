@@ -221,6 +221,7 @@ def judged_by_trajectories(again):
     return "true claims of another tube"
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("count", [SEVERAL, pytest.param(1000, marks=pytest.mark.long)])
 def test_files_that_were_changed_in_any_way(count, tmp_path, record_property):
     rng, found = np.random.default_rng(7), Counter()

@@ -175,6 +175,7 @@ def test_compiled_and_plain_steps_agree():
     assert float(jax.jit(size)(X0)) == pytest.approx(float(size(X0)), abs=1e-6)
 
 
+@pytest.mark.costly
 def test_specifications_are_decided_by_the_better_part():
     net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2) / 2, np.zeros((2, 1))), net)

@@ -73,6 +73,7 @@ def test_what_is_proved_wins_and_what_is_refuted_loses(name, request):
     assert len(found.cells) == 300
 
 
+@pytest.mark.costly
 def test_what_is_known_is_gone_on_with_and_no_cell_is_lost(loop):
     few = rj.winning_set(loop, DOMAIN, HORIZON, cells=60, **WANTED)
     more = rj.winning_set(loop, DOMAIN, HORIZON, cells=200, known=few, **WANTED)

@@ -85,7 +85,6 @@ class Moving(NamedTuple):
     known: Float[Array, "N 2 n_x"]
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(3,))
 def moving(parts: Moving, held: HeldBounds, k: int, t: int) -> Float[Array, " f"]:
     """Zeros with the derivatives of bounds of directions after `k` steps.
 
@@ -95,22 +94,26 @@ def moving(parts: Moving, held: HeldBounds, k: int, t: int) -> Float[Array, " f"
         k: the number of steps.
         t: the time of the initial set.
     """
+    return _zeros(parts._replace(loop=with_constants(parts.loop)), held, k, t)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _zeros(parts: Moving, held: HeldBounds, k: int, t: int) -> Float[Array, " f"]:
     return jnp.zeros(len(parts.directions))
 
 
 def _forward(parts: Moving, held: HeldBounds, k: int, t: int) -> Any:
-    return moving(parts, held, k, t), (parts, held, k)
+    return _zeros(parts, held, k, t), (parts, held, k)
 
 
 def _backward(t: int, given: Any, slopes: Float[Array, " f"]) -> tuple[Moving, None, None]:
     parts, held, k = given
-    parts = parts._replace(loop=with_constants(parts.loop))
     options = ONCE if is_concrete(slopes, parts) else {}  # code within other code takes none
     pulled = jax.jit(_pulled, static_argnames=("t", "intervals"), compiler_options=options)
     return pulled(parts, held, k, slopes, t=t, intervals=held.intervals), None, None
 
 
-moving.defvjp(_forward, _backward)
+_zeros.defvjp(_forward, _backward)
 
 
 def _pulled(

@@ -80,9 +80,10 @@ def _held(
     horizon = Horizon(loop, part, box, start)
     for _ in range(k + 1):
         horizon.advance()
-    forms, facets, cut = directions[k] @ horizon.state, None, isinstance(X0, Polytope)
+    forms, facets = directions[k] @ horizon.state, None
     if isinstance(X0, Polytope):
         room = LOOSE * np.max(box.upper - box.lower)
         facets = X0.cut(Box(box.lower - room, box.upper + room)).facets
-    bounds = sources(horizon.start, forms, forms.ends(horizon.start, cut=cut)[1], facets)
+    _, upper = forms.ends(horizon.start, cut=facets is not None)
+    bounds = sources(horizon.start, forms, upper, facets)
     return held_bounds(horizon, bounds, len(directions), facets)

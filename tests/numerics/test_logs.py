@@ -32,7 +32,7 @@ def lines(caplog):
         "reach": lambda: rj.reach(HALVES, X0, 1, rj.Template.box(1), samples=10),
         "decide": lambda: rj.decide(HALVES, X0, 1, safe=SAFE, samples=10),
         "winning_set": lambda: rj.winning_set(HALVES, X0, 1, safe=SAFE, cells=2),
-        "largest_set": lambda: rj.largest_set(HALVES, X0, 1, safe=SAFE, time_limit=0.1),
+        "largest_set": lambda: rj.largest_set(HALVES, X0, 1, safe=SAFE, rounds=1),
     }.items(),
 )
 def test_a_call_says_when_it_begins_and_ends_and_those_within_it_do_not(name, call, lines, capsys):

@@ -85,7 +85,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _fits_alone(value: Any, hint: Any) -> bool:
-    """The same where axes have lengths of their own."""
+    """Whether a value is of its annotation where the axes of each array have their own lengths."""
     with jaxtyped("context"):  # pyright: ignore[reportGeneralTypeIssues]
         return _fits(value, hint)
 

@@ -98,7 +98,7 @@ class Repeat:
         return proof, np.asarray(proof.recheck())
 
     def _directions(self, k: int) -> Any:
-        """Those of the facets of the set after `k` steps; None of ellipsoids."""
+        """The directions of the facets of the set after `k` steps; None of ellipsoids."""
         return getattr(self._tube.template.at(k), "directions", None)
 
     @cached_property

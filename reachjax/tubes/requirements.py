@@ -77,10 +77,10 @@ class Requirement:
         return self.compared_with(tube.sets[self.time])
 
     def compared_with(self, reached: AbstractSet, by_offsets: bool = False) -> Compared:
-        """The same, of a set that holds every state at this time.
+        """What states of a set surely do not exceed, and should not: of each facet, or of the set.
 
         Args:
-            reached: the set.
+            reached: a set that holds every state at this time.
             by_offsets: whether its facets' offsets will do where its support takes programs.
         """
         if self.inside:

@@ -33,6 +33,14 @@ class Truth:
     largest: float = 1e12
 
 
+def third_of_sinc(y):
+    """Of `sin y / y`; near zero from its series, as sixty digits would cancel."""
+    if abs(y) < mpf(10) ** -6:
+        return y / 5 - y**3 / 42
+    first = (mpmath.cos(y) - mpmath.sinc(y)) / y
+    return (-mpmath.cos(y) + 3 * (mpmath.sinc(y) + 2 * first / y)) / y
+
+
 TRUTHS: dict[SmoothUnit, Truth] = {
     rj.Tanh(): Truth(
         mpmath.tanh,
@@ -41,6 +49,11 @@ TRUTHS: dict[SmoothUnit, Truth] = {
     ),
     rj.Sin(): Truth(mpmath.sin, mpmath.cos, lambda y: -mpmath.cos(y)),
     rj.Cos(): Truth(mpmath.cos, lambda y: -mpmath.sin(y), mpmath.sin),
+    rj.Sinc(): Truth(
+        mpmath.sinc,
+        lambda y: (mpmath.cos(y) - mpmath.sinc(y)) / y if y else mpf(0),
+        third_of_sinc,
+    ),
     rj.Atan(): Truth(
         mpmath.atan, lambda y: 1 / (1 + y**2), lambda y: (6 * y**2 - 2) / (1 + y**2) ** 3
     ),
@@ -186,7 +199,7 @@ def test_intervals_hold_every_value_and_are_sharp(unit, compiled):
     usual = np.all(abs(intervals(unit)) < 1e5, axis=0)
     attained = [np.array(f(values, axis=0), float)[usual] for f in (np.min, np.max)]
     size = 1e-13 * np.maximum(*map(abs, attained)) + 1e-150
-    if not isinstance(unit, rj.Sin | rj.Cos | rj.XLogX):  # attained at ends or at 0
+    if not isinstance(unit, rj.Sin | rj.Cos | rj.Sinc | rj.XLogX):  # attained at ends or at 0
         assert np.all(attained[0] - lower[usual] <= size)
         assert np.all(upper[usual] - attained[1] <= size)
 

@@ -1,4 +1,4 @@
-"""Functions of JAX that are known as a whole: tables, lengths, and `x log y`.
+"""Functions of JAX that are known as a whole: tables, lengths, `x log y` and `sin y / y`.
 
 JAX computes them by cases, against overflow or to find an entry, that have jumps in them, though
 the functions have none. They are told by what they compute, never by their names alone: a call is
@@ -22,7 +22,7 @@ from reachjax.loops.primitives.entries import ONE, Product, as_value, entries, s
 from reachjax.loops.primitives.equations import shaped
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import description, equations
-from reachjax.loops.units import Log, Sqrt, XLogX
+from reachjax.loops.units import Log, Sinc, Sqrt, XLogX
 from reachjax.loops.values import Operand, UnsupportedError, Value, is_constant, is_known
 
 Rule = Callable[[Recorder, list[Operand], tuple[int, ...]], Operand]
@@ -65,6 +65,12 @@ def _times_logarithm(recorder: Recorder, operands: list[Operand], shape: Any) ->
     if not is_known(y) or not np.all(np.asarray(y) > 0):
         raise UnsupportedError("the number whose logarithm it takes must be known, and positive")
     return recorder.nearly_scaled(x, np.log(np.asarray(y)))
+
+
+def _wave(recorder: Recorder, operands: list[Operand], shape: tuple[int, ...]) -> Operand:
+    """`sinc x = sin(pi x) / (pi x)`."""
+    (x,) = operands
+    return recorder.unit(Sinc(), recorder.scaled(x, np.pi))
 
 
 def _table(recorder: Recorder, operands: list[Operand], shape: tuple[int, ...]) -> Operand:
@@ -130,6 +136,7 @@ class Known(NamedTuple):
 KNOWN = (
     Known(jnp.hypot, _length, "hypot"),
     Known(jnp.interp, _table, "_interp"),
+    Known(jnp.sinc, _wave, "sinc"),
     Known(jax.scipy.special.xlogy, _times_logarithm, None),
 )
 """The functions."""

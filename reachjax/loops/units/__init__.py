@@ -23,7 +23,7 @@ from reachjax.loops.units.projection import ProjectionSlack, projected
 from reachjax.loops.units.relu import ReLU
 from reachjax.loops.units.saturating import ISRU, Asin, Asinh, Erf
 from reachjax.loops.units.smooth import Origin, Quadratic, SmoothUnit, UnboundedError
-from reachjax.loops.units.trigonometric import Atan, Cos, Sin
+from reachjax.loops.units.trigonometric import Atan, Cos, Sin, Sinc
 from reachjax.loops.units.within import Within
 
 __all__ = [
@@ -55,6 +55,7 @@ __all__ = [
     "Reciprocal",
     "Sigmoid",
     "Sin",
+    "Sinc",
     "SmoothUnit",
     "Softplus",
     "Sqrt",

@@ -69,5 +69,6 @@ def taken() -> int:
 def _memory_is_bounded(request):
     """Tests share what they compiled until it fills a gigabyte; the cache on disk keeps it."""
     yield
-    if taken() > (MOST if request.config.getoption("every_case") else LARGEST):
+    option = request.config.getoption
+    if taken() > (MOST if option("every_case") or option("other_cases") else LARGEST):
         jax.clear_caches()

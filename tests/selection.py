@@ -1,7 +1,8 @@
 """Which cases a run takes, and from where all is drawn, as a plugin of pytest.
 
 `python -m pytest` takes one case of each claim: what somebody needs to trust an installation, in
-minutes. With a path, or `--every-case`, all cases are taken.
+minutes. With a path, or `--every-case`, all cases are taken; with `--other-cases` those that it
+leaves out.
 """
 
 from collections import defaultdict
@@ -28,6 +29,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--every-case",
         action="store_true",
         help="all cases of each claim, as with a path; else one of each about the library",
+    )
+    parser.addoption(
+        "--other-cases",
+        action="store_true",
+        help="the cases that are not taken by default, for a machine that has run those",
     )
 
 
@@ -61,12 +67,17 @@ def _everything(config: pytest.Config) -> bool:
     return not bare or config.getoption("every_case") or bool(config.getoption("keyword"))
 
 
+def _is_elsewhere(path: Path, config: pytest.Config) -> bool:
+    """Whether a file or a folder is of claims that are not about the library alone."""
+    place = f"{path.relative_to(config.rootpath).as_posix()}/"
+    return place.startswith(tuple(f"{each}/" for each in ELSEWHERE))
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave unread, in a bare run, the files of claims that are not about the library."""
-    if _everything(config):
+    if _everything(config) or config.getoption("other_cases"):
         return None
-    place = f"{collection_path.relative_to(config.rootpath).as_posix()}/"
-    return True if place.startswith(tuple(f"{each}/" for each in ELSEWHERE)) else None
+    return True if _is_elsewhere(collection_path, config) else None
 
 
 @pytest.hookimpl(trylast=True)
@@ -76,9 +87,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return
     cases = defaultdict(list)
     for item in items:
-        if not item.get_closest_marker("costly"):
+        if not (item.get_closest_marker("costly") or _is_elsewhere(item.path, config)):
             cases[item.nodeid.partition("[")[0]].append(item)
-    kept = {id(each[len(each) // 2]) for each in cases.values()}
-    left = [item for item in items if id(item) not in kept]
-    items[:] = [item for item in items if id(item) in kept]
+    first = {id(each[len(each) // 2]) for each in cases.values()}
+    others = config.getoption("other_cases")
+    left = [item for item in items if (id(item) in first) == others]
+    items[:] = [item for item in items if (id(item) in first) != others]
     config.hook.pytest_deselected(items=left)

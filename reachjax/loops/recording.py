@@ -33,7 +33,7 @@ from reachjax.loops.values import (
 from reachjax.numerics.rounding import TINY, UNIT, Ball, larger, namespace
 
 NONE = Limits.of(0.0)
-"""Those of zero."""
+"""Limits of the number zero."""
 
 
 class Recorder:
@@ -288,7 +288,7 @@ class Recorder:
         return self.layer(shape, step, _key("mapped", value.place, matrix))
 
     def joined(self, operands: Sequence[Operand]) -> Value:
-        """All of these, one behind the other, as one vector; one of them at least is a value."""
+        """Operands one behind the other, as one vector; one of them at least is a value."""
         sizes = [part.size if isinstance(part, Value) else np.size(part) for part in operands]
         total, ends = sum(sizes), np.cumsum(sizes)
         eye, found, constants = np.eye(total), None, []
@@ -323,11 +323,11 @@ class Recorder:
         return self.layer(value.shape, step, ("unit", unit, value.place))
 
     def rectified(self, value: Value) -> Value:
-        """`max(value, 0)`."""
+        """The rectifier `max(value, 0)`."""
         return value if self.is_nonnegative(value) else self.unit(ReLU(), value)
 
     def loosened(self, value: Value, by: np.ndarray) -> Value:
-        """The same, up to an error of so much.
+        """A value up to an error of so much.
 
         `0 y + c - c` is zero, which no kind of number knows: it takes the first sum to be off by
         `gamma(1) c`, of which nothing is rounding. That is above `by` for `c = 2^51 by`.

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from reachjax.loops.formats import moving, reductions
 from reachjax.loops.formats.arrays import erf, over, sigmoid, softplus
-from reachjax.loops.formats.kinds import BOOL, KINDS, REAL, cast, kind_name, power, quotient
+from reachjax.loops.formats.kinds import KINDS, REAL, cast, kind_name, power, quotient
+from reachjax.loops.formats.moving import Attributes
 
-Attributes = Mapping[str, Any]
 Compute = Callable[..., Any]
 """From attributes and operands, None for those left out, to the result, or to a list of several."""
 
@@ -297,6 +297,3 @@ OPERATORS: dict[str, Operator] = {
 
 SIZES = ("Shape", "Size")
 """Operators whose results are known, whatever their operands are."""
-
-PLAIN = frozenset(KINDS) - frozenset(REAL) - {BOOL}
-"""Kinds of numbers that must be known, for what depends on the input cannot be of them."""

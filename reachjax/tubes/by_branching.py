@@ -27,7 +27,7 @@ from reachjax.proofs.replayed import Replay, replayed
 from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box, Polytope, Template
 from reachjax.tubes.ladder import WORK, Climbed, Ladder
-from reachjax.tubes.steps import Reached, Setting, Step
+from reachjax.tubes.steps import Reached, Setting, Step, overflow
 from reachjax.tubes.successors import facets_by_products
 
 PRODUCTS = 2.5e7
@@ -101,10 +101,7 @@ def sets_by_branching(
         half = share.share(1 / 2)  # the other one is for products
         climbed = ladder.climbed(target, (horizon - k) * len(rows), half)
         if not np.isfinite(climbed.bounds).all():
-            raise ValueError(
-                f"the loop's states at t = {setting.start + k} overflow or are not numbers: check "
-                "the weights of loop.controller and the entries of loop.plant"
-            )
+            raise overflow(setting.start + k)
         offsets = proved = owned(climbed.bounds)
         if not is_concrete(setting.loop, X0, directions):
             moved = _moving(setting, X0, box, directions, climbed, ladder, ends, horizon)

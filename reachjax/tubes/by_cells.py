@@ -32,7 +32,7 @@ from reachjax.sets import AbstractSet, Box, Polytope, Template
 from reachjax.sets.cells import Cell, halves_along
 from reachjax.tubes.cell_slopes import moving_offsets
 from reachjax.tubes.ladder import LEAST_RANGE, ROUNDED
-from reachjax.tubes.steps import Reached, Setting
+from reachjax.tubes.steps import Reached, Setting, overflow
 
 MULTIPLICATIONS = 1.5e11
 """Products of all cells together, of which one core does some ten to the tenth in a second."""
@@ -244,10 +244,7 @@ class _Search:
         if leaf.lost is not None:
             raise leaf.lost.after(len(self.leaves), leaf.cell.box.widths.tolist())
         k = int(np.argmin(np.isfinite(leaf.offsets).all(axis=1))) + 1
-        raise ValueError(
-            f"the loop's states at t = {self._setting.start + k} overflow or are not numbers: "
-            "check the weights of loop.controller and the entries of loop.plant"
-        )
+        raise overflow(self._setting.start + k, halved=True)
 
     def run(self) -> None:
         """Halve cells until gaps are closed, or nothing is left."""

@@ -16,7 +16,7 @@ from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
 from reachjax.proofs.linear import LinearCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
-from reachjax.tubes.steps import Reached
+from reachjax.tubes.steps import Reached, overflow
 
 ENDS = SolverStatus.AFFINE_FORM, SolverStatus.FAILED
 """How a form ends that has a bound, and one that has none."""
@@ -95,10 +95,7 @@ def _timed(steps: Iterator[ByForms], start: int) -> Iterator[tuple[ByForms, floa
     slopes, began = [], time.perf_counter()
     for t, step in enumerate(steps, start=start + 1):
         if not np.isfinite(step.offsets).all():
-            raise ValueError(
-                f"the loop's states at t = {t} overflow or are not numbers: check the weights of "
-                "loop.controller and the entries of loop.plant"
-            )
+            raise overflow(t)
         slopes.append(step.slopes)
         seconds = time.perf_counter() - began
         yield step._replace(slopes=np.stack(slopes)), seconds

@@ -193,3 +193,22 @@ class Step:
             starts[-1, :n] = column[:n]
         simulations.climb(k, region, np.full(facets, facet), starts)
         return float(simulations.attained(k, region)[0][facet])
+
+
+def overflow(t: int, halved: bool = False) -> ValueError:
+    """The error that bounds of states at a time are no numbers, whether or not the states are.
+
+    Args:
+        t: the time.
+        halved: whether cells of the initial set were tried.
+    """
+    parts = (
+        "a smaller X0, or more time or cells for it"
+        if halved
+        else "smaller cells of X0 (reach_partitioned, or decide(..., cells=...))"
+    )
+    return ValueError(
+        f"bounds of the loop's states at t = {t} overflow or are not numbers: check the weights of "
+        "loop.controller and the entries of loop.plant; where simulated states are small, take a "
+        f"shorter step of integration in the plant's function, or {parts}"
+    )

@@ -40,7 +40,7 @@ from reachjax.sets import (
     Template,
 )
 from reachjax.solvers import AbstractGoal, Facets, GivenShape, LeastVolume, Rounds, proved
-from reachjax.tubes.steps import Step
+from reachjax.tubes.steps import Step, overflow
 
 T = TypeVar("T")
 
@@ -125,10 +125,7 @@ def _finite(step: Step, numbers: T) -> T:
     """
     fixed = jax.lax.stop_gradient(numbers)
     if is_concrete(fixed) and not all_finite(jax.device_get(fixed)):
-        raise ValueError(
-            f"the loop's states at t = {step.t + 1} overflow or are not numbers: check the "
-            "weights of loop.controller and the entries of loop.plant"
-        )
+        raise overflow(step.t + 1)
     return numbers
 
 

@@ -98,6 +98,21 @@ def test_a_set_without_bounds_is_halved_like_any_part_of_it(many):
             rj.reach(loop, X0, 1, rj.Template.box(1), rj.LinearBounds())
 
 
+@pytest.mark.parametrize(
+    ("relaxation", "parts"),
+    [(rj.LinearBounds(), "smaller cells of X0"), (rj.BranchAndCut(cells=2), "a smaller X0")],
+)
+def test_bounds_that_overflow_are_not_said_to_be_states(relaxation, parts):
+    def step(x, u):
+        for _ in range(10):
+            x = x + 0.3 * (x - x**3)
+        return 1e305 * x + u
+
+    loop = rj.ClosedLoop(rj.NonlinearPlant(step, 1, 1), rj.Network(lambda x: 0.0 * x, 1, 1))
+    with pytest.raises(ValueError, match=f"bounds of .* at t = 1 overflow .* shorter .*{parts}"):
+        rj.reach(loop, rj.Box([-1.5], [1.5]), 1, rj.Template.box(1), relaxation)
+
+
 def test_a_pole_is_named_with_its_line_its_time_its_range_and_the_smallest_cell():
     plant = rj.NonlinearPlant(lambda x, u: 1 / x + u, 1, 1)
     loop = rj.ClosedLoop(plant, rj.Network(lambda x: -0.1 * x, 1, 1))

@@ -1,6 +1,8 @@
 """The code of the how-tos runs, and the reference holds every public name."""
 
+import ast
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import matplotlib
@@ -15,6 +17,12 @@ from tests.campaign.tables import report
 DOCS = Path(__file__).parent.parent / "docs"
 QUICKSTART = DOCS / "how-to" / "quickstart.md"
 OTHERS = sorted(set((DOCS / "how-to").glob("*.md")) - {QUICKSTART})
+PACKAGE = Path(rj.__file__).parent
+POINTING = re.compile(
+    r"(As|It|None|Of|That|They|Those)\b"
+    r"|(All of (it|them|these|those)|The same|These|This)"
+    r"(?=\W*$|[.,;]| (about|as|at|by|for|from|in|of|on|over|to|up|with|without)\b)"
+)
 
 
 def blocks(path: Path) -> list[str]:
@@ -90,3 +98,22 @@ def test_the_page_of_the_campaign_takes_the_tables_of_a_report():
     again = campaign.filled(page, report([Outcome(5, {"set": "Ellipsoid, thin"})], 0))
     assert "Box, flat" not in again
     assert again.startswith(page.split(campaign.BEGIN)[0])
+
+
+def docstrings(tree: ast.Module) -> Iterator[str]:
+    """The docstrings of a module, those of its constants too."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            yield from filter(None, [ast.get_docstring(node)])
+            for before, after in zip(node.body, node.body[1:], strict=False):
+                named = isinstance(before, ast.Assign | ast.AnnAssign)
+                if named and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+                    yield str(after.value.value)
+
+
+@pytest.mark.parametrize(
+    "room", sorted({path.parent for path in PACKAGE.rglob("*.py")}), ids=lambda room: room.name
+)
+def test_a_docstring_names_its_subject(room):
+    said = [text for path in room.glob("*.py") for text in docstrings(ast.parse(path.read_text()))]
+    assert [text for text in said if POINTING.match(text) or len(text.split()) < 3] == []

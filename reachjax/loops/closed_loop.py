@@ -187,7 +187,7 @@ class ClosedLoop(Replaceable):
 
     @property
     def controller_layers(self) -> tuple[UnitLayer, ...]:
-        """Those of them that are the controller's, after those of noise."""
+        """The layers of units of the controller, which come after those of noise."""
         return _recorded(*_shaped(self.controller))
 
     @property

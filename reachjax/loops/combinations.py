@@ -28,7 +28,7 @@ NEAR = 3 * UNIT
 
 
 class InexactError(Exception):
-    """That rounding of factors would decide what is recorded."""
+    """Rounding of factors would decide what is recorded."""
 
 
 class Combination:

@@ -138,7 +138,7 @@ def _followed(equation: Any, varies: Sequence[bool]) -> tuple[list[bool], bool]:
 
 
 def _through(body: Any, varies: Sequence[bool]) -> tuple[list[bool], bool]:
-    """The same of all equations of a jaxpr, of whose arguments these vary."""
+    """Which results of a jaxpr vary, and whether plain numbers are rounded, as of an equation."""
     jaxpr = _jaxpr(body)
     known = dict.fromkeys(jaxpr.constvars, False)
     known.update(zip(jaxpr.invars, varies, strict=True))

@@ -28,7 +28,7 @@ from reachjax.numerics.rounding import Ball, gamma, namespace
 from reachjax.sets import AbstractSet, Box, Ellipsoid
 
 EDGES = 16
-"""Of the polygon around a disc."""
+"""The edges of the polygon around a disc."""
 
 CUBE = 3
 """Up to so many dimensions the planes around a ball are those whose normals have entries -1, 0, 1;
@@ -91,7 +91,7 @@ def framed(W: AbstractSet, t: int | Array = 0) -> Frame:
 
 
 def _ends(box: Box, t: int | Array) -> tuple[Numbers, Numbers]:
-    """Those of one time, numpy arrays if the box has them."""
+    """The ends of a box at one time, numpy arrays if the box has them."""
     if box.steps is None:
         return box.lower, box.upper
     within_time_axis("Box", t, box.steps)

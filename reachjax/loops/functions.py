@@ -255,7 +255,7 @@ class Compiled:
         functools.update_wrapper(self, function)
 
     def __call__(self, *given: Any, **static: Any) -> Any:
-        """The value."""
+        """The value, of arguments whose constants are computed."""
         return self._jitted(*with_constants(given), **with_constants(static))
 
     def lower(self, *given: Any, **static: Any) -> Any:

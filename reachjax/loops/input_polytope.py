@@ -37,7 +37,7 @@ class InputPolytope(Replaceable):
 
     @classmethod
     def of(cls, polytope: Polytope) -> InputPolytope:
-        """That of a polytope; a facet that is there more than once is kept once.
+        """The inputs of a polytope; a facet that is there more than once is kept once.
 
         Raises:
             TypeError: the normals are traced.
@@ -69,12 +69,12 @@ class InputPolytope(Replaceable):
 
     @property
     def steps(self) -> None:
-        """None: it is the same at all times."""
+        """No number of steps: the polytope is the same at all times."""
         return None
 
     @property
     def polytope(self) -> Polytope:
-        """The set."""
+        """The set of inputs."""
         return Polytope(np.array(self.normals), self.offsets)
 
     def _check(self) -> None:

@@ -156,7 +156,7 @@ class Interpreter(abc.ABC):
         return WAYS[name](self, params, operands)
 
     def _beside(self, equation: Any, operands: Sequence[Operand]) -> list[Operand]:
-        """The same of an equation that no result depends on, but what is printed may."""
+        """What an equation makes on which no result depends, but what is printed may."""
         plain = all(map(self.is_plain, operands))
         return (_evaluated if plain else self.apply)(equation, operands)
 

@@ -37,12 +37,12 @@ class Limits:
 
     @classmethod
     def unknown(cls, size: int) -> Limits:
-        """Those of numbers of which nothing is known."""
+        """Limits of numbers of which nothing is known."""
         return cls(np.full(size, -np.inf), np.full(size, np.inf))
 
     @classmethod
     def of(cls, plain: Any) -> Limits:
-        """Those of plain numbers, which are themselves; of traced ones nothing is known."""
+        """Limits of plain numbers, which are themselves; of traced ones nothing is known."""
         if cls._is_hidden(plain):
             return cls.unknown(1)
         flat = np.array(plain, float).reshape(-1)
@@ -123,11 +123,11 @@ class Limits:
         return type(self)(np.maximum(self.least, other.least), np.minimum(self.most, other.most))
 
     def larger(self, other: Limits) -> Limits:
-        """Those of the larger of two numbers each."""
+        """Limits of the larger of two numbers each."""
         return type(self)(np.maximum(self.least, other.least), np.maximum(self.most, other.most))
 
     def smaller(self, other: Limits) -> Limits:
-        """Those of the smaller of two numbers each."""
+        """Limits of the smaller of two numbers each."""
         return type(self)(np.minimum(self.least, other.least), np.minimum(self.most, other.most))
 
     def _outward(self, least: Any, most: Any, below: Any, above: Any) -> Limits:
@@ -138,7 +138,7 @@ class Limits:
         )
 
     def at(self, unit: AbstractUnit) -> Limits:
-        """Those of a layer of units of these inputs."""
+        """Limits of the values of a layer of units of these inputs."""
         found: Any = unit.limits if isinstance(unit, SmoothUnit) else unit.interval
         with np.errstate(all="ignore"):
             least, most = found(self.least, self.most)

@@ -254,7 +254,7 @@ class NonlinearPlant(AbstractPlant):
 
     @property
     def steps(self) -> int | None:
-        """None: the function does not know the time."""
+        """No number of steps: the function does not know the time."""
         return None
 
     def propagate(

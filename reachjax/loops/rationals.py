@@ -146,7 +146,7 @@ class Rationals:
         return Rationals([None])
 
     def floats(self) -> np.ndarray | None:
-        """The same as floats; None unless all of them are known, and are floats."""
+        """The numbers as floats; None unless all of them are known, and are floats."""
         if any(each is None for each in self.numbers):
             return None
         try:

@@ -33,7 +33,7 @@ from reachjax.loops.values import (
 from reachjax.numerics.rounding import TINY, UNIT, Ball, larger, namespace
 
 NONE = Limits.of(0.0)
-"""Those of zero."""
+"""Limits of the number zero."""
 
 
 class Recorder:
@@ -169,17 +169,21 @@ class Recorder:
         """Entries as `picked`, but of sums as sums of entries, which comparisons look into."""
         if value.terms is None:
             return self.picked(value, index)
+        key = "taken", value.place, np.ravel(index).tobytes()
+        if key in self._made:
+            return self.reshaped(self._made[key], np.shape(index))
         found: Any = None
         for term in value.terms:
             part = self.taken(term.value, index)
-            factor, divisor = (_entries_of(plain, value, index) for plain in term[1:])
+            factor, divisor = (_entries_of(plain, index) for plain in term[1:])
             part = (
                 part if is_constant(factor) and np.all(factor == 1) else self.scaled(part, factor)
             )
             one = is_constant(divisor) and np.all(divisor == 1)
             part = part if one else self.divided(part, divisor)
             found = part if found is None else self.added(found, part)
-        return self.shifted(found, _entries_of(value.offset, value, index))
+        self._made[key] = self.shifted(found, _entries_of(value.offset, index))
+        return self._made[key]
 
     def broadcast(self, value: Value, shape: Shape) -> Value:
         """The same entries in a larger array."""
@@ -284,7 +288,7 @@ class Recorder:
         return self.layer(shape, step, _key("mapped", value.place, matrix))
 
     def joined(self, operands: Sequence[Operand]) -> Value:
-        """All of these, one behind the other, as one vector; one of them at least is a value."""
+        """Operands one behind the other, as one vector; one of them at least is a value."""
         sizes = [part.size if isinstance(part, Value) else np.size(part) for part in operands]
         total, ends = sum(sizes), np.cumsum(sizes)
         eye, found, constants = np.eye(total), None, []
@@ -319,11 +323,11 @@ class Recorder:
         return self.layer(value.shape, step, ("unit", unit, value.place))
 
     def rectified(self, value: Value) -> Value:
-        """`max(value, 0)`."""
+        """The rectifier `max(value, 0)`."""
         return value if self.is_nonnegative(value) else self.unit(ReLU(), value)
 
     def loosened(self, value: Value, by: np.ndarray) -> Value:
-        """The same, up to an error of so much.
+        """A value up to an error of so much.
 
         `0 y + c - c` is zero, which no kind of number knows: it takes the first sum to be off by
         `gamma(1) c`, of which nothing is rounding. That is above `by` for `c = 2^51 by`.
@@ -428,8 +432,9 @@ def _size(y: Ball) -> Ball:
     return Ball.between(least, larger(larger(-y.lower, y.upper), least))
 
 
-def _entries_of(plain: Any, value: Value, index: np.ndarray) -> Any:
-    return _flat(plain, value)[np.asarray(index)] if np.ndim(plain) else plain
+def _entries_of(flat: Any, index: np.ndarray) -> Any:
+    """Entries of a flat array, of its kind; a number stands for all of them."""
+    return flat[np.ravel(index)].reshape(np.shape(index)) if np.ndim(flat) else flat
 
 
 def _flat(plain: Any, value: Value) -> Any:

@@ -46,7 +46,7 @@ class Runs(NamedTuple):
     states: Float[np.ndarray, "c h+1 n_x"]
 
     def some(self, which: Any) -> Runs:
-        """Those of these numbers."""
+        """The runs of these numbers."""
         return Runs(self.scenarios[which], self.states[which])
 
 
@@ -70,7 +70,7 @@ class Draws(Replaceable):
 
     @classmethod
     def of(cls, W: AbstractSet, steps: int, start: int) -> Draws:
-        """Those of a set, of numbers, from a time on."""
+        """The draws from a set, of numbers, from a time on."""
         if W.steps is None:
             scales, middles = np.asarray(W.scale()), _middle(W)
             sets = jax.tree.map(np.asarray, W)
@@ -173,7 +173,7 @@ class Scenarios(Replaceable):
 
     @classmethod
     def of(cls, loop: ClosedLoop, X0: AbstractSet, steps: int, start: int = 0) -> Scenarios:
-        """Those of a loop of numbers."""
+        """The scenarios of a loop of numbers."""
         given = (loop.disturbance, loop.noise)
         draws = (None if W is None else Draws.of(W, steps, start) for W in given)
         return cls(X0, *draws, steps=steps)

@@ -91,7 +91,7 @@ class Trace:
 
     @property
     def closed(self) -> core.ClosedJaxpr:
-        """Of parameters and vectors. Once 64-bit floats are turned on, in these."""
+        """The jaxpr over parameters and vectors. Once 64-bit floats are turned on, in these."""
         double = bool(jax.config.read("jax_enable_x64"))
         if double not in self._closed:
             for other in self._closed:

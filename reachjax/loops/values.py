@@ -15,7 +15,7 @@ Shape = tuple[int, ...]
 
 
 class UnsupportedError(Exception):
-    """That a primitive cannot be certified, and what to do.
+    """A primitive cannot be certified; the message says what to do.
 
     Attributes:
         primitive: its name, once it is known.

@@ -22,7 +22,7 @@ LEAST, RATIO = 2**30, 64
 What would hold more is written without being compressed."""
 
 KINDS = "biufc"
-"""Of numbers: arrays of anything else are not read."""
+"""Kinds of numbers: arrays of anything else are not read."""
 
 
 class UnreadableError(ValueError):

@@ -92,7 +92,7 @@ def on_host(function: Any, shapes: Any, argument: Any) -> Any:
 
 @jax.custom_jvp
 def _held(leaf: Any) -> Any:
-    """The same; as integers, in which numbers cross, it would have a derivative of zero."""
+    """A number that refuses derivatives: as integers, in which it crosses, it would have zero."""
     return leaf
 
 

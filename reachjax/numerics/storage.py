@@ -25,7 +25,7 @@ from reachjax.numerics.pytrees import unchecked
 from reachjax.numerics.structure import require_structure
 
 VERSION = 1
-"""Of the format: files of another one are refused."""
+"""The version of the format: files of another one are refused."""
 
 PACKAGE = __name__.partition(".")[0]
 SEAL = "seal"
@@ -35,7 +35,7 @@ PLAIN = bool | int | float | str | None
 
 
 class UnstorableError(Exception):
-    """That an object is none of the package's, such as a function that a user wrote."""
+    """An object is none of the package's, such as a function that a user wrote."""
 
 
 class Writer:

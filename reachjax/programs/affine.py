@@ -151,7 +151,7 @@ class AffineForms:
         return middle - reach, middle + reach
 
     def widened(self, width: int) -> AffineForms:
-        """The same over at least so many columns, the new ones empty (numpy)."""
+        """The forms over at least so many columns, the new ones empty (numpy)."""
         more = width - self.rows.shape[1] + 2
         if more <= 0:
             return self

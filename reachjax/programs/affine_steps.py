@@ -225,7 +225,7 @@ def _require_bounds(forms: UnitForms, t: int) -> None:
 def _merged(
     forms: AffineForms, width: int, place: Place, scratch: int
 ) -> tuple[AffineForms, tuple[Any, Any]]:
-    """The same with all columns from some on as one for each number."""
+    """The forms with all columns from some on as one for each number."""
     xp, first = namespace(forms.rows), 2 + (width if place is None else scratch)
     last = forms.rows[:, first:]
     gap = abs(last).sum(axis=1) * (1 + gamma(last.shape[1]))
@@ -315,7 +315,7 @@ def _cut(unit: AbstractUnit, y: AffineForms, start: InitialColumns) -> Ends:
 
 
 def _spilled(forms: AffineForms, place: Place) -> AffineForms:
-    """The same with radii as columns of their own; on the host, those that are not negligible.
+    """The forms with radii as columns of their own; on the host, those that are not negligible.
 
     Such a column is what a number is off by: what it is beside must be the same everywhere.
     """

@@ -35,7 +35,7 @@ class Kind:
 
     @classmethod
     def of(cls, facts: Facts) -> Kind:
-        """That of these facts, whose rows are `(k, n)`."""
+        """The kind of these facts, whose rows are `(k, n)`."""
         blocks = tuple((block.name, block.mark) for block in facts.blocks)
         return cls(len(facts.blocks[0].rows.mid), blocks, facts.zero, facts.products)
 

@@ -63,7 +63,7 @@ class InitialColumns(Replaceable):
 
     @classmethod
     def of(cls, X: AbstractSet, box: Box, curved: bool = False) -> InitialColumns:
-        """Those of a set, numpy arrays if the set has numpy arrays.
+        """The columns of a set, numpy arrays if the set has numpy arrays.
 
         Args:
             X: the set. A polytope is itself the cut on the host, and is held by its box in JAX.

@@ -184,7 +184,7 @@ class LinearBounds(AbstractRelaxation):
     by_forms: ClassVar[bool] = True
 
     def groups(self, facts: FactLayout) -> Groups:
-        """None."""
+        """No products of facts."""
         return [], 0
 
 
@@ -213,7 +213,7 @@ class AllProducts(AbstractRelaxation):
 
 @dataclasses.dataclass(frozen=True)
 class CuttingPlanes(AbstractRelaxation):
-    """Of all products of two facts those that matter, found by the dual.
+    """The products of two facts that matter, found by the dual.
 
     Begins with those of `LocalBounds(repeated=False)`. The moment matrix of each facet's program
     shows which other products it violates; the worst are added, and the program is solved again.
@@ -248,7 +248,7 @@ class CuttingPlanes(AbstractRelaxation):
 
     @property
     def cuts(self) -> CuttingPlanes:
-        """These."""
+        """The cutting planes themselves."""
         return self
 
     def groups(self, facts: FactLayout) -> Groups:

@@ -95,7 +95,7 @@ def unrolled_at_once(
     directions: Float[Array, "N m n_x"],
     t: int = 0,
 ) -> ByForms:
-    """The same for all steps at once, compiled and differentiable, without a call to the host.
+    """Bounds for all steps at once, compiled and differentiable, without a call to the host.
 
     A polytope counts as the box around it.
     """

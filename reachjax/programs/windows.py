@@ -168,7 +168,7 @@ class Window(Replaceable):
         return places, self.taken + int(stays.sum())
 
     def _padded(self, needed: int) -> Window:
-        """The same with at least so many columns; new ones are empty."""
+        """The window with at least so many columns; new ones are empty."""
         if self.drop_columns:
             needed = -(-needed // COLUMNS) * COLUMNS
         more = needed - len(self.transform)

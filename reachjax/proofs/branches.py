@@ -128,7 +128,7 @@ class BranchCertificate(AbstractProof):
 
     @property
     def multipliers(self) -> Float[Array | np.ndarray, "l m"]:
-        """Of the facts of the horizon, one row for each leaf."""
+        """The multipliers of the facts of the horizon, one row for each leaf."""
         return self.branches.multipliers
 
     def recheck(

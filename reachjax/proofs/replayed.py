@@ -61,7 +61,7 @@ class Replay(Replaceable):
         multipliers: Float[np.ndarray, "f m"],
         steps: int,
     ) -> Replay:
-        """That of one leaf for each facet.
+        """The replay of one leaf for each facet.
 
         Args:
             horizon: whose facts they are, over some of the steps.

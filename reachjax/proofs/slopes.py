@@ -92,7 +92,7 @@ def held_level(program: Program, multipliers: Float[np.ndarray, " K"], form: Nor
 
 
 def _moments(program: Program, multipliers: np.ndarray, goal: Ball) -> Float[np.ndarray, "n n"]:
-    """Those of a maximiser; of two, with their mean, where the ball alone bounds a direction."""
+    """Moments of a maximiser; of two, with their mean, where the ball alone bounds a direction."""
     mid, _ = matrix(program, multipliers, goal)
     shift = best_offset(mid)[1]
     values, vectors = np.linalg.eigh(mid[:-1, :-1])

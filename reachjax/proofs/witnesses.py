@@ -24,7 +24,7 @@ BLOCK = 1024
 """Points are drawn and evaluated in multiples of so many, for which code is compiled once."""
 
 PULLS = PULL, 1 - 1e-9, 1 - 1e-6
-"""The same of points that solvers of cones found, by turns until one is inside."""
+"""How far points are pulled that solvers of cones found, by turns until one is inside."""
 
 
 def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, "c n_x"]:
@@ -83,7 +83,7 @@ class Simulated(NamedTuple):
 
     @classmethod
     def nothing(cls, scenario: Float[np.ndarray, " s"], facets: int) -> Simulated:
-        """Of so many directions, with some scenario."""
+        """Nothing known of so many directions, with some scenario."""
         none = np.full(facets, np.inf)
         return cls(none, -none, np.tile(scenario, (facets, 1)))
 
@@ -116,7 +116,7 @@ class Simulations:
 
     @property
     def runs(self) -> Runs:
-        """All of them."""
+        """All trajectories so far."""
         return Runs(self._scenarios, self._trajectories)
 
     def simulated(self, scenarios: Float[np.ndarray, "c s"]) -> Float[np.ndarray, "c h+1 n_x"]:

@@ -13,19 +13,19 @@ from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polytope import Polytope
 
 CORNERS = 48
-"""Of polygons: those within a circle are 0.2 % smaller."""
+"""Corners of polygons: those within a circle are 0.2 % smaller."""
 
 ENTRIES = {3: 2, 4: 1, 5: 1}
 """Normals in more dimensions are all vectors of whole numbers up to this one."""
 
 SLACK = 1e-6
-"""Of the size: what a polytope is smaller or larger by, on account of rounding."""
+"""The part of its size that a polytope is smaller or larger by, on account of rounding."""
 
 THIN = 1e10
 """Beyond this ratio of the squares of its axes, rounding of an ellipsoid is no longer covered."""
 
 FAR = 1e8
-"""The same of its distance from zero, in half-axes."""
+"""Beyond this distance from zero, in half-axes, rounding is no longer covered either."""
 
 
 @lru_cache

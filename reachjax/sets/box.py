@@ -89,7 +89,7 @@ class Box(PolyhedralSet):
 
     @property
     def center(self) -> Float[Array, " n"]:
-        """The midpoint."""
+        """The midpoint of the box."""
         return (self.lower + self.upper) / 2
 
     @property

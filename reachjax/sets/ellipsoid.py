@@ -154,7 +154,7 @@ class Ellipsoid(AbstractSet):
 
     @property
     def limits(self) -> Float[Array, " 1"]:
-        """1."""
+        """The limit 1."""
         return jnp.ones(1)
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:

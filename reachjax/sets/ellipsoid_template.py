@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -44,6 +46,11 @@ class EllipsoidTemplate(AbstractTemplate):
     def dimension(self) -> int | None:
         """The number of coordinates; None if any shape will do."""
         return None if self.shape is None else len(self.shape)
+
+    @property
+    def parts(self) -> tuple[None, Self]:
+        """No facets, and the template itself."""
+        return None, self
 
     @property
     def summary(self) -> str:

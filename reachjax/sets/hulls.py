@@ -67,7 +67,7 @@ def _unit_vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     if radius > FLAT:
         corners = HalfspaceIntersection(np.hstack([A, -b[:, None]]), center).intersections
         return corners[ConvexHull(corners).vertices]
-    basis = _affine_hull(A, b, center, FLAT)
+    basis = _affine_hull(A, b, FLAT)
     if basis.shape[1] == 0:
         return center[None]
     reduced = A @ basis
@@ -77,7 +77,7 @@ def _unit_vertices(A: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _extreme_points(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, np.ndarray]:
-    """As `_corners`, but points that linear programs find where corners cannot be told apart."""
+    """The points `_corners` finds, or those of linear programs where these cannot be told apart."""
     try:
         return _corners(A, b)
     except RuntimeError:
@@ -88,7 +88,7 @@ def _extreme_points(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, np.ndarray]
         return region, np.stack([maximiser(A, b, direction)[1] for direction in directions])
 
 
-def _affine_hull(A: np.ndarray, b: np.ndarray, point: np.ndarray, tolerance: float) -> np.ndarray:
+def _affine_hull(A: np.ndarray, b: np.ndarray, tolerance: float) -> np.ndarray:
     """An orthonormal basis `(n, k)` of the directions in which a flat polytope extends."""
     norms = lengths(A)
     extent = [-a @ maximiser(A, b, -a)[1] for a in A / norms[:, None]]

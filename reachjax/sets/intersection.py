@@ -158,7 +158,7 @@ class Intersection(AbstractSet):
         return middle + jnp.fmax(reach, 1.0)[:, None] * along
 
     def corners(self) -> Float[Array, "v n"]:
-        """Those of the polytope that are in the ellipsoid."""
+        """The corners of the polytope that are in the ellipsoid."""
         corners = self.polytope.corners()
         return corners[self.ellipsoid.contains(corners)]
 

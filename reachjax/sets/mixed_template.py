@@ -50,6 +50,11 @@ class MixedTemplate(AbstractTemplate):
         return self.facets.dimension
 
     @property
+    def parts(self) -> tuple[Template, EllipsoidTemplate]:
+        """The templates of facets and of ellipsoids."""
+        return self.facets, self.ellipsoid
+
+    @property
     def steps(self) -> int | None:
         """The number of steps that the facets are given for."""
         return self.facets.steps

@@ -53,7 +53,7 @@ class PolyhedralSet(AbstractSet):
 
     @property
     def limits(self) -> Float[Array, " m"]:
-        """`b`."""
+        """The offsets `b`."""
         return self.facets[1]
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:

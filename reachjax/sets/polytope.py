@@ -95,7 +95,7 @@ class Polytope(PolyhedralSet):
 
     @property
     def facets(self) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-        """`(A, b)`."""
+        """The pair `(A, b)`."""
         return self.A, self.b
 
     def _host(self) -> tuple[np.ndarray, np.ndarray]:

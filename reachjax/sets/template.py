@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,9 @@ from reachjax.sets import fit
 from reachjax.sets.base import AbstractSet
 from reachjax.sets.polyhedral_set import MOST_DIMENSIONS, PolyhedralSet
 from reachjax.sets.polytope import Polytope
+
+if TYPE_CHECKING:
+    from reachjax.sets.ellipsoid_template import EllipsoidTemplate
 
 
 class Simulated(Protocol):
@@ -52,6 +55,11 @@ class AbstractTemplate(Replaceable, abc.ABC):
     @abc.abstractmethod
     def summary(self) -> str:
         """A few words for what the sets look like."""
+
+    @property
+    @abc.abstractmethod
+    def parts(self) -> tuple[Template | None, EllipsoidTemplate | None]:
+        """The templates of the two parts that the sets have; None of what they have not."""
 
     @property
     def steps(self) -> int | None:
@@ -94,6 +102,11 @@ class Template(AbstractTemplate):
     def dimension(self) -> int:
         """The number of coordinates."""
         return self.directions.shape[-1]
+
+    @property
+    def parts(self) -> tuple[Self, None]:
+        """The template itself, and no ellipsoid."""
+        return self, None
 
     @property
     def summary(self) -> str:

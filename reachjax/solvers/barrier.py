@@ -59,7 +59,7 @@ class EllipsoidBarrier:
 
     @property
     def price(self) -> float:
-        """Of `t`, in units of the trace that the moments may have."""
+        """The price of `t`, in units of the trace that the moments may have."""
         return self.cost[self.count] / self.unit
 
     @price.setter
@@ -71,7 +71,7 @@ class EllipsoidBarrier:
         return self.terms.weighted(y) + y[self.count] * self.states
 
     def schur(self, y: np.ndarray) -> np.ndarray:
-        """`Z`."""
+        """The Schur complement `Z`."""
         return self.constant + self.weighted(y)
 
     def inverse(self, y: np.ndarray) -> np.ndarray:
@@ -86,7 +86,7 @@ class EllipsoidBarrier:
         return multipliers
 
     def value(self, y: np.ndarray, weight: float) -> float:
-        """Infinite outside."""
+        """The barrier's value, infinite outside."""
         if np.any(y[self.signed] <= 0):
             return np.inf
         value = self.cost @ y - weight * np.sum(np.log(y[self.signed]))
@@ -236,7 +236,7 @@ def _free_forms(q: int) -> tuple[NormalForm, np.ndarray]:
 
 
 def _sizes_of(given: NormalForm) -> tuple[NormalForm, np.ndarray]:
-    """The same for a given form, of one variable."""
+    """The sizes for a given form, of one variable."""
     largest = np.linalg.norm(given.A, 2)
     unit = max(largest, np.linalg.norm(given.b))
     form = NormalForm(given.A[None] / unit, given.b[None] / unit)

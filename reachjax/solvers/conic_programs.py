@@ -31,12 +31,12 @@ class ConicPrograms(AbstractPrograms):
 
     def __init__(self, states: int):
         self._clarabel: Any = importlib.import_module("clarabel")  # only where it is needed
-        self._states, self._settings = states, self._clarabel.DefaultSettings()
+        super().__init__(states)
+        self._settings = self._clarabel.DefaultSettings()
         self._settings.verbose = False
         self._settings.presolve_enable = False
         self._facts, self._constants = np.zeros((0, states)), np.zeros(0)
         self._size = np.zeros(0)
-        self._columns, self._width = np.arange(states), states
 
     def grow(self, facts: AffineForms, columns: Int[np.ndarray, " v"]) -> None:
         """Add the columns and the facts that are new."""
@@ -119,9 +119,3 @@ class ConicPrograms(AbstractPrograms):
 
     def forget(self) -> None:
         """Nothing is kept anyhow."""
-
-    def _placed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
-        """Values of the columns that matter among those of all."""
-        found = np.zeros(self._width)
-        found[self._columns] = values
-        return found

@@ -19,7 +19,7 @@ VIOLATED = 1e-6
 """Products more negative than this are, rows of facts and the basis being of unit size."""
 
 NONE = np.zeros((0, 2), dtype=int)
-"""No pairs."""
+"""No pairs of facts."""
 
 
 class CutPool:
@@ -62,7 +62,7 @@ class CutPool:
         return left[left >= 0], right[left >= 0]
 
     def addable(self, pairs: Int[np.ndarray, "p 2"]) -> Int[np.ndarray, "q 2"]:
-        """Those of these pairs that may be added."""
+        """The pairs among these that may be added."""
         places = np.sort(self.place[pairs], axis=1)
         return pairs[(places[:, 0] >= 0) & self.open[tuple(places.T)]]
 
@@ -73,7 +73,7 @@ class CutPool:
     def _besides(
         self, pairs: Int[np.ndarray, "p 2"], entries: Bool[np.ndarray, "m m"]
     ) -> Bool[np.ndarray, "m m"]:
-        """Those of these entries that are none of the pairs."""
+        """The entries among these that are none of the pairs."""
         besides = entries.copy()
         besides[self._entries(pairs)] = False
         return besides

@@ -55,5 +55,5 @@ class CvxpySolver(AbstractConicSolver):
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
 
     def settings(self) -> tuple[str, dict[str, Any]]:
-        """As given; the names cvxpy has are in capitals."""
+        """The settings as given; the names cvxpy has are in capitals."""
         return self.name.upper(), dict(self.options)

@@ -86,13 +86,13 @@ class _AbstractEllipsoid(AbstractGoal):
         return products, self.judged(program.replace(products=products), solver)
 
     def region(self, value: Sized) -> Ellipsoid:
-        """The ellipsoid."""
+        """The ellipsoid that is proved."""
         return Ellipsoid.enclosing(*_with_level_held(value))
 
     def certificate(
         self, program: Program, value: Sized, proposal: Enclosure
     ) -> EllipsoidCertificate:
-        """Its proof."""
+        """The proof of the ellipsoid."""
         form, level = _with_level_held(value)
         return EllipsoidCertificate.from_enclosure(program, form, level, proposal)
 
@@ -110,7 +110,7 @@ class LeastVolume(_AbstractEllipsoid):
     """The ellipsoid of least volume: problem (sdp::ellips)."""
 
     def unknown(self, program: Program) -> Judged:
-        """NaN."""
+        """No size: NaN."""
         blank, q = Enclosure.blank(program), len(program.objective.mid)
         return _judged(Sized(blank.form, np.array(np.nan)), np.array(False), blank, _identity(q))
 
@@ -141,7 +141,7 @@ class LeastVolume(_AbstractEllipsoid):
         return min(attempts, key=lambda judged: log_volume(judged.value.form, judged.value.level))
 
     def slopes(self, program: Program, held: _Held, cotangent: Sized) -> tuple[Slopes, Self]:
-        """That of the point on the central path, or of the level that is proved."""
+        """Slopes of the point on the central path, or of the level that is proved."""
         slopes = None
         if held.optimal:
             slopes = _along_path(program, held, cotangent.form)
@@ -166,7 +166,7 @@ class GivenShape(_AbstractEllipsoid):
         return self.form
 
     def unknown(self, program: Program) -> Judged:
-        """NaN."""
+        """No size: NaN."""
         nan = np.array(np.nan)
         blank, frame = Enclosure.blank(program), _identity(len(program.objective.mid))
         return _judged(Sized(self.form, nan, nan), np.array(False), blank, frame)
@@ -186,7 +186,7 @@ class GivenShape(_AbstractEllipsoid):
         return _judged(Sized(given, level, factor), optimal, enclosure, frame)
 
     def slopes(self, program: Program, held: _Held, cotangent: Sized) -> tuple[Slopes, Self]:
-        """That of the factor, an optimal value; or of the level, the factor being held."""
+        """Slopes of the factor, an optimal value; or of the level, the factor being held."""
         n, factor = len(program.transform), held.value.factor
         scaled = NormalForm(factor * self.form.A, factor * self.form.b)
         if held.optimal:
@@ -235,7 +235,7 @@ def _along_path(program: Program, held: _Held, cotangent: NormalForm) -> Slopes:
 
 
 def _of_level(program: Program, held: _Held, cotangent: Sized) -> Slopes:
-    """That of the level, the ellipsoid moving with the centre and widths of the successors' box.
+    """Slopes of the level, the ellipsoid moving with the centre and widths of the successors' box.
 
     Column `j` of `A` stays the same multiple of one over the width in `j`, and `A x + b` at the
     centre of the box is held.

@@ -40,11 +40,11 @@ class Facets(AbstractGoal):
     directions: Float[Array, "f n_x"]
 
     def rows(self, states: int) -> Float[Array, "f n_x"]:
-        """The directions."""
+        """The directions of the facets."""
         return self.directions
 
     def unknown(self, program: Program) -> Judged:
-        """NaN."""
+        """No offsets: NaN."""
         blank = Solution.blank_for(program)
         unknown = np.full(len(blank.offsets), np.nan)
         held = Held(np.full(blank.multipliers.shape, np.nan), np.full(blank.moments.shape, np.nan))
@@ -75,7 +75,7 @@ class Facets(AbstractGoal):
     def slopes(
         self, program: Program, held: Held, cotangent: Float[np.ndarray, " f"]
     ) -> tuple[Slopes, Self]:
-        """Those of the Lagrangian; the rows carry what the directions do."""
+        """Slopes of the Lagrangian; the rows carry what the directions do."""
         slopes = lagrangian_slopes(program, held.multipliers, held.moments, cotangent)
         return slopes, self.replace(directions=np.zeros_like(self.directions))
 
@@ -119,7 +119,7 @@ class _Round(NamedTuple):
 
     @property
     def in_use(self) -> Int[np.ndarray, "q 2"]:
-        """The others."""
+        """The products added that have a multiplier."""
         return self.pairs[~self.idle]
 
 

@@ -71,7 +71,7 @@ class AbstractGoal(Replaceable, abc.ABC):
     def in_rounds(
         self, program: Program, solver: AbstractSolver, rounds: Rounds
     ) -> tuple[Products, Judged]:
-        """The same with products added round by round, and these."""
+        """The products that were added round by round, and what is proved with them."""
 
     @abc.abstractmethod
     def slopes(self, program: Program, held: Any, cotangent: Any) -> tuple[Slopes, Self]:
@@ -89,7 +89,7 @@ class AbstractGoal(Replaceable, abc.ABC):
 
     @abc.abstractmethod
     def certificate(self, program: Program, value: Any, proposal: Any) -> AbstractCertificate:
-        """Its proof."""
+        """The proof of the set."""
 
 
 def proved(

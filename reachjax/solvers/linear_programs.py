@@ -22,7 +22,7 @@ from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.programs.affine import AffineForms
 
 TOLERANCE = 1e-9
-"""Of feasibility, primal and dual, in rows of unit size."""
+"""The tolerance of feasibility, primal and dual, in rows of unit size."""
 
 DANTZIG, OFF = 0, 0
 """Few pivots lead from a node to its branches: weights of edges and scales take longer."""
@@ -55,7 +55,15 @@ class Vertex(NamedTuple):
 
 
 class AbstractPrograms(abc.ABC):
-    """Programs over the columns and facts of a horizon, which grow."""
+    """Programs over the columns and facts of a horizon, which grow.
+
+    Args:
+        states: how many columns are of the initial state.
+    """
+
+    def __init__(self, states: int):
+        self._states = states
+        self._columns, self._width = np.arange(states), states
 
     @abc.abstractmethod
     def grow(self, facts: AffineForms, columns: Int[np.ndarray, " v"]) -> None:
@@ -92,6 +100,12 @@ class AbstractPrograms(abc.ABC):
     def forget(self) -> None:
         """Let what is solved next depend on nothing that was solved before."""
 
+    def _placed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
+        """Values of the columns that matter among those of all."""
+        found = np.zeros(self._width)
+        found[self._columns] = values
+        return found
+
 
 class LinearPrograms(AbstractPrograms):
     """Linear programs as one model.
@@ -102,6 +116,7 @@ class LinearPrograms(AbstractPrograms):
     """
 
     def __init__(self, states: int, bounded: bool):
+        super().__init__(states)
         self._model: Any = highspy.Highs()
         for name, value in {
             "output_flag": False,
@@ -116,8 +131,6 @@ class LinearPrograms(AbstractPrograms):
         self._model.changeObjectiveSense(highspy.ObjSense.kMaximize)
         self._model.addVar(0.0, 0.0)  # the least of several rows, where that is maximised
         self._add_columns(states, 1.0 if bounded else highspy.kHighsInf)
-        self._states = states
-        self._columns, self._width = np.arange(states), states
         self._held: set[int] = set()
         self._rows = np.zeros(0, dtype=int)  # numbers of the facts among the model's rows
         self._size, self._constant = np.zeros(0), np.zeros(0)
@@ -224,12 +237,6 @@ class LinearPrograms(AbstractPrograms):
             status = self._model.getModelStatus()
             if status != OUT_OF_TIME or budget.late:
                 return status
-
-    def _placed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
-        """Values of the columns that matter among those of all."""
-        found = np.zeros(self._width)
-        found[self._columns] = values
-        return found
 
     def _hold(self, zero: set[int]) -> None:
         """Hold these facts at zero, and no others."""

@@ -87,7 +87,7 @@ class PenaltySchedule(Replaceable):
         return jnp.where(computed, self.weight * grown, 0.0)
 
     def relaxation(self, step: int) -> AbstractRelaxation | None:
-        """That of the penalty at a training step, which is no traced number; None if it has none.
+        """The penalty's relaxation at a training step, which is no traced number; None without one.
 
         Raises:
             TypeError, ValueError: the step is no whole number, or negative.

@@ -106,7 +106,7 @@ def _timed(steps: Iterator[ByForms], start: int) -> Iterator[tuple[ByForms, floa
 
 
 def _at_once(found: ByForms) -> Iterator[tuple[ByForms, float]]:
-    """The same of traced numbers, of which nobody knows how long they take."""
+    """Each step of traced numbers, of which nobody knows how long they take."""
     slopes, corners = jax.lax.stop_gradient((found.slopes, found.corners))
     offsets = jnp.where(jnp.isfinite(found.offsets), found.offsets, jnp.nan)
     for k in range(len(offsets)):

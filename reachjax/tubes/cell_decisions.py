@@ -196,7 +196,7 @@ class _Run:
         jobs.submit((cell, task), outcome_of, task, part, self._budget, known)
 
     def _sifted(self, cells: Sequence[Cell]) -> list[tuple[Cell, Margins | None]]:
-        """Those of some cells that forms do not prove, with the margins that these say.
+        """The cells among some that forms do not prove, with the margins that these say.
 
         All of them, of which nothing is known, while it pays better to bound them one by one.
         """

@@ -88,7 +88,7 @@ class CellJobs(Generic[Kept]):
         self._sent = True
 
     def finished(self) -> Iterator[tuple[Kept, Any]]:
-        """Those that are done, with their results, once there are any.
+        """The jobs that are done, with their results, once there are any.
 
         A job stays among those that run until there is a result.
         """
@@ -132,7 +132,7 @@ class CellJobs(Generic[Kept]):
         )
 
     def cancelled(self) -> list[Kept]:
-        """What is left, none of which runs any more than it must."""
+        """The cells of jobs that are left, none of which runs any more than it must."""
         left = [job.kept for job in self._running.values()]
         for future in self._running:
             future.cancel()

@@ -66,7 +66,7 @@ class Unbounded(NamedTuple):
 
     @classmethod
     def of(cls, error: UnboundedError) -> Unbounded:
-        """That of an error."""
+        """The record of an error."""
         return cls((*error.given, error.line))
 
     @property
@@ -92,7 +92,7 @@ class Outcome(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """The smallest."""
+        """The smallest known margin."""
         return smallest(self.margins)
 
 

@@ -17,7 +17,7 @@ SAMPLES = 300
 """Trajectories in a picture that nobody asked for."""
 
 WIDTH, HEIGHT = 4.2, 3.0
-"""Of such a picture, in inches."""
+"""The sides of such a picture, in inches."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

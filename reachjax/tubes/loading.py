@@ -79,9 +79,8 @@ def load(
     try:
         tube = _sealed(kept)
     except Exception as error:  # whoever wrote it may have written anything
-        raise UnreadableError(
-            f"{path} must hold a tube, but something else arrived: {error}"
-        ) from (error)
+        message = f"{path} must hold a tube, but something else arrived: {error}"
+        raise UnreadableError(message) from error
     if loop is not None and not kept.is_of(loop):
         raise ValueError(
             f"loop must be that of the tube in {path}, with the same equations and numbers, but "

@@ -70,7 +70,7 @@ class Options(NamedTuple):
 
     @classmethod
     def named(cls, options: dict[str, Any]) -> Options:
-        """Those that are given, the others being as `reach` has them.
+        """The options that are given, the others being as `reach` has them.
 
         Raises:
             TypeError: there is no such option.
@@ -101,7 +101,7 @@ class Task(NamedTuple):
 
     @property
     def fixed(self) -> Task:
-        """The same without derivatives."""
+        """The task without derivatives."""
         loop, X0, template = jax.lax.stop_gradient((self.loop, self.X0, self.template))
         return self._replace(loop=loop, X0=X0, template=template)
 

@@ -17,15 +17,7 @@ import numpy as np
 
 from reachjax.loops.scenarios import Scenarios
 from reachjax.proofs.certificates import AbstractProof
-from reachjax.sets import (
-    AbstractSet,
-    Ellipsoid,
-    EllipsoidTemplate,
-    Intersection,
-    MixedTemplate,
-    Polytope,
-    Template,
-)
+from reachjax.sets import AbstractSet, Ellipsoid, Intersection, Polytope
 from reachjax.sets.covers import covers
 from reachjax.tubes.disagreements import DisagreementError
 from reachjax.tubes.partitions import PartitionedTube
@@ -34,7 +26,7 @@ from reachjax.tubes.repeats import Repeat
 from reachjax.tubes.seals import seal_of
 
 ROUNDING = 1e-9
-"""Of a number's size: what a recheck may differ by on another machine."""
+"""The part of a number's size by which a recheck may differ on another machine."""
 
 
 class Recheck:
@@ -156,17 +148,12 @@ class Recheck:
 
 def _require_template(tube: ReachTube, k: int, region: AbstractSet) -> None:
     """Raise an error unless a set looks as the template says."""
-    template = tube.template.at(k)
-    mixed = isinstance(template, MixedTemplate)
-    facets = template.facets if mixed else template
-    ellipsoid = template.ellipsoid if mixed else template
+    facets, ellipsoid = tube.template.at(k).parts
     flat, ball = region.parts
-    fits = (flat is not None) == isinstance(facets, Template)
-    fits &= (ball is not None) == isinstance(ellipsoid, EllipsoidTemplate)
-    if fits and isinstance(facets, Template):
+    fits = (flat is None, ball is None) == (facets is None, ellipsoid is None)
+    if fits and facets is not None:
         fits = np.array_equal(region.facets[0], facets.directions)
-    if fits and isinstance(ellipsoid, EllipsoidTemplate) and ellipsoid.shape is not None:
-        assert ball is not None
+    if fits and ball is not None and ellipsoid is not None and ellipsoid.shape is not None:
         shapes = [np.asarray(each) / np.trace(each) for each in (ball.shape, ellipsoid.shape)]
         fits = np.allclose(*shapes, rtol=0, atol=ROUNDING)
     if not fits:

@@ -19,7 +19,13 @@ from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import ENDLESS
 from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Origin, Program
-from reachjax.programs.relaxations import AllProducts, LinearBounds, LocalBounds, Products
+from reachjax.programs.relaxations import (
+    AbstractRelaxation,
+    AllProducts,
+    LinearBounds,
+    LocalBounds,
+    Products,
+)
 from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.programs.windows import Window
 from reachjax.proofs.branches import BranchCertificate
@@ -90,7 +96,7 @@ class Repeat:
         if isinstance(proof, BranchCertificate):
             proof = self._branches(k, proof)
         elif isinstance(proof, AbstractCertificate):
-            goals = goals_of(tube.template.at(k), self._step(k - 1))
+            goals = goals_of(tube.template.at(k), self._step(k - 1, LocalBounds()))
             rows = [goal.rows(tube.loop.states) for goal in goals]
             proof = proof.replace(program=self._program(k, jnp.concatenate(rows), proof.program))
         else:
@@ -145,9 +151,8 @@ class Repeat:
             products = products.replace(program=program)
         return proof.replace(about=about, products=products, least=False)
 
-    def _step(self, k: int, linear: bool = False) -> Step:
+    def _step(self, k: int, relaxation: AbstractRelaxation) -> Step:
         """The step after `k` others, for the bounds of its set and of units over it."""
-        relaxation = AllProducts() if linear else LocalBounds()
         setting = Setting(
             self._tube.loop, self._tube.start, relaxation, Auto(), None, False, simulations=None
         )
@@ -173,14 +178,15 @@ class Repeat:
         if not (0 <= first < k and start == self._tube.start + first):
             raise ValueError(f"its program begins at t = {start}, and has {steps} steps")
         relaxation = AllProducts(prune) if linear else LocalBounds(remove_stable=prune)
+        bounds = AllProducts() if linear else LocalBounds()  # of units, whatever was pruned
         key = origin._replace(steps=0)
         window = self._windows.get(key)
         if window is None or len(window) >= steps:
-            begun = self._step(first)
+            begun = self._step(first, LocalBounds())
             given = self._tube.loop, begun.X, begun.box, begun.t
             window = Window.beginning(*given, relaxation, drop)
         while len(window) < steps:
-            window = self._step(first + len(window), linear).added_to(window)
+            window = self._step(first + len(window), bounds).added_to(window)
         self._windows[key] = window
         program = window.program(directions, LinearBounds())
         return program.replace(products=holding(said.products, window.layout))

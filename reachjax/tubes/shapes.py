@@ -17,7 +17,7 @@ from reachjax.sets import Box, Ellipsoid
 Kind = Box | Ellipsoid
 
 STEP = 1e-7
-"""Of difference quotients, in parts of the axes: rounding leaves half of the digits."""
+"""The step of difference quotients, in parts of the axes: rounding leaves half of the digits."""
 
 
 class Shape(NamedTuple):
@@ -34,14 +34,14 @@ class Shape(NamedTuple):
 
     @classmethod
     def of(cls, X: Kind) -> Shape:
-        """That of a set."""
+        """The shape of a set."""
         if isinstance(X, Box):
             return cls(np.asarray(X.center), np.asarray(X.widths) / 2)
         return cls(np.asarray(X.center), np.linalg.cholesky(np.asarray(X.shape)))
 
     @property
     def sides(self) -> list[int]:
-        """Those to be extended, which are not flat: of an ellipsoid, ends of axes."""
+        """The sides to be extended, which are not flat: of an ellipsoid, ends of axes."""
         return [side for side in range(2 * len(self.center)) if self.lengths[side // 2] > 0]
 
     @property
@@ -73,7 +73,7 @@ class Shape(NamedTuple):
         return float(np.linalg.slogdet(self.axes)[1])
 
     def volume(self) -> float:
-        """Its volume, flat sides aside; of an ellipsoid, that of the box of its axes."""
+        """The volume, flat sides aside; of an ellipsoid, that of the box of its axes."""
         return float(2.0 ** (len(self.sides) // 2) * np.exp(self.log_volume()))
 
     def uphill(self, value: Callable[[Shape], float], here: float) -> Shape:
@@ -121,11 +121,11 @@ class Shape(NamedTuple):
         return Shape(self.center + length * along.center, self.axes + length * along.axes)
 
     def enlarged(self, by: float) -> Shape:
-        """The same about its center, larger by this part."""
+        """The shape about its center, larger by this part."""
         return Shape(self.center, (1 + by) * self.axes)
 
     def extended(self, side: int, by: float) -> Shape:
-        """The same with one end further out by this part of its axis, the other end as it is."""
+        """The shape with one end further out by this part of its axis, the other end as it is."""
         i, sign = side // 2, 1.0 if side % 2 else -1.0
         if self.axes.ndim == 1:
             own, half = np.eye(len(self.axes))[i], by * self.axes[i] / 2

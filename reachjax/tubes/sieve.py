@@ -39,7 +39,7 @@ Ends = tuple[Float[np.ndarray, " n_x"], Float[np.ndarray, " n_x"]]
 
 
 def no_margins(required: Iterable[Requirement], horizon: int) -> Margins:
-    """Those of requirements of which nothing is known."""
+    """Margins of requirements of which nothing is known."""
     return {item.name: np.full(horizon + 1, np.nan) for item in required}
 
 
@@ -64,7 +64,7 @@ class Sifted(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """The smallest."""
+        """The smallest known margin."""
         return smallest(self.margins)
 
 
@@ -90,7 +90,7 @@ class _Rows(NamedTuple):
 
     @classmethod
     def of(cls, item: Requirement, first: int) -> _Rows:
-        """Those of a requirement."""
+        """The rows of a requirement."""
         C, d, norms = (np.asarray(part) for part in item.region.facets_in_units(item.inside))
         facets = (np.asarray(part) for part in item.looser.facets)
         D, e = balanced(*facets, inner=not item.inside)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from reachjax.sets import AbstractTemplate, MixedTemplate, Template
+from reachjax.sets import AbstractTemplate
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -50,8 +50,6 @@ def frame(found: list[dict[str, Any]]) -> DataFrame:
 
 
 def _directions(template: AbstractTemplate, t: int) -> np.ndarray:
-    """Those of a step's facets; none of ellipsoids."""
-    facets = template.facets if isinstance(template, MixedTemplate) else template
-    if not isinstance(facets, Template):
-        return np.zeros((0, 0))
-    return np.asarray(facets.at(t).directions)
+    """Directions of a step's facets; none of ellipsoids."""
+    facets, _ = template.at(t).parts
+    return np.zeros((0, 0)) if facets is None else np.asarray(facets.directions)

@@ -164,7 +164,7 @@ class Verdict:
         return display(self.status.name, table(head, rows) + notes, picture(self._drawn))
 
     def _drawn(self, ax: Axes) -> None:
-        """Its cells, or its margins over time."""
+        """Draw the cells, or the margins over time."""
         if self.cells and len(self.cells[0].lower) > 1:
             from reachjax.tubes.plotting import plot_cells
 

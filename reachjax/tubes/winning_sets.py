@@ -65,7 +65,7 @@ class WinningSet:
         return plot_cells(self, ax, **options)
 
     def _part(self, status: VerdictStatus) -> str:
-        """Its part of the domain, whose flat coordinates count for nothing."""
+        """The part of the domain with this status, whose flat coordinates count for nothing."""
         wide = np.asarray(self.domain.widths) > 0
         sizes = [
             sum(np.prod((cell.upper - cell.lower)[wide]) for cell in cells)
@@ -78,7 +78,7 @@ class WinningSet:
         return tuple(cell for cell in self.cells if cell.status is status)
 
     def volume(self, status: VerdictStatus) -> float:
-        """That of these cells together, in the units of the states."""
+        """The volume of these cells together, in the units of the states."""
         return float(sum(np.prod(cell.upper - cell.lower) for cell in self.of(status)))
 
     def contains(self, states: Float[ArrayLike, "*batch n"]) -> Bool[np.ndarray, "*batch"]:

@@ -66,15 +66,15 @@ def program(n_x=3, seed=0, hidden=(5, 3), network=he_network, X=box_of, relaxati
 
 
 KINDS = {
-    "single pairs": program(relaxation=rj.PaperQC(repeated=False)),
-    "two pairs": program(seed=1, relaxation=rj.PaperQC()),
-    "an ellipsoid's squares": program(seed=2, X=round_of, relaxation=rj.PaperQC()),
+    "single pairs": {"relaxation": rj.PaperQC(repeated=False)},
+    "two pairs": {"seed": 1, "relaxation": rj.PaperQC()},
+    "an ellipsoid's squares": {"seed": 2, "X": round_of, "relaxation": rj.PaperQC()},
 }
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_schur_matrix_is_that_of_traces_of_explicit_matrices(kind):
-    rng, generators = np.random.default_rng(0), presolved(KINDS[kind]).generators
+    rng, generators = np.random.default_rng(0), presolved(program(**KINDS[kind])).generators
     n = generators.rows.shape[1]
     G = generators.columns().T.toarray().reshape(-1, n, n)
     X, W = (A @ A.T for A in rng.normal(size=(2, n, n)))
@@ -219,7 +219,7 @@ def test_programs_that_are_not_numbers_get_a_blank_proposal(traced, bad):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_traced_and_plain_programs_get_the_same_answer(kind):
-    given = KINDS[kind]
+    given = program(**KINDS[kind])
     bounds, plain = proved_offsets(given, SOLVER)
     traced_bounds, traced = jax.jit(partial(proved_offsets, solver=SOLVER))(given)
     np.testing.assert_array_equal(traced_bounds, bounds)

@@ -51,7 +51,7 @@ NAMES = {
 """What files call activations, in small letters."""
 
 ENDINGS = (".onnx", ".mat", ".nnet", ".txt")
-"""Of files that say what they are; any other is taken for plain text."""
+"""Endings of files that say what they are; any other is taken for plain text."""
 
 
 @pytree

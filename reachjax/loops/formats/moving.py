@@ -11,6 +11,7 @@ import numpy as np
 from reachjax.loops.formats.arrays import over
 
 Attributes = Mapping[str, Any]
+"""Attributes of a node by name, with the standard's defaults."""
 
 ROOM = 2**24
 """Entries that one array within a network may have, 128 MiB; its weights are as the file holds."""

@@ -26,12 +26,12 @@ class Constant(NamedTuple):
 
     @classmethod
     def of(cls, array: np.ndarray) -> Constant:
-        """From an array."""
+        """The constant of an array."""
         return cls(array.dtype.str, array.shape, array.tobytes())
 
     @property
     def array(self) -> np.ndarray:
-        """As an array."""
+        """The array that it was made of."""
         return np.frombuffer(self.data, self.kind).reshape(self.shape)
 
 

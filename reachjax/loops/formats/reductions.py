@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from reachjax.loops.formats.arrays import log_softmax, logsumexp, over, softmax
-from reachjax.loops.formats.moving import axes_of
-
-Attributes = Mapping[str, Any]
+from reachjax.loops.formats.moving import Attributes, axes_of
 
 
 def reduction(

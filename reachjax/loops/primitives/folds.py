@@ -16,7 +16,7 @@ Pair = Callable[[Recorder, Value, Value], Value]
 
 
 def _folded(recorder: Recorder, parts: list[Value], pair: Pair) -> Value:
-    """By halves."""
+    """One value of many parts, pair by pair."""
     while len(parts) > 1:
         pairs = zip(parts[::2], parts[1::2], strict=False)
         rest = parts[-1:] if len(parts) % 2 else []
@@ -81,7 +81,7 @@ def _over_windows(pair: Pair) -> Rule:
 
 
 SORTED = 8
-"""As many numbers are sorted at most: each pair of them is a rectifier."""
+"""So many numbers are sorted at most: each pair of them is a rectifier."""
 
 
 def _sorted(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> list[Value]:

@@ -145,7 +145,7 @@ KNOWN = (
     Known(jnp.sinc, _wave, "sinc"),
     Known(jax.scipy.special.xlogy, _times_logarithm, None),
 )
-"""The functions."""
+"""The functions that have a rule as a whole."""
 
 
 def rule_of(equation: Any) -> Rule | None:

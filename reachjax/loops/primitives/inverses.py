@@ -127,7 +127,7 @@ def _sureness(recorder: Recorder, number: Scalar) -> float:
 
 
 def _times(recorder: Recorder, A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """`A B`."""
+    """The product `A B`."""
     places = [*np.ndindex(len(A), B.shape[1])]
     rows = ([Product(1, *pair) for pair in zip(A[i], B[:, j], strict=True)] for i, j in places)
     return row_of(sums(recorder, rows)).reshape(len(A), -1)

@@ -156,7 +156,7 @@ def _lines(condition: Value) -> Iterator[Value]:
 def _pieces(
     recorder: Recorder, y: Value, condition: Value, below: Operand, above: Operand
 ) -> Operand | None:
-    """The same as two functions of `y`; None unless they are, and agree."""
+    """A choice as one between two functions of `y`; None unless they are, and agree."""
     on = _affine(condition, y.place)
     scale = on.terms.get(y.place)
     if scale is None or len(on.terms) != 1 or not all(scale.numbers):

@@ -65,7 +65,7 @@ def _taken(recorder: Recorder, operands: Sequence[Operand], index: Any) -> Value
 
 
 def _moved(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
-    """Of one operand, by others that are known."""
+    """Entries of one operand, by others that are known."""
     value, *places = operands
     _require_known(places)
     if not isinstance(value, Value):
@@ -99,13 +99,7 @@ def _gathered(recorder: Recorder, equation: Equation, operands: Sequence[Operand
 
 
 def _joined(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    """Concatenation and stacking."""
-    index = _evaluated(equation, *_numbers(operands))
-    return _taken(recorder, operands, index)
-
-
-def _padded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    """By one number, of any kind."""
+    """Entries of all operands: concatenated, stacked, or padded by one number of any kind."""
     index = _evaluated(equation, *_numbers(operands))
     return _taken(recorder, operands, index)
 
@@ -224,9 +218,8 @@ ALONE = (
 
 RULES: dict[str, Rule] = {
     **dict.fromkeys((*ALONE, "split", "unstack"), _moved),
-    **dict.fromkeys(["concatenate", "stack"], _joined),
+    **dict.fromkeys(("concatenate", "pad", "stack"), _joined),
     "gather": _gathered,
-    "pad": _padded,
     "dynamic_update_slice": _updated,
     "scatter": _set,
     "scatter-add": _added,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from reachjax.loops.values import Operand, UnsupportedError, Value, is_known
 
 
 def by(unit: AbstractUnit) -> Rule:
-    """A unit."""
+    """The rule that a primitive is a unit."""
     return lambda recorder, equation, operands: recorder.unit(unit, operands[0])
 
 
@@ -149,11 +148,6 @@ def _inverse_tangent(recorder: Recorder, equation: Equation, operands: Sequence[
     one = np.ones(operands[0].shape)
     more, less = (recorder.unit(Log(), recorder.added(one, operands[0], sign)) for sign in (1, -1))
     return recorder.scaled(recorder.added(more, less, -1), np.array(0.5))
-
-
-def multiplied(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
-    """The product of two values."""
-    return reduce(recorder.product, operands)
 
 
 RULES: dict[str, Rule] = {

@@ -69,7 +69,7 @@ class ActiveSets(NamedTuple):
 
 @lru_cache(maxsize=64)
 def active_sets(normals: Normals) -> ActiveSets:
-    """Those of facets with these normals.
+    """The active sets of facets with these normals.
 
     Raises:
         ValueError: there are too many.
@@ -135,7 +135,7 @@ def _dot(one: Iterable[Fraction], other: Iterable[Fraction]) -> Fraction:
 
 
 def _gram(normals: Normals) -> list[list[Fraction]]:
-    """`C C'`."""
+    """The Gram matrix `C C'`."""
     C = [[Fraction(entry) for entry in row] for row in normals]
     return [[_dot(one, other) for other in C] for one in C]
 

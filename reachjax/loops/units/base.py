@@ -111,7 +111,7 @@ class AbstractActivation(abc.ABC):
         """The value for any kind of number, with `unit` at each unit that it is made of."""
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """The value."""
+        """The value `f(y)`."""
         return self.propagate(y, evaluate)
 
 
@@ -144,7 +144,7 @@ class AbstractUnit(AbstractActivation):
 
     @abc.abstractmethod
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """The value."""
+        """The value `f(y)`."""
 
     @abc.abstractmethod
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:

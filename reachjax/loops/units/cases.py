@@ -47,7 +47,7 @@ class Cases(NamedTuple):
 
     @classmethod
     def of(cls, sets: ActiveSets, faces: Any, lower: Array, upper: Array) -> Cases:
-        """Those of a box.
+        """The cases of a box.
 
         Args:
             sets: the active sets.

@@ -75,16 +75,16 @@ class Constraint(AbstractUnit):
     stated: ClassVar[bool] = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """Zero."""
+        """The value zero."""
         return 0.0 * y
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Zero."""
+        """The ends of zero."""
         zero = namespace(lower, upper).zeros_like(lower)
         return zero, zero
 
     def lines(self, lower: Array, upper: Array) -> Lines:
-        """Zero, twice."""
+        """The line zero, twice."""
         zero = namespace(lower, upper).zeros_like(lower)
         return Lines(below=Line(zero, zero), above=Line(zero, zero))
 

@@ -13,7 +13,7 @@ from reachjax.numerics.rounding import TINY, larger, namespace, smaller
 
 @dataclasses.dataclass(frozen=True)
 class Exp(SmoothUnit):
-    """`exp y`.
+    """The exponential `exp y`.
 
     Example:
         >>> import numpy as np
@@ -26,11 +26,11 @@ class Exp(SmoothUnit):
     rises = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`exp y`."""
+        """The value `exp y`."""
         return namespace(y).exp(y)
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`exp y`."""
+        """The derivative `exp y`."""
         return self(y)
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
@@ -58,7 +58,7 @@ class Log(SmoothUnit):
     advice = "keep them above zero, where a logarithm is minus infinity"
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`log y`."""
+        """The value `log y`."""
         return namespace(y).log(y)
 
     def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:

@@ -28,7 +28,7 @@ class Tanh(SmoothUnit):
     rises = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`tanh y`."""
+        """The value `tanh y`."""
         return namespace(y).tanh(y)
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:

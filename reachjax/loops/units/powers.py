@@ -15,7 +15,7 @@ from reachjax.numerics.rounding import TINY, constant, gamma, larger, namespace,
 
 @dataclasses.dataclass(frozen=True)
 class Square(SmoothUnit):
-    """`y^2`.
+    """The square `y^2`.
 
     Example:
         >>> import numpy as np
@@ -27,11 +27,11 @@ class Square(SmoothUnit):
     image = (0.0, math.inf)
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`y^2`."""
+        """The value `y^2`."""
         return y * y
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`2 y`."""
+        """The derivative `2 y`."""
         return 2 * y
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:

@@ -52,14 +52,14 @@ class ProjectionSlack(AbstractUnit):
 
     @classmethod
     def scaled(cls, normals: Any, offsets: Any) -> ProjectionSlack:
-        """That of facets brought to a size about 1 by powers of two: nothing is rounded."""
+        """The unit of facets brought to a size about 1 by powers of two: nothing is rounded."""
         C = np.asarray(normals, float)
         scale = np.ldexp(1.0, -np.frexp(abs(C).max(axis=1))[1])
         return cls(tuple(map(tuple, (scale[:, None] * C).tolist())), scale * offsets)
 
     @property
     def kind(self) -> ProjectionSlack:
-        """The same for any offsets."""
+        """The unit without what it knows of offsets."""
         return ProjectionSlack(self.normals)
 
     @property
@@ -67,7 +67,7 @@ class ProjectionSlack(AbstractUnit):
         return active_sets(self.normals)
 
     def __call__(self, y: Float[Array, "*c r"]) -> Float[Array, "*c r"]:
-        """Those of the first active set whose multipliers and slacks are not negative."""
+        """The multipliers of the first active set whose multipliers and slacks are not negative."""
         xp, sets, (N, r) = namespace(y), self._sets, self._sets.members.shape
         faces = sets.faces(self.offsets)
         m, s = (

@@ -48,7 +48,7 @@ class Erf(SmoothUnit):
     rises = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`erf y`."""
+        """The value `erf y`."""
         if namespace(y) is np:
             from scipy.special import erf
         else:
@@ -137,7 +137,7 @@ class Asinh(SmoothUnit):
     rises = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`arsinh y`."""
+        """The value `arsinh y`."""
         return namespace(y).arcsinh(y)
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:

@@ -80,7 +80,7 @@ class Origin(NamedTuple):
 
 
 class UnboundedError(ValueError):
-    """That a unit has no bounds on the range of its inputs.
+    """A unit has no bounds on the range of its inputs.
 
     Args:
         unit: which one.
@@ -177,7 +177,7 @@ class SmoothUnit(AbstractUnit):
 
     @abc.abstractmethod
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`f'(y)`."""
+        """The derivative `f'(y)`."""
 
     @abc.abstractmethod
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:

@@ -36,7 +36,7 @@ class WaveUnit(SmoothUnit):
         return self.image
 
     def remainder(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """As of any smooth unit; of large arguments, those of numbers in its extent."""
+        """Ends of `f(y) - slope y`; of large arguments, those of numbers in its extent."""
         xp = namespace(slope, lower, upper)
         low, high = super().remainder(slope, lower, upper)
         far = ~self.defined(lower, upper) & super().defined(lower, upper)
@@ -62,7 +62,7 @@ def _met(angle: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
 
 @dataclasses.dataclass(frozen=True)
 class Sin(WaveUnit):
-    """`sin y`.
+    """The sine `sin y`.
 
     Example:
         >>> import numpy as np
@@ -73,11 +73,11 @@ class Sin(WaveUnit):
     image = (-1.0, 1.0)
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`sin y`."""
+        """The value `sin y`."""
         return namespace(y).sin(y)
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`cos y`."""
+        """The derivative `cos y`."""
         return namespace(y).cos(y)
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
@@ -93,7 +93,7 @@ class Sin(WaveUnit):
 
 @dataclasses.dataclass(frozen=True)
 class Cos(WaveUnit):
-    """`cos y`.
+    """The cosine `cos y`.
 
     Example:
         >>> import numpy as np
@@ -104,11 +104,11 @@ class Cos(WaveUnit):
     image = (-1.0, 1.0)
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`cos y`."""
+        """The value `cos y`."""
         return namespace(y).cos(y)
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`-sin y`."""
+        """The derivative `-sin y`."""
         return -namespace(y).sin(y)
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
@@ -238,7 +238,7 @@ class Atan(SmoothUnit):
     rises = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`arctan y`."""
+        """The value `arctan y`."""
         return namespace(y).arctan(y)
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:

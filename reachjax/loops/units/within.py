@@ -28,11 +28,11 @@ class Within(SmoothUnit):
     rises = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """`y`."""
+        """The input `y` itself."""
         return y
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """One."""
+        """The derivative one."""
         return namespace(y).ones_like(y)
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
@@ -52,7 +52,7 @@ class Within(SmoothUnit):
 
     @np.errstate(all="ignore")
     def quadratic(self, lower: Array, upper: Array) -> Quadratic:
-        """The lines."""
+        """The lines, which bend nowhere."""
         return self.linear(lower, upper)
 
     def _is_kept(self, lower: Array, upper: Array) -> Bool[Array, " k"]:

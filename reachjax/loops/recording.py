@@ -169,17 +169,21 @@ class Recorder:
         """Entries as `picked`, but of sums as sums of entries, which comparisons look into."""
         if value.terms is None:
             return self.picked(value, index)
+        key = "taken", value.place, np.ravel(index).tobytes()
+        if key in self._made:
+            return self.reshaped(self._made[key], np.shape(index))
         found: Any = None
         for term in value.terms:
             part = self.taken(term.value, index)
-            factor, divisor = (_entries_of(plain, value, index) for plain in term[1:])
+            factor, divisor = (_entries_of(plain, index) for plain in term[1:])
             part = (
                 part if is_constant(factor) and np.all(factor == 1) else self.scaled(part, factor)
             )
             one = is_constant(divisor) and np.all(divisor == 1)
             part = part if one else self.divided(part, divisor)
             found = part if found is None else self.added(found, part)
-        return self.shifted(found, _entries_of(value.offset, value, index))
+        self._made[key] = self.shifted(found, _entries_of(value.offset, index))
+        return self._made[key]
 
     def broadcast(self, value: Value, shape: Shape) -> Value:
         """The same entries in a larger array."""
@@ -428,11 +432,14 @@ def _size(y: Ball) -> Ball:
     return Ball.between(least, larger(larger(-y.lower, y.upper), least))
 
 
-def _entries_of(plain: Any, value: Value, index: np.ndarray) -> Any:
-    return _flat(plain, value)[np.asarray(index)] if np.ndim(plain) else plain
+def _entries_of(flat: Any, index: np.ndarray) -> Any:
+    """Entries of a flat array, of its kind; a number stands for all of them."""
+    return flat[np.ravel(index)].reshape(np.shape(index)) if np.ndim(flat) else flat
 
 
 def _flat(plain: Any, value: Value) -> Any:
+    if np.ndim(plain) and np.size(plain) == value.size:
+        return plain.reshape(-1)
     if isinstance(plain, Parameter):
         return np.broadcast_to(plain, value.shape, subok=True).reshape(-1)
     return namespace(plain).broadcast_to(plain, value.shape).reshape(-1)

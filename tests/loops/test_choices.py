@@ -13,7 +13,7 @@ from tests.loops.widths import widths
 
 Partial = jax.tree_util.Partial
 PLACES, HEIGHTS = jnp.array([-1.0, 0.0, 0.7, 2.0]), jnp.array([0.0, 1.0, -1.0, 3.0])
-SLOPES = jnp.array([2.0, 1.0])
+SLOPES, ROWS = jnp.array([2.0, 1.0]), jnp.array([[1.0, -2.0], [0.5, 3.0], [0.2, 0.7]])
 
 
 def leaky(mask, y):
@@ -32,6 +32,12 @@ CONTINUOUS = {
     "x log of a constant": lambda x: xlogy(x, 2.0) + xlogy(3.0, x + 2.0),
     "select": lambda x: jnp.select([x < 0, x < 1], [0 * x, x], 1.0),
     "pieces": lambda x: jnp.piecewise(x, [x < 0, x >= 1], [0.0, 1.0, lambda y: y]),
+    "pieces of one entry": lambda x: jnp.piecewise(
+        x[:1], [x[:1] < 0, x[:1] >= 1], [0.0, 1.0, lambda y: y]
+    ),
+    "pieces of a number": lambda x: jnp.piecewise(
+        x[0], [x[0] < 0, x[0] >= 1], [0.0, 1.0, lambda y: y]
+    )[None],
     "branches": lambda x: lax.cond(x[0] > 0, lambda x: x[:1], lambda x: 2 * x[:1], x),
     "branches of several": lambda x: jnp.stack(
         lax.cond(x[0] > 0, lambda x: (x[0], 0.0), lambda x: (0.0, x[0]), x)
@@ -45,6 +51,12 @@ CONTINUOUS = {
     ),
     "masks in a scan": lambda x: lax.scan(lambda c, m: (c + leaky(*m), c), 0.0, (x > 0, x))[0] * x,
     "masks in a map": lambda x: lax.map(lambda m: leaky(*m), (x - 0.5 > 0, x - 0.5)),
+    "masks of rows": lambda x: lax.map(
+        lambda m: leaky(*m), (x * ROWS - 0.5 > 0, x * ROWS - 0.5)
+    ).ravel(),
+    "masks of rows of parameters": Partial(
+        lambda p, x: lax.map(lambda m: leaky(*m), (x / p + p > 0, x / p + p)).ravel(), ROWS
+    ),
 }
 
 

@@ -101,6 +101,10 @@ REFUSED = {
         },
         "against ONNX's rules.*rank 2",
     ),
+    "weights that are not there": (
+        {"nodes": [node("Mul", "x weight0")]},
+        r"node 'y' \(Mul\) takes \['weight0'\].*export it with its weights",
+    ),
     "an attribute of nothing": (
         {"nodes": [node("Relu", "x", mystery=1)]},
         r"node 'y' \(Relu\) has the attribute 'mystery', which is not known",

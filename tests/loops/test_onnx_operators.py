@@ -207,3 +207,36 @@ def test_smooth_operators_of_policies_have_bounds(name, tmp_path):
     expected = run(tmp_path / "net.onnx", x=x)
     np.testing.assert_allclose(net(jnp.asarray(x[0], float)), expected, rtol=1e-5, atol=1e-6)
     assert jax.tree.leaves(net)[0].shape == (4, 3)
+
+
+@pytest.mark.parametrize("name", ["Greater", "GreaterOrEqual", "Less", "LessOrEqual"])
+@pytest.mark.parametrize("kind", ["leaky", "held"])
+def test_choices_at_known_numbers_have_bounds(name, kind, tmp_path):
+    upwards = name.startswith("Greater")
+    if kind == "leaky":  # as TensorFlow's exporter writes it
+        held, cases = {"s": W["s"], "k": HELD["k"]}, "x a" if upwards else "a x"
+        nodes = [node("Mul", "x s", "a"), node(name, "x k", "g"), node("Where", f"g {cases}")]
+    else:
+        held, cases = {"k": HELD["k2"]}, "x k" if upwards else "k x"
+        nodes = [node(name, "x k", "g"), node("Where", f"g {cases}")]
+    net = rj.Network.from_onnx(saved(tmp_path / "net.onnx", nodes, held))
+    for x in (entries((1, 3), 5), np.zeros((1, 3), np.float32)):
+        expected = run(tmp_path / "net.onnx", x=x)
+        np.testing.assert_allclose(net(jnp.asarray(x[0], float)), expected.ravel(), rtol=1e-6)
+    assert len(jax.tree.leaves(net)) == (kind == "leaky")  # a slope may be learned, no place
+
+
+SLOPES = {"Celu": 1.0, "Elu": 1.0, "Selu": 1.0507009873554805 * 1.6732632423543772}
+
+
+@pytest.mark.parametrize("name", SLOPES)
+def test_digits_that_a_runtime_loses_near_zero_make_no_other_function(name, tmp_path):
+    """It subtracts one from an exponential, and is off by 6e-8 however small the result is."""
+    nodes = [node("Mul", "x k", "a"), node(name, "a", "h"), node("Mul", "h l")]
+    for size in (1.0, 1e-2, 1e-4):
+        held = {"k": np.float32(size), "l": np.float32(1 / size)}
+        for inputs in (1, 2, 3):
+            path = saved(tmp_path / "net.onnx", nodes, held, shape=(1, inputs))
+            found = read_graph(path)[0](np.full(inputs, -0.5))
+            expected = SLOPES[name] * np.expm1(-0.5 * size) / size
+            np.testing.assert_allclose(found, expected, rtol=1e-6)

@@ -7,6 +7,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.tubes.by_cells import _Node
+from tests.quick_cases import some
 
 PERIOD = 0.1
 
@@ -106,7 +107,7 @@ def test_what_is_interrupted_keeps_what_is_proved(monkeypatch):
     assert caught.value.tube.horizon == 2
 
 
-@pytest.mark.costly
+@pytest.mark.long  # what gradients of many kinds of loops claim too
 def test_derivatives_are_those_of_what_is_proved():
     def size(lower, gravity):
         def f(gravity, x, u):
@@ -167,7 +168,10 @@ DIAMOND = np.array([[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
 
 @pytest.mark.parametrize(
     ("kind", "cells", "tolerance"),
-    [("polytope", 1000, 3e-3), ("polytope", 1, 3e-3), ("intersection", 1, 2e-2)],
+    some(
+        [("polytope", 1000, 3e-3), ("polytope", 1, 3e-3), ("intersection", 1, 2e-2)],
+        lambda kind, *_: kind == "intersection",
+    ),
     ids=["cells", "programs", "both"],
 )
 @pytest.mark.costly

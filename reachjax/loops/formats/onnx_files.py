@@ -215,8 +215,8 @@ def _needed(graph: Any, wanted: str) -> list[Any]:
             if name and name in makers:
                 raise ValueError(f"two nodes compute {name!r}")
             makers[name] = node
-    fixed = {each.name for each in (*graph.initializer, *graph.input)} & makers.keys() - {""}
-    if fixed:
+    given = {each.name for each in (*graph.initializer, *graph.input)}
+    if fixed := given & makers.keys() - {""}:
         raise ValueError(f"nodes compute {sorted(fixed)}, which are given")
     found: set[int] = set()
     left = [wanted]
@@ -225,6 +225,11 @@ def _needed(graph: Any, wanted: str) -> list[Any]:
         if node is not None and id(node) not in found:
             found.add(id(node))
             left.extend(name for name in node.input if name)
+            if lost := [name for name in node.input if name and name not in given | makers.keys()]:
+                raise ValueError(
+                    f"{_named(node)} takes {lost}, which are neither in the file nor inputs of "
+                    "it: export it with its weights"
+                )
     return [node for node in graph.node if id(node) in found]
 
 

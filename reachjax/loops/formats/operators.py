@@ -85,15 +85,20 @@ def _clip(attributes: Attributes, x: Any, low: Any = None, high: Any = None) -> 
     return x if high is None else over(x).minimum(x, high)
 
 
+def _expm1(x: Any) -> Any:
+    """`exp(x) - 1`; in numpy's 32 bits with the digits that runtimes lose near zero."""
+    if isinstance(x, np.ndarray) and x.dtype == np.float32:
+        return np.exp(x) - 1
+    return over(x).expm1(x)
+
+
 def _elu(attributes: Attributes, x: Any) -> Any:
-    below = over(x).expm1(over(x).minimum(x, 0.0))
-    return over(x).maximum(x, 0.0) + attributes["alpha"] * below
+    return over(x).maximum(x, 0.0) + attributes["alpha"] * _expm1(over(x).minimum(x, 0.0))
 
 
 def _celu(attributes: Attributes, x: Any) -> Any:
     alpha = attributes["alpha"]
-    below = over(x).expm1(over(x).minimum(x, 0.0) / alpha)
-    return over(x).maximum(x, 0.0) + alpha * below
+    return over(x).maximum(x, 0.0) + alpha * _expm1(over(x).minimum(x, 0.0) / alpha)
 
 
 def _gelu(attributes: Attributes, x: Any) -> Any:
@@ -196,10 +201,6 @@ FOLLOWED = {
     "Equal": "equal",
     "Exp": "exp",
     "Floor": "floor",
-    "Greater": "greater",
-    "GreaterOrEqual": "greater_equal",
-    "Less": "less",
-    "LessOrEqual": "less_equal",
     "Log": "log",
     "MatMul": "matmul",
     "Mul": "multiply",
@@ -212,15 +213,23 @@ FOLLOWED = {
     "Sub": "subtract",
     "Tan": "tan",
     "Tanh": "tanh",
-    "Where": "where",
 }
 """Operators without attributes that numpy and JAX have, and what these call them."""
 
 REDUCED = ("axes", "keepdims", "noop_with_empty_axes")
 NORMALISED = ("axis", "epsilon", "stash_type")
 
+COMPARED = {
+    "Greater": "greater",
+    "GreaterOrEqual": "greater_equal",
+    "Less": "less",
+    "LessOrEqual": "less_equal",
+}
+"""Operators that choose: where they change must be known, for values to be seen to agree there."""
+
 OPERATORS: dict[str, Operator] = {
     **{name: Operator(_entrywise(twin)) for name, twin in FOLLOWED.items()},
+    **{name: Operator(_entrywise(twin), fixed=(0, 1)) for name, twin in COMPARED.items()},
     **{name: Operator(each, REDUCED, known=(1,)) for name, each in reductions.REDUCTIONS.items()},
     "BatchNormalization": Operator(
         reductions.batch_normalised, ("epsilon", "momentum", "training_mode", "spatial")
@@ -283,6 +292,7 @@ OPERATORS: dict[str, Operator] = {
     "Swish": Operator(lambda a, x: x * sigmoid(a["alpha"] * x), ("alpha",)),
     "Transpose": Operator(moving.transposed, ("perm",)),
     "Unsqueeze": Operator(moving.unsqueezed, ("axes",), known=(1,)),
+    "Where": Operator(_entrywise("where"), fixed=(1, 2)),
 }
 
 SIZES = ("Shape", "Size")

@@ -18,6 +18,7 @@ from reachjax.loops.recording import Recorder
 from reachjax.loops.values import (
     Choice,
     Comparison,
+    Index,
     Operand,
     Unknown,
     UnsupportedError,
@@ -89,8 +90,8 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
     if unknown and equation.name != "custom_linear_solve":  # which needs no factors
         raise unknown[0].error
     rules = choices.RULES if any(isinstance(each, Choice) for each in operands) else RULES
-    if isinstance(first, Comparison) and equation.name in moving.ALONE:
-        return Comparison(recorded(recorder, equation, [first.value, *others]))
+    if isinstance(first, Comparison | Index) and equation.name in moving.ALONE:
+        return _moved(recorder, equation, first, others)
     rule = (RULES if equation.name == "not" else rules).get(equation.name)
     if rule is None and rules is choices.RULES:
         raise UnsupportedError(choices.ONLY)
@@ -107,6 +108,16 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
             *(np.zeros(each.shape) if isinstance(each, Value) else each for each in operands)
         )
     return rule(recorder, equation, operands)
+
+
+def _moved(recorder: Recorder, equation: Equation, operand: Any, others: Sequence[Any]) -> Any:
+    """Entries of truth values, or of places, are those of what decides about them."""
+    if isinstance(operand, Comparison):
+        return Comparison(recorded(recorder, equation, [operand.value, *others]))
+    if isinstance(operand, Index):
+        conditions = [_moved(recorder, equation, each, others) for each in operand.conditions]
+        return Index(conditions, operand.last)
+    return equation.evaluate(operand, *others)
 
 
 def _why(equation: Equation) -> str:

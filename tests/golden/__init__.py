@@ -1,0 +1,1 @@
+"""What the library says of some ninety drawn cases, kept bit for bit, and compared."""

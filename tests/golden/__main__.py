@@ -1,0 +1,71 @@
+"""Keep what the library says of drawn cases, or compare it with what was kept.
+
+    python -m tests.golden write results/before.json
+    python -m tests.golden compare results/before.json        # runs the cases again
+    python -m tests.golden compare results/before.json results/after.json
+
+What is compared is compared bit for bit: on one machine, and with the same versions of what the
+library stands on.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import jax
+from rich.console import Console
+from rich.table import Table
+from tqdm import tqdm
+
+import conftest  # noqa: F401  (64-bit floats, quick compilation)
+from tests.golden.cases import every
+from tests.golden.records import SECONDS, Record, differences, read, recorded, written
+
+
+def run(pattern: str) -> dict[str, Record]:
+    """The records of the cases whose names have a pattern in them."""
+    found = {}
+    for case in tqdm([case for case in every() if pattern in case.name], unit="case"):
+        found[case.name] = recorded(case)
+        jax.clear_caches()  # what is compiled is compiled in each case's own seconds
+    return found
+
+
+def compared(before: dict[str, Record], after: dict[str, Record]) -> int:
+    """Print what is not the same; how many cases that are."""
+    table, changed = Table("case", "what", "difference"), 0
+    for name in before | after:
+        pair = before.get(name, {}), after.get(name, {})
+        found = differences(*pair)
+        changed += bool(found)
+        for what, difference in found.items():
+            table.add_row(name, what, difference[:100])
+    console = Console()
+    if changed:
+        console.print(table)
+    seconds = [sum(each[SECONDS] for each in one.values()) for one in (before, after)]
+    console.print(f"{changed} of {len(before | after)} cases are not the same")
+    console.print(f"{seconds[0]:.0f} s of the processor before, {seconds[1]:.0f} s after")
+    return changed
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0], prog="tests.golden")
+    parser.add_argument("what", choices=["write", "compare"])
+    parser.add_argument("file", type=Path, help="what was kept, or is to be")
+    parser.add_argument(
+        "other", type=Path, nargs="?", help="what to compare with; runs if not given"
+    )
+    parser.add_argument("--case", default="", help="only cases whose names have this in them")
+    given = parser.parse_args(arguments)
+    if given.what == "write":
+        written(given.file, run(given.case))
+        return 0
+    before = {name: record for name, record in read(given.file).items() if given.case in name}
+    after = run(given.case) if given.other is None else read(given.other)
+    return 1 if compared(before, after) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

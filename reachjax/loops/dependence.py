@@ -51,16 +51,19 @@ def body_of(params: dict[str, Any]) -> Any:
 
 
 def rounds(equation: Any) -> bool:
-    """Whether an equation, all operands of which are plain, may round."""
+    """Whether an equation, all operands of which are plain, may round.
+
+    What a call rounds may decide its results also where these are whole numbers or truth values.
+    """
+    inner = [*_bodies(equation)]
+    if inner:
+        return any(rounds(each) for body in inner for each in _jaxpr(body).eqns)
     if not any(jnp.issubdtype(each.aval.dtype, jnp.inexact) for each in equation.outvars):
         return False
     name = equation.primitive.name
     if name == "convert_element_type":
         return not _is_wider(equation.outvars[0].aval.dtype, equation.invars[0].aval.dtype)
-    if name in EXACT:
-        return False
-    inner = [*_bodies(equation)]
-    return not inner or any(rounds(each) for body in inner for each in _jaxpr(body).eqns)
+    return name not in EXACT
 
 
 def _bodies(equation: Any) -> list[Any]:
@@ -70,7 +73,7 @@ def _bodies(equation: Any) -> list[Any]:
     if name == "scan":
         return [params["jaxpr"]]
     if name == "while":
-        return [params["body_jaxpr"]]
+        return [params["cond_jaxpr"], params["body_jaxpr"]]
     return list(params["branches"]) if name == "cond" else []
 
 
@@ -128,7 +131,8 @@ def _followed(equation: Any, varies: Sequence[bool]) -> tuple[list[bool], bool]:
             outs, rounded = _through(params["body_jaxpr"], [*done, *carry])
             after = [a or b for a, b in zip(carry, outs, strict=True)]
             if after == carry:
-                return carry, rounded
+                asked = _through(params["cond_jaxpr"], [*varies[:first], *carry])[1]
+                return carry, rounded or asked
             carry = after
     return [True] * len(equation.outvars), False
 

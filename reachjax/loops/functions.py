@@ -47,12 +47,13 @@ class Function:
     Attributes:
         parameters: its arrays.
         structure: all else.
-        constants: what is computed of parameters alone and rounded; None: that is still to be done.
+        constants: what is computed of parameters alone and rounded, by its places; None: that is
+            still to be done.
     """
 
     parameters: tuple[Any, ...]
     structure: Structure = static()
-    constants: tuple[Any, ...] | None = None
+    constants: dict[str, list[Any]] | None = None
 
     @classmethod
     def of(cls, function: Callable, inputs: Sizes, outputs: int, name: str) -> Function:
@@ -169,7 +170,7 @@ class Function:
             Function,
             parameters=self.parameters,
             structure=self.structure,
-            constants=tuple(constants.computed),
+            constants=constants.computed,
         )
         if is_concrete(found):
             object.__setattr__(self, "_evaluated", found)
@@ -201,7 +202,7 @@ class Function:
 
     def _steps(self) -> tuple[Recorder, Operand]:
         """The steps; of numpy arrays they are kept."""
-        given = *self.parameters, *(self.constants or ())
+        given = jax.tree.leaves((self.parameters, self.constants))
         if not all(isinstance(each, np.ndarray) for each in given):
             return self._recorded()[1]
         kept = self.__dict__.get("_kept")

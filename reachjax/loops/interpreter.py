@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import abc
 import importlib.util
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -31,28 +31,30 @@ PASSED = ("copy", "copy_p", "optimization_barrier", "stop_gradient")
 
 
 class Constants:
-    """The numbers of a function that depend on its parameters alone and are rounded, in order.
+    """The numbers of a function that depend on its parameters alone and are rounded.
+
+    They are told apart by where they are computed: a reader that knows more of the inputs takes
+    other branches, and finds results plain that another one takes to depend on them.
 
     Args:
-        known: all of them, to be taken one after the other; None: they are computed.
+        known: those that are known; the others are computed.
 
     Attributes:
-        computed: those so far that were.
+        computed: those that were.
     """
 
-    def __init__(self, known: Sequence[Any] | None = None):
-        self.computed: list[Any] = []
-        self._known: Iterator[Any] | None = None if known is None else iter(known)
+    def __init__(self, known: Mapping[str, Sequence[Any]] | None = None):
+        self.computed: dict[str, list[Any]] = {}
+        self._known = known or {}
 
-    def of(self, equation: Any, operands: Sequence[Any]) -> list[Any]:
-        """The results of an equation whose operands are plain."""
+    def of(self, equation: Any, operands: Sequence[Any], place: str) -> list[Any]:
+        """The results of an equation, at a place, whose operands are plain."""
         own = any(isinstance(each, Parameter) or not is_known(each) for each in operands)
         if not own or not rounds(equation):
             return _evaluated(equation, operands)
-        if self._known is not None:
-            return [Parameter.of(next(self._known)) for _ in equation.outvars]
-        found = _evaluated(equation, operands)
-        self.computed += found
+        if place in self._known:
+            return [*map(Parameter.of, self._known[place])]
+        found = self.computed[place] = _evaluated(equation, operands)
         return found
 
 
@@ -73,6 +75,7 @@ class Interpreter(abc.ABC):
 
     def __init__(self, constants: Constants):
         self._constants = constants
+        self._place = ""
 
     @abc.abstractmethod
     def is_plain(self, operand: Operand) -> bool:
@@ -98,8 +101,13 @@ class Interpreter(abc.ABC):
     def either(self, which: Operand, cases: Sequence[Operand]) -> Operand:
         """One of several operands, by a number that depends on inputs."""
 
-    def walk(self, closed: Any, operands: Sequence[Operand]) -> list[Operand]:
+    def walk(self, closed: Any, operands: Sequence[Operand], turn: int = 0) -> list[Operand]:
         """What a jaxpr makes of operands.
+
+        Args:
+            closed: the jaxpr.
+            operands: as many as it has arguments.
+            turn: which one it is, of several within one equation.
 
         Raises:
             UnsupportedError: some of it is not supported.
@@ -113,16 +121,18 @@ class Interpreter(abc.ABC):
         def read(variable: Any) -> Operand:
             return _plain(variable.val) if isinstance(variable, core.Literal) else known[variable]
 
-        needed = _needed(jaxpr)
+        needed, around = _needed(jaxpr), self._place
         for number, equation in enumerate(jaxpr.eqns):
             if number not in needed and not self.has_effects:
                 continue
             given = [read(each) for each in equation.invars]
+            self._place = f"{around}/{turn}.{number}"
             try:
                 found = (self._made if number in needed else self._beside)(equation, given)
             except UnsupportedError as error:
                 raise located(error, equation) from None
             known.update(zip(equation.outvars, found, strict=True))
+        self._place = around
         return [read(each) for each in jaxpr.outvars]
 
     def _made(self, equation: Any, operands: Sequence[Operand]) -> list[Operand]:
@@ -130,7 +140,9 @@ class Interpreter(abc.ABC):
         name, params = equation.primitive.name, equation.params
         varies = [not self.is_plain(each) for each in operands]
         if not any(varies):
-            return [*operands] if name in PASSED else self._constants.of(equation, operands)
+            if name in PASSED:
+                return [*operands]
+            return self._constants.of(equation, operands, self._place)
         whole = self.whole(equation, operands)
         if whole is not None:
             return whole
@@ -161,7 +173,7 @@ class Interpreter(abc.ABC):
         order = range(length)[::-1] if params["reverse"] else range(length)
         for k in order:
             given = [each[k] if self.is_plain(each) else self.entry(each, k) for each in streams]
-            found = self.walk(params["jaxpr"], [*constants, *carry, *given])
+            found = self.walk(params["jaxpr"], [*constants, *carry, *given], k)
             carry, row = found[: len(carry)], found[len(carry) :]
             rows.append(row)
         if not rows:
@@ -184,8 +196,8 @@ class Interpreter(abc.ABC):
         first, second = params["cond_nconsts"], params["body_nconsts"]
         asked, done = operands[:first], operands[first : first + second]
         carry = list(operands[first + second :])
-        for _ in range(TURNS):
-            (goes_on,) = self.walk(params["cond_jaxpr"], [*asked, *carry])
+        for turn in range(0, 2 * TURNS, 2):
+            (goes_on,) = self.walk(params["cond_jaxpr"], [*asked, *carry], turn)
             if not self.is_plain(goes_on) or not is_known(goes_on):
                 raise UnsupportedError(
                     "how often it repeats must not depend on inputs or traced parameters: use "
@@ -193,7 +205,7 @@ class Interpreter(abc.ABC):
                 )
             if not bool(np.asarray(goes_on)):
                 return carry
-            carry = self.walk(params["body_jaxpr"], [*done, *carry])
+            carry = self.walk(params["body_jaxpr"], [*done, *carry], turn + 1)
         raise UnsupportedError(f"it has not ended after {TURNS} turns: use a loop of fewer")
 
     def _branch(self, params: dict[str, Any], operands: Sequence[Operand]) -> list[Operand]:
@@ -201,14 +213,15 @@ class Interpreter(abc.ABC):
         which, *given = operands
         branches = params["branches"]
         if not self.is_plain(which):
-            found = [self.walk(branch, given) for branch in branches]
+            found = [self.walk(branch, given, k) for k, branch in enumerate(branches)]
             return [self.either(which, cases) for cases in zip(*found, strict=True)]
         if not is_known(which):
             raise UnsupportedError(
                 "which branch is taken must not depend on traced parameters: use jnp.where "
                 "between functions that agree where it changes"
             )
-        return self.walk(branches[int(np.clip(which, 0, len(branches) - 1))], given)
+        k = int(np.clip(which, 0, len(branches) - 1))
+        return self.walk(branches[k], given, k)
 
 
 WAYS: dict[str, Callable[..., list[Operand]]] = {

@@ -438,6 +438,8 @@ def _entries_of(flat: Any, index: np.ndarray) -> Any:
 
 
 def _flat(plain: Any, value: Value) -> Any:
+    if np.ndim(plain) and np.size(plain) == value.size:
+        return plain.reshape(-1)
     if isinstance(plain, Parameter):
         return np.broadcast_to(plain, value.shape, subok=True).reshape(-1)
     return namespace(plain).broadcast_to(plain, value.shape).reshape(-1)

@@ -58,7 +58,7 @@ class UnitForms(NamedTuple):
     outputs: AffineForms
 
 
-class Merged(NamedTuple):
+class ControllerColumns(NamedTuple):
     """What the units of a smooth controller leave out, as one column for each of its outputs.
 
     Attributes:
@@ -85,7 +85,7 @@ class StepForms(NamedTuple):
 
     successor: AffineForms
     units: tuple[UnitForms, ...]
-    merged: Merged | None
+    merged: ControllerColumns | None
 
 
 Ranges = Callable[[AbstractUnit | None, AffineForms, Ends, Sequence[UnitForms]], Ends]
@@ -165,7 +165,7 @@ def step_forms(
         free = None if place is None else scratch
         u = loop.controller.propagate(measured, apply)
         u, (gap, places) = _merged(u, own, kept, scratch)
-        merged = Merged(u, gap, places, range(first, len(found)))
+        merged = ControllerColumns(u, gap, places, range(first, len(found)))
         width = u.columns.shape[1]
         free = None if kept is None else kept + len(u.rows)
     else:

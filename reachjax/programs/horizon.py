@@ -26,7 +26,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit, Mark, SmoothUnit
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine import AffineForms
-from reachjax.programs.affine_steps import Merged, UnitForms, states_facts, step_forms
+from reachjax.programs.affine_steps import ControllerColumns, UnitForms, states_facts, step_forms
 from reachjax.programs.initial import Ends, InitialColumns, met, product_facts
 from reachjax.sets import AbstractSet, Box
 
@@ -104,7 +104,7 @@ class Horizon:
         self.start = InitialColumns.of(X0, box, loop.curved)
         self.state = AffineForms.beginning(self.start)
         self.steps: list[tuple[UnitForms, ...]] = []
-        self.merged: list[Merged | None] = []
+        self.merged: list[ControllerColumns | None] = []
         self.states: list[AffineForms] = []
         self.ends: list[Ends] = []
         self.better: list[RangeEnd] = []
@@ -340,9 +340,9 @@ class Horizon:
         self._count += len(rows.rows)
 
 
-def _left_out(each: UnitForms | Merged) -> bool:
+def _left_out(each: UnitForms | ControllerColumns) -> bool:
     """Whether columns are of what smooth units leave out."""
-    return isinstance(each, Merged) or isinstance(each.unit, SmoothUnit)
+    return isinstance(each, ControllerColumns) or isinstance(each.unit, SmoothUnit)
 
 
 def _fill(

@@ -202,7 +202,7 @@ class Tree:
         return Found(phases, multipliers, weights, columns, self.nodes)
 
 
-def settled(
+def attained_multipliers(
     horizon: Horizon,
     programs: AbstractPrograms,
     form: AffineForms,

@@ -26,7 +26,7 @@ from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.replayed import Replay, replayed
 from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box, Polytope, Template
-from reachjax.tubes.ladder import WORK, Climbed, Ladder
+from reachjax.tubes.ladder import WORK, Ladder, StepBounds
 from reachjax.tubes.steps import Reached, Setting, Step, overflow
 from reachjax.tubes.successors import facets_by_products
 
@@ -99,7 +99,7 @@ def sets_by_branching(
             simulated = setting.simulations.values(k, rows)
         target, ranges = ladder.facets(rows, simulated, gap)
         half = share.share(1 / 2)  # the other one is for products
-        climbed = ladder.climbed(target, (horizon - k) * len(rows), half)
+        climbed = ladder.bounds(target, (horizon - k) * len(rows), half)
         if not np.isfinite(climbed.bounds).all():
             raise overflow(setting.start + k)
         offsets = proved = owned(climbed.bounds)
@@ -136,7 +136,7 @@ def _moving(
     X0: AbstractSet,
     box: Box,
     directions: Float[Array, "f n_x"],
-    climbed: Climbed,
+    climbed: StepBounds,
     ladder: Ladder,
     known: Sequence[Float[Array | np.ndarray, "2 n_x"]],
     horizon: int,
@@ -147,13 +147,13 @@ def _moving(
     forms of smooth loops leave something out.
     """
     k, begun = len(ladder.horizon.steps), ladder.horizon
-    columns, multipliers, settled = ladder.settled(climbed)
-    if settled.all():
+    columns, multipliers, witnessed = ladder.where_attained(climbed)
+    if witnessed.all():
         held = Replay.of(begun, columns, multipliers, horizon)
         return replayed(setting.loop, X0, box, directions, held, k, setting.start)
     rows = climbed.about.rows
     bounds = sources(begun.start, rows, climbed.bounds, None)
-    for i in np.flatnonzero(settled | (climbed.rungs != Rung.AFFINE_FORM)):
+    for i in np.flatnonzero(witnessed | (climbed.rungs != Rung.AFFINE_FORM)):
         bounds[i] = attained(begun, rows[i : i + 1], multipliers[i], columns[i])
     ends = [*known, *[jnp.zeros((2, len(directions.T)))] * (horizon - len(known))]
     held = held_bounds(begun, bounds, horizon)
@@ -175,7 +175,7 @@ def _with_products(
 
 
 def _certificate(
-    climbed: Climbed,
+    climbed: StepBounds,
     codes: Int[np.ndarray, " f"],
     offsets: Float[Array, " f"],
     products: Certificate | None,

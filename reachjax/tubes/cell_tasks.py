@@ -76,7 +76,7 @@ class Unbounded(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What is found of a cell.
+    """How a task ended for a cell.
 
     Attributes:
         proved: whether all requirements are.
@@ -164,7 +164,7 @@ def bounded(
     uppers = rows.ends(ladder.horizon.start)[1]
     bounds = uppers if item.inside else uppers.min(keepdims=True)
     if not _all_right(item, bounds) and len(ladder.horizon.zero):
-        bounds = ladder.climbed(target_of(item, ladder, None, middle)[0]).bounds
+        bounds = ladder.bounds(target_of(item, ladder, None, middle)[0]).bounds
     return _all_right(item, bounds), float(np.min(-bounds / units))
 
 

@@ -42,7 +42,7 @@ from reachjax.tubes.by_cells import affordable
 from reachjax.tubes.cell_decisions import decided_by_cells, roots
 from reachjax.tubes.cell_tasks import CellTask
 from reachjax.tubes.interruptions import Interrupted
-from reachjax.tubes.ladder import WORK, Climbed, Ladder
+from reachjax.tubes.ladder import WORK, Ladder, StepBounds
 from reachjax.tubes.propagation import (
     Progress,
     known_numbers,
@@ -321,7 +321,7 @@ class _Decision:
         target, units = target_of(item, ladder, self.simulations, self._middle)
         left = sum(other.time >= item.time for other in self._open.values())
         share = self._budget.share(1 / left)
-        climbed = ladder.climbed(target, (left - 1) * len(target.forms), share)
+        climbed = ladder.bounds(target, (left - 1) * len(target.forms), share)
         right = climbed.bounds <= 0 if item.inside else climbed.bounds < 0
         margin = float(np.min(-climbed.bounds / units))
         holds = bool(np.all(right))
@@ -362,7 +362,7 @@ class _Decision:
         self._example = counterexample(self._loop, self._X0, found, self._start)
 
 
-def _certificate(climbed: Climbed, known: Simulated, least: bool) -> BranchCertificate:
+def _certificate(climbed: StepBounds, known: Simulated, least: bool) -> BranchCertificate:
     """The proof of a requirement."""
     count = len(climbed.bounds)
     proof = BranchCertificate(

@@ -32,7 +32,7 @@ from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated
 from reachjax.sets import AbstractSet, Box
-from reachjax.solvers.branching import Found, Tree, affine_leaf, settled
+from reachjax.solvers.branching import Found, Tree, affine_leaf, attained_multipliers
 from reachjax.solvers.conic_programs import ConicPrograms
 from reachjax.solvers.linear_programs import LinearPrograms
 
@@ -65,8 +65,8 @@ class Target(NamedTuple):
     simulated: Simulated
 
 
-class Climbed(NamedTuple):
-    """What the first three rungs prove of some bounds of one step.
+class StepBounds(NamedTuple):
+    """Bounds of one step that the first three rungs prove.
 
     Attributes:
         about: rows over the columns of the horizon.
@@ -242,7 +242,7 @@ class Ladder:
         each = [forms[i : i + 1] for i in range(len(directions))]
         return Target(each, lambda states: states @ directions.T, enough, simulated), ranges
 
-    def climbed(self, target: Target, left: int = 0, budget: Budget | None = None) -> Climbed:
+    def bounds(self, target: Target, left: int = 0, budget: Budget | None = None) -> StepBounds:
         """Bounds of the state after the steps so far.
 
         Args:
@@ -281,7 +281,7 @@ class Ladder:
             (number in trees and trees[number].found()) or affine_leaf(forms, horizon)
             for number, forms in enumerate(target.forms)
         ]
-        judged = self._judged(target, best, worst, found, ended)
+        judged = self._by_leaves(target, best, worst, found, ended)
         codes = [
             self._ended(trees.get(number), budget)
             if not target.enough(number, float(bound), float(known))
@@ -332,15 +332,15 @@ class Ladder:
         found = self._scenarios.of_units(states, self.horizon.drawn_at(columns))
         return self._scenarios.completed(found, self._middle)
 
-    def _judged(
+    def _by_leaves(
         self,
         target: Target,
         best: np.ndarray,
         worst: np.ndarray,
         found: list[Found],
         ended: list[np.ndarray],
-    ) -> Climbed:
-        """What the leaves prove."""
+    ) -> StepBounds:
+        """The bounds that the leaves prove."""
         horizon, count = self.horizon, len(found)
         width = horizon.facts.columns.shape[1]
         owner = np.repeat(np.arange(count), [len(each.phases) for each in found])
@@ -358,7 +358,7 @@ class Ladder:
         deciding = np.array([leaf[each[leaf].argmax()] for leaf in mine])
         bounds, leaf_counts = bounds_of(leaves, each, count), np.bincount(owner)
         rungs = np.where(leaf_counts > 1, Rung.PHASE_SPLITS, Rung.LINEAR_PROGRAM)
-        return Climbed(
+        return StepBounds(
             about=about,
             branches=leaves,
             bounds=np.fmin(bounds, uppers),
@@ -372,8 +372,8 @@ class Ladder:
             ended=np.array(ended).reshape(-1, len(self._middle)),
         )
 
-    def settled(
-        self, climbed: Climbed
+    def where_attained(
+        self, climbed: StepBounds
     ) -> tuple[Float[np.ndarray, "f n"], Float[np.ndarray, "f m"], Bool[np.ndarray, " f"]]:
         """Columns and multipliers that derivatives of bounds hold, and which are attained."""
         found = climbed.multipliers.copy()
@@ -388,7 +388,9 @@ class Ladder:
             worst, n = climbed.worst[facet], len(self.horizon.start.center)
             at = self.horizon.columns_at(worst[:n], self._scenarios.units_at(worst))
             leaves, bound = phases[owner == facet], climbed.bounds[facet]
-            given = settled(self.horizon, self._programs, form, at, leaves, bound, self._budget)
+            given = attained_multipliers(
+                self.horizon, self._programs, form, at, leaves, bound, self._budget
+            )
             if given is not None:
                 found[facet], columns[facet], there[facet] = given, at, True
         return columns, found, there

@@ -49,8 +49,8 @@ def smallest(margins: Margins) -> float:
     return float(min(known, default=-np.inf))
 
 
-class Sifted(NamedTuple):
-    """What is found of a cell.
+class CellVerdict(NamedTuple):
+    """Whether a cell is proved or refuted, and by what margins.
 
     Attributes:
         proved: whether all requirements hold from every state of it.
@@ -175,8 +175,8 @@ class Sieve:
         lower, upper = (np.stack(ends) for ends in zip(*filled, strict=True))
         return self._loop, lower, upper, self._later
 
-    def sifted(self, cells: Sequence[Ends]) -> list[Sifted]:
-        """What is found of each cell, at most `TOGETHER` of them."""
+    def sifted(self, cells: Sequence[Ends]) -> list[CellVerdict]:
+        """The verdict on each cell, at most `TOGETHER` of them."""
         _, lower, upper, _ = given = self._given(cells)
         bounds = SIFT(*given, t=self._start)
         first = _at_first(self._directions[0], lower, upper)
@@ -184,7 +184,7 @@ class Sieve:
         with np.errstate(invalid="ignore"):
             return [self._judged(uppers) for uppers in bounds[: len(cells)]]
 
-    def _judged(self, uppers: Float[np.ndarray, "h+1 m"]) -> Sifted:
+    def _judged(self, uppers: Float[np.ndarray, "h+1 m"]) -> CellVerdict:
         """What bounds say of one cell."""
         items, proved, refuted = [rows.item for rows in self._rows], True, False
         margins = no_margins(items, len(uppers) - 1)
@@ -193,7 +193,7 @@ class Sieve:
             holds, fails, margin = rows.judged(uppers[item.time])
             margins[item.name][item.time] = margin
             proved, refuted = proved and holds, refuted or fails
-        return Sifted(proved, refuted, margins)
+        return CellVerdict(proved, refuted, margins)
 
 
 def _at_first(

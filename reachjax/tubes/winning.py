@@ -43,7 +43,7 @@ from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.propagation import known_numbers
 from reachjax.tubes.requirements import AvoidSets, Region, Timed, requirements
 from reachjax.tubes.seals import seal_of
-from reachjax.tubes.sieve import TOGETHER, Ends, Margins, Sieve, Sifted, no_margins
+from reachjax.tubes.sieve import TOGETHER, CellVerdict, Ends, Margins, Sieve, no_margins
 from reachjax.tubes.soundness import require_unbroken_cells
 from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
 from reachjax.tubes.winning_sets import WinningSet
@@ -72,7 +72,7 @@ ENOUGH = 8
 
 
 class Sorted(NamedTuple):
-    """What is found of a cell.
+    """The status of a cell, and how to go on with it.
 
     Attributes:
         status: proved; refuted, from every state; or neither.
@@ -293,7 +293,7 @@ def sorted_cells(
         each = np.split(rooms, np.cumsum([len(part) for part in points])[:-1], axis=1)
         broken = [(part.min(axis=0) < 0) for part in each]
         alike = [number for number, some in enumerate(broken) if some.all() or not some.any()]
-        sifted: dict[int, Sifted] = {}
+        sifted: dict[int, CellVerdict] = {}
         if len(alike) >= ENOUGH:
             sieve = Sieve(task.loop, task.horizon, task.start, task.required)
             some = [boxes[number] for number in alike]
@@ -346,7 +346,7 @@ def _sorted(
     ends: Ends,
     scale: Float[np.ndarray, " n"],
     rooms: Float[np.ndarray, "r c"],
-    sifted: Sifted | None,
+    sifted: CellVerdict | None,
     budget: Budget,
 ) -> Sorted:
     """What is found of one box, given what trajectories from it do, and forms say of it."""
@@ -369,14 +369,14 @@ def _promising(least: Float[np.ndarray, " c"], margin: float) -> bool:
     return bool(least.min() > 0 and least.min() >= ROOM * (least.min() - margin))
 
 
-def _bounded(task: CellTask, box: Box, rooms: Float[np.ndarray, "r c"]) -> Sifted:
+def _bounded(task: CellTask, box: Box, rooms: Float[np.ndarray, "r c"]) -> CellVerdict:
     """What forms and programs say of one box, given how trajectories from it fare."""
     margins = no_margins(task.required, task.horizon)
     try:
         proved, refuted = _climbed(task, jax.device_get(box), rooms, margins)
     except UnboundedError:  # of halves there may be bounds
         proved = refuted = False
-    return Sifted(proved, refuted, margins)
+    return CellVerdict(proved, refuted, margins)
 
 
 def _climbed(

@@ -112,6 +112,63 @@ def test_constants_inside_of_loops_calls_and_branches_are_rounded_once(function)
     assert_simulated(plant)
 
 
+HUNDRED = {
+    "whole numbers of a call": jax.jit(lambda d: jnp.sum(d).astype(int)),
+    "truth values of a call": jax.jit(lambda d: jnp.where(jnp.sum(d) >= 100, 1, 2)),
+    "a branch": lambda d: jax.lax.cond(
+        True, lambda d: jnp.floor(jnp.sum(d)).astype(int), lambda d: 0, d
+    ),
+    "a condition": lambda d: jax.lax.while_loop(
+        lambda k: k < jnp.sum(d) - F32(98.9995), lambda k: k + 1, 0
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HUNDRED)
+def test_what_rounding_decides_is_decided_once(name):
+    made = HUNDRED[name]
+    d = jnp.full((1000,), 0.1, F32)
+    assert_simulated(rj.NonlinearPlant(lambda x, u: x * made(d), states=1, inputs=1))
+
+
+def counted(x):
+    """Turns, as many as rounding decides, beside what depends on the state."""
+    return jax.lax.while_loop(
+        lambda c: c[0] < jnp.sum(jnp.full((1000,), 0.1, F32)) - F32(98.9995),
+        lambda c: (c[0] + 1, 2 * c[1]),
+        (0, x),
+    )[1]
+
+
+def test_a_condition_beside_states_is_rounded_once():
+    assert_simulated(rj.NonlinearPlant(lambda x, u: counted(x), states=1, inputs=1))
+
+
+KNOWN_OF_REAL_NUMBERS = {
+    "branches": lambda p, x: jax.lax.cond(
+        jnp.isfinite(x[0]), lambda: x * (p * 1.7), lambda: x * (p * 0.1)
+    ),
+    "no NaN": lambda p, x: x * (jnp.where(x == x, p, 0.0) * p) + x * (p * 1.7),
+    "no infinity": lambda p, x: x * (jnp.where(x < jnp.inf, p, 0.0) * p) + x * (p * 1.7),
+}
+
+
+@pytest.mark.parametrize("name", KNOWN_OF_REAL_NUMBERS)
+def test_what_only_the_recording_knows_to_be_constant_takes_no_other_constants(name):
+    """One reader takes one branch, the other both: each has its own numbers of parameters."""
+    function = Partial(lambda p, x, u: KNOWN_OF_REAL_NUMBERS[name](p, x), jnp.array(0.7))
+    loop = rj.ClosedLoop(rj.NonlinearPlant(function, states=1, inputs=1), STILL)
+    X0, template = rj.Box([0.5], [1.0]), rj.Template.box(1)
+
+    def bounds(loop):
+        return rj.reach(loop, X0, 1, template, rj.LinearBounds()).sets[1].b
+
+    ends = jax.vmap(lambda x: loop.simulate(x, 1)[1, 0])(jnp.array([[1.0], [0.5]]))
+    expected = ends * jnp.array([1.0, -1.0])
+    for found in (bounds(loop), jax.jit(bounds)(loop)):
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
 def test_barriers_and_literals_are_passed_on():
     assert_simulated(
         rj.NonlinearPlant(lambda x, u: sum(jax.lax.optimization_barrier((x, u))), 1, 1)

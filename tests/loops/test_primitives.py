@@ -206,7 +206,8 @@ def test_what_is_recorded_does_not_depend_on_numbers_of_parameters():
     def largest(p):
         f = Partial(lambda p, x: jax.nn.relu(x - 0.1) - jax.nn.relu(p * x**2), p)
         loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[0.1]]), rj.Network(f, 1, 1))
-        return rj.reach(loop, rj.Box([-1.0], [1.0]), 2, rj.Template.box(1)).sets[2].b.sum()
+        tube = rj.reach(loop, rj.Box([-1.0], [1.0]), 2, rj.Template.box(1), rj.LinearBounds())
+        return tube.sets[2].b.sum()
 
     p, step = jnp.array(2.0), 1e-3
     difference = (largest(p + step) - largest(p - step)) / (2 * step)

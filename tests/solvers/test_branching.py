@@ -13,7 +13,7 @@ from reachjax.programs.horizon import Horizon, upper_bounds
 from reachjax.programs.initial import InitialColumns
 from reachjax.proofs.branches import Branches, HorizonFacts, bounds_of, leaf_bounds
 from reachjax.proofs.witnesses import initial_states
-from reachjax.solvers.branching import Tree, affine_leaf, settled
+from reachjax.solvers.branching import Tree, affine_leaf, attained_multipliers
 from reachjax.solvers.conic_programs import ConicPrograms
 from reachjax.solvers.linear_programs import LinearPrograms
 from tests.closed_loops import initial_set, on_host, switching_loop
@@ -414,14 +414,14 @@ def test_round_sets_are_bounded_tightly(kind):
         assert attained.max() - 1e-9 <= bound <= attained.max() + 2e-2 * spread
 
 
-def test_settled_multipliers_bound_what_is_attained(case):
+def test_multipliers_bound_what_is_attained(case):
     _, _, horizon, directions, exact, worst = case
     programs = programs_of(horizon)
     for i, value in enumerate(exact):
         row = directions[i : i + 1] @ horizon.state
         at = horizon.columns_at(worst[i])
         none = np.full((1, len(horizon.zero)), -1)
-        multipliers = settled(horizon, programs, row, at, none, value)
+        multipliers = attained_multipliers(horizon, programs, row, at, none, value)
         assert multipliers is not None
         facts = horizon.facts.rows[:, 0] + horizon.facts.columns @ at
         assert multipliers @ facts == pytest.approx(0.0, abs=1e-6)
@@ -434,18 +434,18 @@ def test_settled_multipliers_bound_what_is_attained(case):
         assert abs(weighed[of_units]).max(initial=0.0) <= 1e-6 * abs(row.columns).sum()
 
 
-def test_what_is_not_the_maximum_is_not_settled(case):
+def test_what_is_not_the_maximum_has_none(case):
     _, X0, horizon, directions, _, _ = case
     center = np.asarray(X0.bounding_box().center)
     row, none = directions[:1] @ horizon.state, np.full((1, len(horizon.zero)), -1)
     at = horizon.columns_at(center)
     value = float(row.rows[0, 0] + row.columns[0] @ at[: row.columns.shape[1]])
-    assert settled(horizon, programs_of(horizon), row, at, none, value) is None
+    assert attained_multipliers(horizon, programs_of(horizon), row, at, none, value) is None
 
 
-def test_what_is_attained_below_the_bound_is_not_settled(case):
+def test_what_is_attained_below_the_bound_has_none(case):
     _, _, horizon, directions, exact, worst = case
     row, none = directions[:1] @ horizon.state, np.full((1, len(horizon.zero)), -1)
     at, above = horizon.columns_at(worst[0]), exact[0] + 1e-3 * abs(row.columns).sum()
-    assert settled(horizon, programs_of(horizon), row, at, none, exact[0]) is not None
-    assert settled(horizon, programs_of(horizon), row, at, none, above) is None
+    assert attained_multipliers(horizon, programs_of(horizon), row, at, none, exact[0]) is not None
+    assert attained_multipliers(horizon, programs_of(horizon), row, at, none, above) is None

@@ -47,22 +47,21 @@ STEP, PROMISED = 1e-4, 1e-3
 ALL_PARTS = 3e-5  # a step in all parts: those of small gradients move by up to ten times as much
 
 
-@pytest.mark.parametrize("args", [(0, False), (1, True), (3, False)], ids=str)
+@pytest.mark.parametrize(
+    "args",
+    [(0, False), (1, True), pytest.param((3, False), marks=pytest.mark.long)],
+    ids=str,
+)
 def test_the_gradient_of_a_step_is_the_central_difference(args):
     args = planar(*args)
     gradient = jax.grad(value, argnums=(0, 1))(*args)
     assert error_in_all_parts(value, args, gradient, ALL_PARTS) <= PROMISED
 
 
-FIVE_STEPS = [
-    (0, True),
-    *(pytest.param(*args, marks=pytest.mark.long) for args in ((0, False), (1, False), (1, True))),
-    pytest.param(2, True, marks=pytest.mark.long),
-]
-
-
-@pytest.mark.parametrize(("seed", "polytope"), FIVE_STEPS)
-@pytest.mark.costly
+@pytest.mark.parametrize(
+    ("seed", "polytope"), [(0, True), (0, False), (1, False), (1, True), (2, True)]
+)
+@pytest.mark.long  # what gradients of one step, and of two, claim in minutes
 def test_the_gradient_of_five_steps_is_the_central_difference(seed, polytope):
     """Neurons leave and enter the basis on the way."""
     args = planar(seed, polytope)
@@ -231,7 +230,7 @@ def test_second_derivatives_in_reverse_mode_raise(template, wrapped):
         wrapped(jax.grad(jax.grad(once)))(1.0)
 
 
-@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.long), 3])
 @pytest.mark.costly
 def test_the_gradient_is_the_central_difference_in_other_dimensions(n):
     region = box_region(n, seed=n)
@@ -253,7 +252,15 @@ INTEGRATOR = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
 
 
 @pytest.mark.costly
-@pytest.mark.parametrize("widths", [(1e-3, 0.5), (1e-6, 0.5), (0.0, 0.5), (0.0, 0.0)])
+@pytest.mark.parametrize(
+    "widths",
+    [
+        pytest.param((1e-3, 0.5), marks=pytest.mark.long),
+        (1e-6, 0.5),
+        pytest.param((0.0, 0.5), marks=pytest.mark.long),
+        (0.0, 0.0),
+    ],
+)
 def test_flat_and_thin_sets_and_points_have_gradients(widths):
     """Of where they are, and of the loop: not of the width, which has a kink at zero."""
 

@@ -18,6 +18,7 @@ from tests.disturbed_loops import (
     disturbed_loop,
     double_integrator,
 )
+from tests.quick_cases import some
 
 KINDS = ["box", "varying box", "polytope", "ellipsoid", "intersection"]
 ROUNDING = 1e-9
@@ -145,11 +146,15 @@ def test_noise_alone_and_disturbances_without_width():
 
 
 @pytest.mark.parametrize(
-    "relaxation", [rj.LinearBounds(), rj.BranchAndCut()], ids=lambda r: type(r).__name__
+    ("kind", "relaxation"),
+    some(
+        product(["box", "polytope", "ellipsoid"], [rj.LinearBounds(), rj.BranchAndCut()]),
+        lambda *case: case in (("box", rj.BranchAndCut()), ("ellipsoid", rj.LinearBounds())),
+    ),
+    ids=lambda each: each if isinstance(each, str) else type(each).__name__,
 )
-@pytest.mark.parametrize("kind", ["box", "polytope", "ellipsoid"])
 @pytest.mark.costly
-def test_gradients_are_those_of_differences(relaxation, kind):
+def test_gradients_are_those_of_differences(kind, relaxation):
     loop = disturbed_loop(2, disturbance_set(kind, 2), disturbance_set("box", 2, 3), seed=1)
     X0, template = initial(2), rj.Template.octagonal(2)
     weights = jnp.asarray(np.random.default_rng(0).uniform(size=8))

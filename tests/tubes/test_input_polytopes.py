@@ -11,6 +11,7 @@ from reachjax.proofs.branches import Rung
 from tests.closed_loops import initial_set
 from tests.differences import PARTS, along, relative_error
 from tests.input_polytopes import SETS, box_facets, polytope_loop
+from tests.quick_cases import some
 
 HORIZON = 3
 X0 = rj.Box([-0.6, -0.4], [0.5, 0.7])
@@ -92,7 +93,7 @@ def summed(loop, X0):
     return sum((k + 1.0) * weights @ X.b for k, X in enumerate(tube.sets[1:]))
 
 
-@pytest.mark.parametrize("name", ["triangle", "pentagon", "cube"])
+@pytest.mark.parametrize("name", some(["triangle", "pentagon", "cube"], "triangle".__eq__))
 @pytest.mark.costly
 def test_gradients_are_those_of_differences(name):
     loop = polytope_loop(SETS[name], seed=1)

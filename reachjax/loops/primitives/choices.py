@@ -62,10 +62,17 @@ def _stacked(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
             index = np.arange(each.value.size).reshape(each.shape)
             parts += [Comparison(recorder.taken(each.value, row)) for row in index]
         else:
-            parts += [*np.asarray(each)]
-    if not all(isinstance(each, Comparison) or is_plain(each) for each in parts):
+            parts += [*(np.asarray(each) if is_known(each) else each)]
+    if not all(isinstance(each, Comparison) or _is_truth(each) for each in parts):
         raise UnsupportedError(ONLY)
     return Conditions(parts)
+
+
+def _is_truth(part: Any) -> bool:
+    """Whether plain numbers are truth values, or known to stand for such: 0 and 1."""
+    if not is_plain(part):
+        return False
+    return part.dtype == bool or (is_known(part) and bool(np.isin(np.asarray(part), (0, 1)).all()))
 
 
 def _so_far(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:

@@ -75,7 +75,7 @@ def _wave(recorder: Recorder, operands: list[Operand], shape: tuple[int, ...]) -
 
 def _table(recorder: Recorder, operands: list[Operand], shape: tuple[int, ...]) -> Operand:
     """`interp(x, xp, fp)`: ramps that begin at the places, by how much slopes change there."""
-    x, places, heights = operands
+    x, places, heights, *beyond = operands
     if not isinstance(x, Value) or isinstance(places, Value) or not is_constant(places):
         raise UnsupportedError(
             "the places of its table must be constants: close over them, and let what is looked "
@@ -88,6 +88,12 @@ def _table(recorder: Recorder, operands: list[Operand], shape: tuple[int, ...]) 
             "them, and give the table a steep slope there"
         )
     heights = entries(recorder, heights)
+    ends = (entries(recorder, each).item() for each in beyond)
+    if any(a != b for a, b in zip(ends, (heights[0], heights[-1]), strict=False)):
+        raise UnsupportedError(
+            "left and right of its table it must be what it is at the first and at the last place, "
+            "as it jumps there: leave them out"
+        )
     steps = [
         ONE / (b - a) for a, b in zip(map(Fraction, at[:-1]), map(Fraction, at[1:]), strict=True)
     ]

@@ -14,6 +14,7 @@ import numpy as np
 from reachjax.loops.primitives.equations import NOT_FINITE, Equation, Rule, shape_of
 from reachjax.loops.recording import Recorder
 from reachjax.loops.values import Operand, UnsupportedError, Value, is_known
+from reachjax.numerics.rounding import namespace
 
 NONE = -1
 """The number of an entry that there is not."""
@@ -150,15 +151,26 @@ def _set(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) ->
     return _taken(recorder, [whole, part], index)
 
 
+def _columns(
+    equation: Equation, whole: Operand, places: Operand, part: Operand
+) -> list[np.ndarray]:
+    """For each entry of what is scattered, how often it gets to each entry of the whole."""
+    zeros, size = np.zeros(shape_of(whole)), math.prod(shape_of(part))
+    ones = np.eye(size).reshape(size, *shape_of(part))
+    return [np.asarray(_scattered(equation, zeros, places, one, adding=True)) for one in ones]
+
+
 def _added(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
     """`x.at[i].add(y)` with known places: what is added is a sum of entries of `y`."""
     whole, places, part = operands
     _require_known([places])
-    zeros = np.zeros(shape_of(whole))
+    columns = _columns(equation, whole, places, part)
     if not isinstance(part, Value):
-        return recorder.added(whole, equation.evaluate(zeros, places, part))
-    ones = np.eye(part.size).reshape(part.size, *part.shape)
-    columns = [np.asarray(_scattered(equation, zeros, places, one, adding=True)) for one in ones]
+        if not np.any(sum(columns) > 1):
+            return recorder.added(whole, equation.evaluate(0 * columns[0], places, part))
+        for column, number in zip(columns, part.reshape(-1), strict=True):
+            whole = recorder.added(whole, number * column)  # sums of numbers would be rounded
+        return whole
     matrix = np.stack([column.reshape(-1) for column in columns], axis=1)
     return recorder.added(recorder.mapped(part, matrix, equation.shape), whole)
 
@@ -169,7 +181,12 @@ def _multiplied(recorder: Recorder, equation: Equation, operands: Sequence[Opera
     _require_known([places])
     ones = np.ones(shape_of(whole))
     if not isinstance(part, Value):
-        return recorder.scaled(whole, equation.evaluate(ones, places, part))
+        columns, xp = _columns(equation, whole, places, part), namespace(part)
+        if not np.any(sum(columns) > 1):
+            return recorder.scaled(whole, equation.evaluate(ones, places, part))
+        for column, number in zip(columns, part.reshape(-1), strict=True):
+            whole = recorder.scaled(whole, xp.where(column > 0, number, 1.0))
+        return whole
     factor = _set(recorder, equation, [ones, places, part])
     if not isinstance(whole, Value):
         return recorder.scaled(factor, whole)

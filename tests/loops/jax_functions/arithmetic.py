@@ -157,6 +157,7 @@ SPECIAL = [
     lambda x: jnp.copysign(x, 1.0),
     lambda x: jax.scipy.special.xlogy(x + 1, x + 1),
     lambda x: jnp.interp(x, jnp.array([-1.0, 0.0, 2.0]), jnp.array([1.0, 0.0, 3.0])),
+    lambda x: jnp.interp(x, jnp.array([0.0, 0.3]), jnp.array([1.0, 2.0]), left=1.0, right=2.0),
 ]
 
 REFUSED = [

@@ -89,6 +89,7 @@ SCATTERING = [
     lambda x: jnp.zeros((2, 2)).at[:, 1].add(x).sum(axis=1),
     lambda x: x.at[1].multiply(3.0),
     lambda x: x.at[jnp.array([1, 1])].multiply(jnp.array([2.0, 0.5])),
+    lambda x: x.at[jnp.array([0, 0, 0])].add(jnp.array([1e16, 1.0, -1e16])),
     lambda x: x.at[1].multiply(x[1]),
     lambda x: jnp.full(2, 2.0).at[0].multiply(x[0]),
     lambda x: x.at[0].divide(3.0),

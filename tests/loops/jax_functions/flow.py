@@ -21,6 +21,18 @@ def counted(limit, step, x):
     return lax.while_loop(lambda c: c[0] < limit, lambda c: (c[0] + 1, step(c[1])), (0, x))[1]
 
 
+def leaky(mask, y):
+    """A leaky rectifier, by a mask."""
+    return jnp.where(mask, y, 0.1 * y)
+
+
+def first_of(numbers, x):
+    """Zero, or an entry, by the place of the first of the largest of numbers, which agree."""
+    parts = [jnp.stack([jnp.asarray(each)]).astype(int) for each in numbers]
+    branches = [lambda y: 0 * y[0], lambda y: y[0], lambda y: 0 * y[0]]
+    return lax.switch(jnp.argmax(jnp.concatenate(parts)), branches, x)
+
+
 LOOPS = [
     lambda x: lax.fori_loop(0, 3, lambda k, y: A @ y, x),
     lambda x: lax.fori_loop(0, 3, lambda k, y: y * (k + 1), x),
@@ -103,6 +115,9 @@ CHOICES = [
     lambda x: jnp.select([x > 0.3, x > 0], [x, x], 0.0),
     lambda x: jnp.piecewise(x, [x < 0, x >= 0], [lambda y: -y, lambda y: y]),
     lambda x: lax.cond(x[0] > 0, lambda y: y[0], lambda y: -y[0], x),
+    lambda x: jnp.piecewise(x[0], [x[0] < 0, x[0] >= 0.5], [jnp.negative, jnp.positive, jnp.abs]),
+    lambda x: lax.map(lambda m: leaky(*m), ((2 * x).reshape(1, 2) > 0, (2 * x).reshape(1, 2)))[0],
+    lambda x: first_of([0, x[0] > 0, 1], x),
 ]
 
 ACTIVATIONS = [
@@ -227,6 +242,9 @@ LAYERS = [
 ]
 
 REFUSED = [
+    lambda x: first_of([x[0] > 0, 2], x),
+    lambda x: first_of([-1, x[0] > 0], x),
+    lambda x: jnp.interp(x, jnp.array([0.0, 0.3]), jnp.array([1.0, 2.0]), left=0.0, right=2.0),
     lambda x: lax.while_loop(lambda y: y[0] > 0.3, lambda y: y / 2, x),
     lambda x: lax.map(lambda m: m.astype(float), x > 0.1),
     lambda x: lax.scan(lambda m, y: (m & (y > 0), jnp.where(m, y, 2 * y)), True, x)[1],

@@ -16,6 +16,7 @@ from reachjax.solvers.clarabel import FacetCone
 from tests.closed_loops import closed_loop, random_loop, recursion, step_program
 from tests.differences import along, error_in_all_parts, norm, relative_error
 from tests.networks import box_region, simplex_region
+from tests.quick_cases import some
 
 TEMPLATE = rj.Template.octagonal(2)
 WEIGHTS = jnp.linspace(0.5, 2.0, len(TEMPLATE))
@@ -44,6 +45,7 @@ def value(loop, X0, horizon=1, **options):
 # what is promised. Kinks closer than 2e-4 would show as errors of order one: these points have none
 # along these directions, and every facet is solved.
 STEP, PROMISED = 1e-4, 1e-3
+ONE_STATUS = some(OF_SOLVERS, lambda status: status is rj.SolverStatus.INACCURATE)
 ALL_PARTS = 3e-5  # a step in all parts: those of small gradients move by up to ten times as much
 
 
@@ -351,7 +353,7 @@ class Stubborn(rj.AbstractSolver):
 
 
 @pytest.mark.costly
-@pytest.mark.parametrize("status", OF_SOLVERS)
+@pytest.mark.parametrize("status", ONE_STATUS)
 def test_the_gradient_of_an_inaccurate_bound_is_the_central_difference(status):
     """Multipliers off by a fifth prove less than the optimum, whatever the solver calls them."""
     args = planar(0)
@@ -362,7 +364,7 @@ def test_the_gradient_of_an_inaccurate_bound_is_the_central_difference(status):
         assert relative_error(f, args, gradient, along(part, *args, 0), 1e-5) <= 1e-6, part
 
 
-@pytest.mark.parametrize("status", OF_SOLVERS)
+@pytest.mark.parametrize("status", ONE_STATUS)
 def test_a_claim_that_is_borne_out_has_the_gradient_of_the_optimum_whatever_the_status(status):
     loop, X0 = planar(0)
     solver = Stubborn(status)
@@ -374,13 +376,16 @@ def test_a_claim_that_is_borne_out_has_the_gradient_of_the_optimum_whatever_the_
 
 @pytest.mark.parametrize(
     "changes",
-    [
-        {"moments": -3.0},
-        {"moments": 0.99},
-        {"moments": np.nan},
-        {"offsets": 1.1},
-        {"offsets": 0.9},
-    ],
+    some(
+        [
+            {"moments": -3.0},
+            {"moments": 0.99},
+            {"moments": np.nan},
+            {"offsets": 1.1},
+            {"offsets": 0.9},
+        ],
+        lambda changes: changes.get("moments") == 0.99 or changes.get("offsets") == 0.9,
+    ),
     ids=str,
 )
 def test_a_claim_that_is_not_borne_out_has_the_gradient_of_what_is_proved(changes):

@@ -4,6 +4,7 @@ The library is given JAX's functions; a search and a judgement have formulas ove
 """
 
 import itertools
+import math
 from fractions import Fraction
 from types import SimpleNamespace
 from typing import Any
@@ -28,6 +29,7 @@ JAX = SimpleNamespace(
     arcsinh=jnp.arcsinh,
     erf=jax.scipy.special.erf,
     hypot=jnp.hypot,
+    sinc=jnp.sinc,
     solve=jnp.linalg.solve,
     inverse=jnp.linalg.inv,
     table=lambda y: jnp.interp(y, jnp.array(PLACES), jnp.array(HEIGHTS)),
@@ -67,6 +69,13 @@ def _of(function: Any) -> Any:
     return np.vectorize(function, otypes=[object])
 
 
+def _wave(m: Any, y: Any) -> Any:
+    """`sin(pi y) / (pi y)` for `pi` as it is in floats."""
+    angle = math.pi * y
+    some = np.where(angle == 0, 1 + 0 * angle, angle)
+    return np.where(angle == 0, 1 + 0 * angle, m.sin(some) / some)
+
+
 def of(m: Any) -> SimpleNamespace:
     """The functions that go with a namespace of numbers: JAX's, numpy's or mpmath's.
 
@@ -76,15 +85,19 @@ def of(m: Any) -> SimpleNamespace:
     if m is jnp:
         return JAX
     if m is np:
-        return _plain(np, arctan2=np.arctan2, arcsinh=np.arcsinh, erf=lambda y: erf(float(y)))
-    return _plain(m, arctan2=_of(mpmath.atan2), arcsinh=_of(mpmath.asinh), erf=_of(mpmath.erf))
+        own = {"arctan2": np.arctan2, "arcsinh": np.arcsinh, "erf": lambda y: erf(float(y))}
+    else:
+        named = {"arctan2": "atan2", "arcsinh": "asinh", "erf": "erf"}
+        own = {name: _of(getattr(mpmath, theirs)) for name, theirs in named.items()}
+    return _plain(m, sinc=lambda y: _wave(m, y), **own)
 
 
 def by_cases(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
-    """Tables, lengths, angles in all quadrants but one, and a constant that is rounded."""
+    """Tables, lengths, angles in all quadrants but one, waves, and a constant that is rounded."""
     f, a = of(m), p["a"]
     angle = f.arctan2(x[1] / 4, 3 + x[0] * x[0]) + f.hypot(x[0], x[1]) * a[0]
-    return m.stack([x[0] + a[1] * f.table(x[1]) + angle, a[2] * f.erf(x[0]) + u[0] * f.constant()])
+    waves = a[2] * f.erf(x[0]) + f.sinc(2 * x[1]) / 4
+    return m.stack([x[0] + a[1] * f.table(x[1]) + angle, waves + u[0] * f.constant()])
 
 
 def masses(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:

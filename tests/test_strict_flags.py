@@ -56,6 +56,7 @@ def test_sets(kind, strict):
 
 
 @pytest.mark.parametrize("relaxation", [rj.LinearBounds(), rj.BranchAndCut()])
+@pytest.mark.costly
 def test_tubes_and_verdicts(relaxation, strict):
     tube = rj.reach(LOOP, BOX, 2, OCTAGON, relaxation, samples=100)
     assert rj.verify(tube, safe=SAFE, goal=BALL.replace(shape=np.eye(2)), samples=100).proved
@@ -64,6 +65,7 @@ def test_tubes_and_verdicts(relaxation, strict):
     assert LOOP.simulate(np.ones((4, 2)), 2).shape == (4, 3, 2)
 
 
+@pytest.mark.costly
 def test_decisions_and_winning_sets(strict):
     assert rj.decide(LOOP, BOX, 2, safe=SAFE, samples=100).proved
     with ThreadPoolExecutor(2) as threads:  # scopes are of one thread
@@ -72,6 +74,7 @@ def test_decisions_and_winning_sets(strict):
     assert len(rj.reach_partitioned(LOOP, BOX, 1, OCTAGON, cells=(2, 1)).tubes) == 2
 
 
+@pytest.mark.costly
 def test_penalties(strict):
     def penalty(net):
         loop = LOOP.replace(controller=net)
@@ -82,6 +85,7 @@ def test_penalties(strict):
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope))
 
 
+@pytest.mark.costly
 def test_functions_of_users_are_as_in_plain_jax(strict):
     """One that keeps to the flags is certified, of another one JAX's error is shown."""
     plant = rj.NonlinearPlant(lambda x, u: 0.5 * x + 0.1 * jnp.sin(x[0]) * u, 2, 1)

@@ -58,6 +58,7 @@ def compiled():
     return []
 
 
+@pytest.mark.costly
 def test_nothing_that_is_said_is_false(block, journal, finished, compiled, request):
     kind = architecture(block[0])
     shapes, anew = kind.loop, isinstance(kind, kinds.Kind) and kind.facets > 0

@@ -100,6 +100,7 @@ def test_suprema_of_affine_loops_are_exact():
 
 
 @pytest.mark.parametrize("lower", [-2.0, 1.0])
+@pytest.mark.costly
 def test_tubes_that_hold_pass_and_shrunk_ones_do_not(lower):
     X0 = interval(lower, 2.0)
     tube = rj.reach(library_loop(), rj.Box([lower], [2.0]), 2, rj.Template.box(1), window=2)
@@ -224,6 +225,7 @@ def test_words_of_other_libraries_are_unclear(monkeypatch):
     assert unclear(repeated.value) == "ValueError from elsewhere"
 
 
+@pytest.mark.costly
 def test_an_exception_of_a_solver_is_a_failed_program():
     solver = Faulty(rj.Clarabel(), "raises")
     with pytest.warns(RuntimeWarning, match="LicenceError was raised"):
@@ -252,6 +254,7 @@ def test_a_case_is_its_seed_and_number():
     assert drawn(3, 5).script != drawn(4, 5).script
 
 
+@pytest.mark.costly
 def test_every_fault_is_one():
     assert hash(Faulty(rj.Clarabel(), "None")) == hash(Faulty(rj.Clarabel(), "None"))
     _, proof = rj.reach_step(library_loop(), rj.Box([1.0], [2.0]), rj.Template.box(1))

@@ -81,6 +81,7 @@ def assert_simulated(plant, compiled=True):
 
 
 @pytest.mark.parametrize("name", CONSTANTS)
+@pytest.mark.costly
 def test_constants_are_rounded_once(name):
     constant = CONSTANTS[name]
     assert_simulated(rj.NonlinearPlant(lambda x, u: x * constant(), states=1, inputs=1))
@@ -154,6 +155,7 @@ KNOWN_OF_REAL_NUMBERS = {
 
 
 @pytest.mark.parametrize("name", KNOWN_OF_REAL_NUMBERS)
+@pytest.mark.costly
 def test_what_only_the_recording_knows_to_be_constant_takes_no_other_constants(name):
     """One reader takes one branch, the other both: each has its own numbers of parameters."""
     function = Partial(lambda p, x, u: KNOWN_OF_REAL_NUMBERS[name](p, x), jnp.array(0.7))

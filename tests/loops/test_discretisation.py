@@ -49,6 +49,7 @@ def test_they_agree_to_fifth_order():
     assert errors[0] / errors[1] == pytest.approx(2**5, rel=0.1)
 
 
+@pytest.mark.costly
 def test_the_derivative_in_the_plant_is_that_of_the_exponential():
     gradient = jax.grad(lambda a: rj.zero_order_hold(a[None, None], [[1.0]], period=2.0).A[0, 0])
     assert float(gradient(jnp.array(-0.5))) == pytest.approx(2 * np.exp(-1.0))

@@ -36,6 +36,7 @@ def test_a_set_may_touch_the_edge_of_a_domain(name):
         assert np.all(bounds <= most * sampled), (options, bounds / sampled)
 
 
+@pytest.mark.costly
 def test_also_after_several_steps_and_beside_what_is_drawn():
     plant = rj.NonlinearPlant(
         lambda x, u, w: jnp.stack([0.5 * jnp.sqrt(x[0]), x[0] + 0.1 * w[0] + u[0]]), 2, 1, 1

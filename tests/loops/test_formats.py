@@ -195,6 +195,7 @@ def test_every_result_of_an_operator_is_that_of_onnxruntime(name, tmp_path):
 
 
 @pytest.mark.parametrize("path", EXPORTED, ids=lambda path: path.stem)
+@pytest.mark.costly
 def test_what_exporters_write_computes_what_onnxruntime_does(path):
     net = rj.Network.from_file(path)
     points = 3 * floats(200, net.inputs, seed=7)
@@ -203,6 +204,7 @@ def test_what_exporters_write_computes_what_onnxruntime_does(path):
 
 
 @pytest.mark.parametrize("path", EXPORTED, ids=lambda path: path.stem)
+@pytest.mark.costly
 def test_certified_sets_hold_the_trajectories_of_onnxruntime(path):
     net = rj.Network.from_onnx(path)
     n, m = net.inputs, net.outputs
@@ -219,6 +221,7 @@ def test_certified_sets_hold_the_trajectories_of_onnxruntime(path):
         assert room.min(axis=0).max() < 0.05  # and the sets are no larger than they must be
 
 
+@pytest.mark.costly
 def test_weights_of_a_file_have_derivatives(tmp_path):
     path = written(tmp_path / "net.onnx", dense(), DENSE)
     net = rj.Network.from_onnx(path)
@@ -359,6 +362,7 @@ def test_plain_text(layers, points, tmp_path):
     same(rj.Network.from_file(path), expected, points)
 
 
+@pytest.mark.costly
 def test_a_chain_from_a_file_is_bounded_as_the_network_that_it_is(tmp_path):
     data = random_loop(2, (4, 3), seed=2)
     loop, path = closed_loop(data), tmp_path / "controller.mat"

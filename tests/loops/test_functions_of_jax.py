@@ -121,6 +121,7 @@ def assert_judged(functions, *wanted):
     assert not [each for each in found if each[1] not in wanted]
 
 
+@pytest.mark.costly
 def test_every_fortieth_function_is_inside():
     functions = [f for family in FAMILIES.values() for f in family][::40]
     assert_judged(functions, "accepted")

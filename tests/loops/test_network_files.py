@@ -373,6 +373,7 @@ def test_versions_of_matlab_files_that_are_not_read_say_what_to_do(tmp_path):
         rj.Network.from_file(path)
 
 
+@pytest.mark.costly
 def test_a_matlab_file_that_grows_without_end_is_refused(tmp_path):
     path = tmp_path / "net.mat"
     scipy.io.savemat(path, {"x": 1})

@@ -96,6 +96,7 @@ def with_biases(module):
 
 
 @pytest.mark.parametrize("build", NNX.values(), ids=NNX.keys())
+@pytest.mark.costly
 def test_a_network_from_an_nnx_module_maps_as_the_module_does(build):
     module = with_biases(build())
     x = jax.random.normal(jax.random.key(1), (20, 3))
@@ -141,6 +142,7 @@ class Linen(linen.Module):
 
 @pytest.mark.parametrize("wrap", [dict, lambda v: v["params"], freeze])
 @pytest.mark.parametrize("use_bias", [True, False])
+@pytest.mark.costly
 def test_a_network_from_linen_parameters_maps_as_the_module_does(use_bias, wrap):
     module = Linen(use_bias=use_bias)
     x = jax.random.normal(jax.random.key(1), (20, 4))
@@ -150,6 +152,7 @@ def test_a_network_from_linen_parameters_maps_as_the_module_does(use_bias, wrap)
     np.testing.assert_allclose(jax.vmap(net)(x), module.apply(variables, x), rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.costly
 def test_linen_parameters_may_be_traced():
     module = Linen(sizes=(4, 2))
     variables = module.init(jax.random.key(0), jnp.ones(3))
@@ -230,6 +233,7 @@ class NestedLinen(linen.Module):
         return linen.Dense(2)(linen.relu(linen.Dense(2)(x)))
 
 
+@pytest.mark.costly
 def test_linen_layers_that_chain_in_several_orders_are_refused_without_their_module():
     variables = NestedLinen().init(jax.random.key(0), jnp.ones(2))
     with pytest.raises(ValueError, match=r"chain in more than one order.*pass module="):
@@ -246,6 +250,7 @@ def test_linen_layers_that_chain_in_several_orders_are_refused_without_their_mod
     )
 
 
+@pytest.mark.costly
 def test_linen_parameters_need_an_activation_or_their_module():
     class Tanh(linen.Module):
         @linen.compact
@@ -331,6 +336,7 @@ def test_an_activation_that_differs_far_out_is_another_one(name):
         rj.MLP.from_flax(source)
 
 
+@pytest.mark.costly
 def test_a_module_that_saturates_far_out_is_not_read():
     class Saturating(linen.Module):
         @linen.compact

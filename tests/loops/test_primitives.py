@@ -105,6 +105,7 @@ def test_activations_are_sound(name):
     assert_sound(getattr(jax.nn, name), 2 * LOWER, 2 * UPPER)
 
 
+@pytest.mark.costly
 def test_tight_bounds_of_what_is_never_negative():
     low, high = interval(network(lambda x: jnp.linalg.norm(x)[None]))
     np.testing.assert_allclose([low[0], high[0]], [0.0, np.hypot(1.0, 1.5)], atol=1e-13)
@@ -167,6 +168,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.costly
 def test_what_has_no_bounds_is_named(name):
     function, message = REFUSED[name]
     with pytest.raises(TypeError, match=message):
@@ -177,6 +179,7 @@ def turning(x, u):
     return jnp.array([x[0] + 0.1 * u[0], x[1] + 0.1 * jnp.arctan2(x[1], x[0])])
 
 
+@pytest.mark.costly
 def test_angles_have_bounds_in_all_quadrants_but_on_their_cut():
     loop = rj.ClosedLoop(rj.NonlinearPlant(turning, 2, 1), rj.Network(lambda x: -x[:1], 2, 1))
     rng = np.random.default_rng(0)

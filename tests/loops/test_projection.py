@@ -41,6 +41,7 @@ def on_all(C, d, y):
     return jax.vmap(lambda y: projected(y, C, jnp.asarray(d), evaluate))(jnp.asarray(y))
 
 
+@pytest.mark.costly
 def test_it_is_the_nearest_point(inputs):
     y = points(*inputs, 12)
     np.testing.assert_allclose(on_all(*inputs, y), nearest(*inputs, y), atol=2e-5)
@@ -60,6 +61,7 @@ def test_multipliers_satisfy_the_optimality_conditions(inputs):
     assert np.all(abs(m * slack) <= ROUNDING * size**2)
 
 
+@pytest.mark.costly
 def test_points_inside_stay_where_they_are(inputs):
     C, d = inputs
     y = 0.05 * points(C, d, 300)
@@ -74,6 +76,7 @@ def test_compiled_mapped_and_in_batches_on_the_host_it_is_the_same(inputs):
     np.testing.assert_allclose(jax.jit(partial(on_all, C))(d, y), on_host, atol=1e-12)
 
 
+@pytest.mark.costly
 def test_derivatives_are_those_of_differences():
     C, d = polygon(5)
     f = lambda y, d: jnp.sum(jnp.sin(3 * projected(y, C, d, evaluate)))  # noqa: E731
@@ -86,6 +89,7 @@ def test_derivatives_are_those_of_differences():
         assert abs(exact - float(np.subtract(*map(float, ends))) / 2e-6) < 1e-6
 
 
+@pytest.mark.costly
 def test_facets_that_meet_next_to_each_other_are_told_apart():
     """The corner of two facets at an angle of 1e-6, and of two that are opposite but for 1e-15."""
     for C in ([[0.0, 1.0], [1e-6, 1.0]], [[0.0, 1.0], [1e-15, -1.0]]):
@@ -96,6 +100,7 @@ def test_facets_that_meet_next_to_each_other_are_told_apart():
         np.testing.assert_allclose(u, nearest(C, d, y), atol=2e-5)
 
 
+@pytest.mark.costly
 def test_a_flat_polytope_whose_facets_are_opposite_but_for_rounding_is_named():
     C, d = polygon(4)
     flat = d[[0, 1]].tolist()

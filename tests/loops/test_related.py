@@ -78,6 +78,7 @@ def test_quotients_are_bounded_by_what_their_parts_have_in_common(name):
     assert np.all(bounds <= most * sampled), bounds / sampled
 
 
+@pytest.mark.costly
 def test_traced_parameters_beside_a_quotient_are_recorded_alike():
     def bound(scale):
         plant = rj.NonlinearPlant(jax.tree_util.Partial(scaled, scale), 2, 1)

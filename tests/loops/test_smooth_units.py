@@ -345,6 +345,7 @@ def test_waves_of_large_arguments_are_any_numbers_of_size_one(unit):
 
 
 @each_unit
+@pytest.mark.costly
 def test_remainders_and_quadratics_have_derivatives(unit):
     lower, upper = jnp.array([[0.5, 0.7, 1e-7, 1.0, 2.0], [0.9, 3.0, 2e-7, 1.0, 2.0 + 1e-9]])
     lower, upper = usual(unit, lower), usual(unit, upper)

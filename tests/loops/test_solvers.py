@@ -132,6 +132,7 @@ TIGHT = {
 
 
 @pytest.mark.parametrize("name", TIGHT)
+@pytest.mark.costly
 def test_solutions_are_bounded_tightly(name):
     step, X0, most = TIGHT[name]
     bounds, sampled = widths(step, X0, rj.LinearBounds())

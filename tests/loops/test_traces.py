@@ -91,6 +91,7 @@ def described():
     return network(Partial(law, 1.5)).f.described
 
 
+@pytest.mark.costly
 def test_a_description_is_the_same_in_another_process():
     script = (
         "import jax; jax.config.update('jax_enable_x64', True);"

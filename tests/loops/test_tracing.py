@@ -85,6 +85,7 @@ def test_every_kind_of_number_has_the_values_of_the_function(traced):
     )
 
 
+@pytest.mark.costly
 def test_intervals_hold_the_values(traced):
     function, net = traced
     middle, radius = np.array([0.2, -0.3]), np.array([0.3, 0.2])
@@ -115,6 +116,7 @@ def equinox_module():
 
 
 @pytest.mark.parametrize("made", [flax_module, linen_function, equinox_module])
+@pytest.mark.costly
 def test_modules_are_functions_whose_parameters_have_derivatives(made):
     module = made()
     net = rj.Network(module, inputs=2, outputs=1)

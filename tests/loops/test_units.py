@@ -51,6 +51,7 @@ def test_intervals_hold_every_value(unit):
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["plain", "compiled"])
 @pytest.mark.parametrize("unit", UNITS, ids=str)
+@pytest.mark.costly
 def test_lines_are_below_and_above_every_value_and_coincide_where_the_unit_is_affine(
     unit, compiled
 ):
@@ -140,6 +141,7 @@ def test_a_slope_that_is_none_is_refused(slope, error, message):
         (nnx.sigmoid, rj.Sigmoid()),
     ],
 )
+@pytest.mark.costly
 def test_flax_functions_are_read_as_the_activation_that_computes_them(function, activation):
     first, last = (nnx.Linear(*sizes, rngs=nnx.Rngs(0)) for sizes in ((2, 5), (5, 1)))
     module = nnx.Sequential(first, function, last)

@@ -39,6 +39,7 @@ def environment(tmp_path):
     return {name: value for name, value in os.environ.items() if name in kept} | own
 
 
+@pytest.mark.costly
 def test_a_second_process_compiles_nothing(environment, tmp_path):
     folder = tmp_path / "given"
     first, kept = run(environment, folder)
@@ -47,6 +48,7 @@ def test_a_second_process_compiles_nothing(environment, tmp_path):
     assert run(environment, folder) == (str(folder), 0)
 
 
+@pytest.mark.costly
 def test_compilations_are_in_the_users_cache_or_where_they_are_kept_already(environment, tmp_path):
     assert run(environment)[0] == str(tmp_path / "caches" / "reachjax")
     there = str(tmp_path / "there")

@@ -44,6 +44,7 @@ def ellipsoid(n):
         (3, True, True, 4),
     ],
 )
+@pytest.mark.costly
 def test_volumes_of_three_steps_are_those_of_the_paper(n_x, boxed, repeated, seed):
     data = random_loop(n_x, (5, 3), seed=seed, boxed=boxed)
     tube = recursion(

@@ -96,6 +96,7 @@ def test_bounds_are_those_of_ten_lines_of_numpy(options, n_x):
 
 
 @pytest.mark.parametrize("kind", ["box", "ellipsoid", "intersection", "far intersection"])
+@pytest.mark.costly
 def test_compiled_bounds_are_those_of_numpy(kind):
     loop, X0, D = closed_loop(random_loop(3)), initial_set(kind, 3), directions(3, 0, 3)
     box = X0.bounding_box()
@@ -188,6 +189,7 @@ def test_forms_keep_what_later_programs_need():
     np.testing.assert_allclose(there, case.successors(x), atol=1e-12)
 
 
+@pytest.mark.costly
 def test_rounding_does_not_grow_with_the_horizon():
     """Forty degrees a step: `|A|^200` is 1e28, and radii of states would grow as much."""
     angle = np.deg2rad(40)
@@ -213,6 +215,7 @@ def test_a_polytope_is_more_than_its_box(kind):
     np.testing.assert_allclose(offsets(loop, X0, D)[-1], exact, atol=1e-9)
 
 
+@pytest.mark.costly
 def test_what_is_known_of_states_is_used():
     case, box, D = controlled(rj.ReLU(), seed=1), box_of(2), directions(2)
     tube = recursion(case.loop, box, STEPS, rj.Template.box(2), relaxation=rj.LocalBounds())

@@ -127,6 +127,7 @@ def test_pruning_empties_the_columns_of_stable_units_in_all_rows(case):
         np.testing.assert_array_equal(used, 1.0)
 
 
+@pytest.mark.costly
 def test_pruning_meets_units_that_pass_that_block_and_that_do_neither():
     loop = closed_loop(loop_data(3, True))
     bounds, _ = bounds_and_rows(loop, rj.Box(*state_box(3)), TIME)
@@ -166,6 +167,7 @@ def exact_rows(data, bounds, prune):
 
 @pytest.mark.parametrize("prune", [False, True])
 @pytest.mark.parametrize("n_x", [1, 3])
+@pytest.mark.costly
 def test_coefficients_are_within_their_radii_of_the_exact_ones(n_x, prune):
     data = loop_data(n_x, True)
     bounds, both = bounds_and_rows(closed_loop(data), rj.Box(*state_box(n_x)), TIME)

@@ -141,6 +141,7 @@ def test_masks_name_the_units_that_are_surely_affine(case):
     assert (y[:, blocking] <= 0).all()
 
 
+@pytest.mark.costly
 def test_the_networks_have_units_of_all_three_kinds():
     kinds = []
     for network in NETWORKS:
@@ -152,6 +153,7 @@ def test_the_networks_have_units_of_all_three_kinds():
 
 
 @pytest.mark.parametrize("n_x", STATES)
+@pytest.mark.costly
 def test_bounds_of_the_first_layer_are_attained_at_corners(n_x):
     data, box = loop_data(n_x, True), rj.Box(*state_box(n_x))
     y = np.asarray(box.vertices()) @ data.layers[0][0].T + data.layers[0][1]

@@ -97,12 +97,14 @@ def check_sound(data, X, t=0):
 
 
 @pytest.mark.parametrize(("kind", "n_x"), some(SETS, quick))
+@pytest.mark.costly
 def test_no_sampled_input_of_a_unit_is_beyond_its_bounds(kind, n_x):
     for seed, network in enumerate(NETWORKS):
         check_sound(random_loop(n_x, seed=seed, network=network), initial(kind, n_x, seed))
 
 
 @pytest.mark.parametrize("t", range(3))
+@pytest.mark.costly
 def test_a_time_varying_loop_has_the_bounds_of_its_time(t):
     data = random_loop(3, seed=2, steps=3)
     check_sound(data, initial("box", 3, seed=2), t)
@@ -115,6 +117,7 @@ def test_a_time_varying_loop_has_the_bounds_of_its_time(t):
 
 
 @pytest.mark.parametrize(("kind", "n_x"), some(SETS, quick))
+@pytest.mark.costly
 def test_no_bound_is_looser_than_that_by_intervals(kind, n_x):
     for seed in range(3):
         loop, X = closed_loop(random_loop(n_x, seed=seed)), initial(kind, n_x, seed)
@@ -129,6 +132,7 @@ def test_no_bound_is_looser_than_that_by_intervals(kind, n_x):
 @pytest.mark.parametrize(
     ("kind", "n_x"), some((case for case in SETS if case[0] not in THIN), quick)
 )
+@pytest.mark.costly
 def test_some_bounds_are_much_tighter_than_those_by_intervals(kind, n_x):
     data, X = random_loop(n_x, seed=1), initial(kind, n_x, seed=1)
     bounds = linear_bounds(closed_loop(data), X)
@@ -159,6 +163,7 @@ def test_the_bounds_of_the_first_layer_are_its_supports(n_x):
 
 
 @pytest.mark.parametrize("n_x", [1, 2, 3, 6])
+@pytest.mark.costly
 def test_a_single_point_has_inputs_and_not_intervals(n_x):
     data, X = random_loop(n_x, seed=3), initial("point", n_x, seed=3)
     bounds, inputs = linear_bounds(closed_loop(data), X), preactivations(data, samples(X, 1))[0]
@@ -166,6 +171,7 @@ def test_a_single_point_has_inputs_and_not_intervals(n_x):
     np.testing.assert_allclose(bounds.upper, inputs, atol=1e-12)
 
 
+@pytest.mark.costly
 def test_a_loop_whose_neurons_do_not_switch_has_exact_bounds():
     data, X = random_loop(2, seed=2, network=affine_network), initial("ellipsoid", 2, seed=2)
     bounds = linear_bounds(closed_loop(data), X)
@@ -178,12 +184,14 @@ def test_a_loop_whose_neurons_do_not_switch_has_exact_bounds():
 
 @pytest.mark.parametrize("scale", [1e-8, 1e3, 1e8])
 @pytest.mark.parametrize("kind", ["box", "polytope", "intersection"])
+@pytest.mark.costly
 def test_weights_of_any_size_have_sound_bounds(kind, scale):
     data = random_loop(3, seed=5)
     data.layers[:] = [(scale * W, scale * b) for W, b in data.layers]
     check_sound(data, initial(kind, 3, seed=5))
 
 
+@pytest.mark.costly
 def test_weights_that_overflow_prove_nothing():
     data, X = random_loop(2, seed=5), initial("box", 2, seed=5)
     data.layers[:] = [(1e200 * W, 1e200 * b) for W, b in data.layers]

@@ -78,6 +78,7 @@ def random_multipliers(rng, facets, units, repeated):
         lambda n_x, boxed, repeated: (n_x in (1, 3)) == (boxed == repeated),
     ),
 )
+@pytest.mark.costly
 def test_paper_qc_is_propositions_one_to_five_and_lemma_one_entry_by_entry(n_x, boxed, repeated):
     steps = None if repeated else 3
     data, region, t = random_loop(n_x, boxed=boxed, steps=steps), simplex_region(n_x, 1), 2
@@ -108,6 +109,7 @@ def test_paper_qc_is_propositions_one_to_five_and_lemma_one_entry_by_entry(n_x, 
         )
 
 
+@pytest.mark.costly
 def test_paper_qc_keeps_every_neuron_even_dead_ones():
     data = random_loop(2, network=dead_network)
     X = rj.Box([-0.1, -0.1], [0.1, 0.1])
@@ -126,6 +128,7 @@ RELAXATIONS = [
 
 @pytest.mark.parametrize("relaxation", RELAXATIONS, ids=str)
 @pytest.mark.parametrize("n_x", STATES)
+@pytest.mark.costly
 def test_facts_products_and_objectives_hold_on_simulated_trajectories(n_x, relaxation):
     data, region = random_loop(n_x, steps=3), box_region(n_x, seed=2, rotated=True)
     loop, X = closed_loop(data), rj.Polytope(region.A, region.b)
@@ -148,6 +151,7 @@ def test_facts_products_and_objectives_hold_on_simulated_trajectories(n_x, relax
     )
 
 
+@pytest.mark.costly
 def test_the_rounding_bound_of_the_products_covers_exact_arithmetic():
     from fractions import Fraction
 
@@ -180,6 +184,7 @@ def test_the_rounding_bound_of_the_products_covers_exact_arithmetic():
     assert ball.rad.max() < 1e-10
 
 
+@pytest.mark.costly
 def test_a_program_compiles_once_for_new_weights_sets_and_times():
     from reachjax.programs.windows import _extended
 

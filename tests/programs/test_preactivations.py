@@ -67,6 +67,7 @@ def touching(X, direction):
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e2])
 @pytest.mark.parametrize("offset", [1e-2, 1.0, 1e6])
+@pytest.mark.costly
 def test_no_exact_input_of_a_unit_is_beyond_its_bounds(offset, size):
     checked = 0
     for seed in range(6):
@@ -83,6 +84,7 @@ def test_no_exact_input_of_a_unit_is_beyond_its_bounds(offset, size):
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
+@pytest.mark.costly
 def test_bounds_of_the_layers_before_any_switch_are_attained(n):
     loop, X = cancelling(n, seed=3, offset=1.0, size=1.0)
     bounds = bounds_of(loop, X).preactivation
@@ -94,6 +96,7 @@ def test_bounds_of_the_layers_before_any_switch_are_attained(n):
     np.testing.assert_allclose(bounds.lower[:6], middle - spread, rtol=1e-9)
 
 
+@pytest.mark.costly
 def test_no_bound_is_looser_than_that_of_the_box():
     loop, X = cancelling(3, seed=1, offset=1.0, size=1.0)
     over, around = bounds_of(loop, X), loop_bounds(loop, X.bounding_box(), 0)

@@ -71,6 +71,7 @@ def test_a_window_begins_at_the_time_of_its_first_set(window):
         assert tube.proof(t).gaps.max() < 1e-2  # of sets of size 0.1 to 1: facts of other times
 
 
+@pytest.mark.costly
 def test_a_window_of_any_length_may_be_asked_for():
     data = random_loop(2, hidden=(3, 2), seed=2)
     long, whole = (tube_of(data, rj.CuttingPlanes(), window) for window in (10, HORIZON))
@@ -154,6 +155,7 @@ QUICK |= {("intersection", 1, 1), ("intersection", 2, 0)}
     ),
     ids=str,
 )
+@pytest.mark.costly
 def test_facts_hold_of_every_trajectory(n_x, kind, relaxation):
     loop, X0 = closed_loop(random_loop(n_x, hidden=(5, 4), seed=3)), initial_set(kind, n_x)
     sets = [X0, *around(loop, X0)]

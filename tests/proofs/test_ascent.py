@@ -46,6 +46,7 @@ def climbed(loop, X, k=HORIZON, starts=None, horizon=HORIZON, start=0):
         product(DIMENSIONS, SETS), lambda n_x, kind: (n_x in (1, 3)) == bool(SETS.index(kind) % 2)
     ),
 )
+@pytest.mark.costly
 def test_an_ascent_never_leaves_the_set_and_never_loses(n_x, kind):
     loop = closed_loop(random_loop(n_x, seed=1))
     for seed in range(2):
@@ -59,6 +60,7 @@ def test_an_ascent_never_leaves_the_set_and_never_loses(n_x, kind):
 
 @pytest.mark.parametrize("kind", ["box", "polytope", "ellipsoid"])
 @pytest.mark.parametrize("n_x", DIMENSIONS)
+@pytest.mark.costly
 def test_of_an_affine_loop_ascents_find_the_support(n_x, kind):
     W, (A, B, c) = np.random.default_rng(n_x).normal(size=(1, n_x)), plant(n_x, 1, seed=n_x)
     loop = rj.ClosedLoop(rj.AffinePlant(A, B, c), rj.MLP.from_layers([(W, [0.1])]))
@@ -70,6 +72,7 @@ def test_of_an_affine_loop_ascents_find_the_support(n_x, kind):
     assert np.all(values.max(axis=0) >= largest - EDGE * (largest + opposite))
 
 
+@pytest.mark.costly
 def test_the_surface_of_an_ellipsoid_has_its_closed_form():
     n_x = 3
     X = initial_set("ellipsoid", n_x, seed=4)
@@ -83,6 +86,7 @@ def test_the_surface_of_an_ellipsoid_has_its_closed_form():
 
 
 @pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.costly
 def test_values_are_those_after_so_many_steps(k):
     data, X = random_loop(2, seed=2), initial_set("box", 2)
     begin, end, _, after = climbed(closed_loop(data), X, k=k, horizon=3)
@@ -110,6 +114,7 @@ def test_a_time_varying_loop_is_climbed_from_its_start():
 
 
 @pytest.mark.parametrize("kind", ["box", "polytope", "ellipsoid", "intersection"])
+@pytest.mark.costly
 def test_starts_outside_are_brought_inside(kind):
     X = initial_set(kind, 2)
     away = 10 * np.random.default_rng(0).normal(size=(4 * STARTS, 2))
@@ -117,6 +122,7 @@ def test_starts_outside_are_brought_inside(kind):
     assert np.asarray(X.contains(end)).all()
 
 
+@pytest.mark.costly
 def test_a_point_stays_where_it_is():
     X = initial_set("box", 2)
     X = X.replace(upper=X.lower)
@@ -125,6 +131,7 @@ def test_a_point_stays_where_it_is():
 
 
 @pytest.mark.parametrize("kind", SETS[:-1])
+@pytest.mark.costly
 def test_simulations_keep_what_ascents_find_and_tolerate_what_is_no_number(kind):
     data, X, n_x = random_loop(3, seed=2), initial_set(kind, 3, seed=1), 3
     simulations = Simulations(closed_loop(data), X, HORIZON, 0, samples=50, seed=0)

@@ -300,6 +300,7 @@ def test_infinite_weights_prove_nothing(several, weights):
     assert np.isinf(leaf_bounds(about, one_leaf(about, weights))[0])
 
 
+@pytest.mark.costly
 def test_shares_that_are_rounded_bound_the_least_all_the_same():
     """Of three rows that are the same constant: a third thrice is not quite one."""
     start = InitialColumns.of(Box([0.0], [1.0]), Box([0.0], [1.0]))

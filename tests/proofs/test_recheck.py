@@ -110,6 +110,7 @@ def test_multipliers_of_another_shape_are_a_clear_failure(case):
 
 
 @pytest.mark.parametrize("n_x", STATES)
+@pytest.mark.costly
 def test_the_recheck_of_a_solved_program_costs_next_to_nothing(n_x):
     region = box_region(n_x, seed=n_x)
     X, template = rj.Polytope(region.A, region.b), rj.Template(directions(n_x, extra=1))

@@ -66,6 +66,7 @@ def test_gradients_are_those_of_differences(case):
     assert error_in_all_parts(f, args, gradient, STEP) < 1e-6
 
 
+@pytest.mark.costly
 def test_gradients_in_all_numbers_of_the_set_are_those_of_differences(case):
     """Normals of polytopes too; their programs' 1e-9 over the step is 1e-4, for a norm of 60."""
     f, (loop, X0), gradient = case
@@ -77,6 +78,7 @@ def test_gradients_in_all_numbers_of_the_set_are_those_of_differences(case):
     assert abs(exact - found) < 1e-5 * norm(gradient[1])
 
 
+@pytest.mark.costly
 def test_values_do_not_depend_on_whether_a_gradient_is_asked_for(case):
     f, args, _ = case
     value, _ = jax.value_and_grad(f)(*args)
@@ -92,6 +94,7 @@ def test_gradients_from_round_sets_are_those_of_differences(units):
     assert error_in_all_parts(f, args, gradient, h=1e-4) < 1e-3
 
 
+@pytest.mark.costly
 def test_gradients_in_directions_are_those_of_differences():
     _, (loop, X0) = problem(2, "box", "ReLU")
     directions = np.random.default_rng(0).normal(size=(3, 2))
@@ -104,6 +107,7 @@ def test_gradients_in_directions_are_those_of_differences():
     assert dot(jax.grad(value)(jnp.asarray(directions)), move) == pytest.approx(found, rel=1e-6)
 
 
+@pytest.mark.costly
 def test_gradients_in_the_weights_alone_are_part_of_all():
     f, (loop, X0) = problem(2, "polytope", "ReLU")
     alone = jax.grad(lambda net: f(loop.replace(controller=net), X0))(loop.controller)

@@ -83,6 +83,7 @@ def test_levels_have_the_derivative_of_what_is_proved(held, factor):
     assert float(mine) == pytest.approx(proved, rel=1e-5, abs=1e-6)
 
 
+@pytest.mark.costly
 def test_where_the_ball_alone_bounds_a_direction_the_derivative_holds_too():
     """No `v` in the direction of the largest eigenvalue: two maximisers, one on either side."""
     held = program(*case(2, seed=0))
@@ -106,6 +107,7 @@ def test_where_the_ball_alone_bounds_a_direction_the_derivative_holds_too():
     np.testing.assert_allclose(mine, proved, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.costly
 def test_a_point_has_a_level_without_a_derivative():
     held = program(*case(2, seed=0))
     zero = NormalForm(np.zeros((2, 2)), np.zeros(2))
@@ -114,6 +116,7 @@ def test_a_point_has_a_level_without_a_derivative():
     assert not moments.any()
 
 
+@pytest.mark.costly
 def test_multipliers_that_prove_nothing_are_not_in_the_derivative():
     """Negative ones are clipped in the proof, and so they are where the optimum is borne out."""
     given = program(*case(1, seed=1))

@@ -19,6 +19,7 @@ def ellipsoid(n, seed=0, scale=1.0):
 
 
 @pytest.mark.parametrize("n", DIMENSIONS)
+@pytest.mark.costly
 def test_the_cone_fact_holds_exactly_on_members(n):
     E = ellipsoid(n)
     x = np.asarray(E.sample_boundary(jax.random.key(0), 500) - E.center)
@@ -33,6 +34,7 @@ def test_the_cone_fact_holds_exactly_on_members(n):
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.costly
 def test_the_cone_fact_is_sound_in_exact_arithmetic(n):
     # with a shape and points of large dynamic range, and rational arithmetic to decide
     E = rj.Ellipsoid(1e3 * np.arange(1, n + 1), np.diag(10.0 ** -np.arange(2, n + 2)) + 1e-6)
@@ -76,6 +78,7 @@ def quadratic_form(Q, d):
 
 
 @pytest.mark.parametrize("n", DIMENSIONS)
+@pytest.mark.costly
 def test_the_support_is_attained_and_never_exceeded(n):
     E = ellipsoid(n)
     D = np.random.default_rng(n).normal(size=(5, n))
@@ -90,6 +93,7 @@ def test_the_support_is_attained_and_never_exceeded(n):
 
 
 @pytest.mark.parametrize("n", DIMENSIONS)
+@pytest.mark.costly
 def test_samples_are_uniform_in_the_set_and_on_its_surface(n):
     E = ellipsoid(n)
     x = E.sample(jax.random.key(0), 20_000)
@@ -105,6 +109,7 @@ def test_samples_are_uniform_in_the_set_and_on_its_surface(n):
     np.testing.assert_allclose(jnp.linalg.norm(surface @ A.T + b, axis=1), 1, rtol=1e-9)
 
 
+@pytest.mark.costly
 def test_volumes_of_balls():
     for n, expected in ((1, 2.0), (2, np.pi), (3, 4 * np.pi / 3), (6, np.pi**3 / 6)):
         assert float(rj.Ellipsoid(np.zeros(n), 4 * np.eye(n)).volume()) == pytest.approx(
@@ -118,6 +123,7 @@ def test_volumes_of_balls():
 
 
 @pytest.mark.parametrize("coordinates", [(0, 1), (4, 2), (5,)])
+@pytest.mark.costly
 def test_a_projection_is_the_shadow_of_the_samples(coordinates):
     E = ellipsoid(6)
     shadow = E.projection(*coordinates)

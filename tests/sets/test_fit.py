@@ -44,6 +44,7 @@ def test_each_step_has_as_many_unit_directions_as_asked_for(n_x, facets):
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.costly
 def test_in_the_plane_they_fit_better_than_regular_directions(seed):
     data, loop, X0 = case(2, seed)
     template = rj.Template.adapted(loop, X0, HORIZON)

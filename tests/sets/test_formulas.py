@@ -87,6 +87,7 @@ def test_the_inner_one_of_two_facets_bounds_a_box_and_an_empty_one_has_no_ends()
     assert np.isnan(slope).any()
 
 
+@pytest.mark.costly
 def test_ends_and_areas_have_derivatives_in_normals():
     """A facet of a box, turned about its middle."""
     b = jnp.ones(4)

@@ -26,6 +26,7 @@ def members(X, count=20_000):
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.costly
 def test_facts_hold_on_members_and_one_fails_on_every_other_point(n):
     X = intersection(n)
     points = np.asarray(X.polytope.bounding_box().sample(jax.random.key(0), 5000))
@@ -42,6 +43,7 @@ def test_facts_hold_on_members_and_one_fails_on_every_other_point(n):
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.costly
 def test_no_member_is_beyond_support_box_or_volume(n):
     X, rng = intersection(n), np.random.default_rng(n)
     x, D = np.asarray(members(X)), rng.normal(size=(6, n))
@@ -56,6 +58,7 @@ def test_no_member_is_beyond_support_box_or_volume(n):
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.costly
 def test_samples_are_uniform_and_reach_both_parts_of_the_surface(n):
     X = intersection(n)
     x, others = X.sample(jax.random.key(0), 5000), members(X)
@@ -85,6 +88,7 @@ def test_a_part_inside_the_other_is_the_set():
 @pytest.mark.parametrize(
     "flat", [rj.Box([0.0, -2.0], [0.0, 2.0]), rj.Box([0.3, 0.4], [0.3, 0.4])], ids=["line", "point"]
 )
+@pytest.mark.costly
 def test_a_flat_part_is_sampled_within_itself(flat):
     X = rj.Intersection(flat, rj.Ellipsoid([0.0, 0.0], np.eye(2)))
     for points in (X.sample(jax.random.key(0), 100), X.sample_boundary(jax.random.key(0), 100)):
@@ -93,6 +97,7 @@ def test_a_flat_part_is_sampled_within_itself(flat):
     assert float(X.volume()) == 0
 
 
+@pytest.mark.costly
 def test_parts_that_hardly_meet_are_not_sampled_and_parts_that_do_not_have_no_box():
     ball = rj.Ellipsoid([0.0, 0.0], np.eye(2))
     corner = rj.Intersection(rj.Box([0.7, 0.7], [5.0, 5.0]), ball)  # 1e-4 of either part
@@ -102,6 +107,7 @@ def test_parts_that_hardly_meet_are_not_sampled_and_parts_that_do_not_have_no_bo
         rj.Intersection(rj.Box([2.0, 0.0], [3.0, 1.0]), ball).bounding_box()
 
 
+@pytest.mark.costly
 def test_volumes_and_boxes_have_derivatives_also_when_compiled():
     def measured(offsets, Q):
         X = rj.Intersection(rj.Template.box(2).polytope(offsets), rj.Ellipsoid([0.0, 0.0], Q))

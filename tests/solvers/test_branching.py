@@ -401,6 +401,7 @@ def test_the_least_of_several_rows_is_largest_over_all_patterns(small):
 
 
 @pytest.mark.parametrize("kind", ["ellipsoid", "intersection"])
+@pytest.mark.costly
 def test_round_sets_are_bounded_tightly(kind):
     loop, X0 = switching_loop(2, hidden=(4, 3), seed=2), initial_set(kind, 2, seed=2)
     horizon, programs = (found := horizon_of(loop, X0)), programs_of(found)

@@ -93,6 +93,7 @@ LIMITED = {
 
 
 @pytest.mark.parametrize(("solver", "expected"), LIMITED.values(), ids=LIMITED.keys())
+@pytest.mark.costly
 def test_bounds_are_sound_when_the_solver_is_stopped_early(setting, solver, expected):
     data, region, _ = setting
     X = rj.Polytope(region.A, region.b)

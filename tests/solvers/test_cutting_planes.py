@@ -134,6 +134,7 @@ def test_sound_however_a_solver_ends(solver):
     check_sound(tube_of(data, X0, CUTS, window=None, solver=solver), data, states)
 
 
+@pytest.mark.costly
 def test_garbage_multipliers_prove_loose_bounds_not_wrong_ones():
     data = random_loop(2, seed=2)
     X0, _ = initial("box", 2, seed=2)
@@ -169,6 +170,7 @@ def test_products_found_once_are_not_sought_again():
     np.testing.assert_allclose(again.value, first.value, atol=1e-5)
 
 
+@pytest.mark.costly
 def test_violated_products_are_those_of_negative_moments():
     data = random_loop(2, hidden=(3, 2), seed=1)
     X0, _ = initial("box", 2)

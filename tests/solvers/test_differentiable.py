@@ -100,6 +100,7 @@ def test_the_gradient_is_as_accurate_as_the_solver():
     assert errors[2] <= PROMISED
 
 
+@pytest.mark.costly
 def test_the_lagrangian_at_the_solution_is_the_offset():
     loop, X = planar(0)
     program = step_program(loop, X, X.bounding_box(), TEMPLATE.directions, 0, rj.LocalBounds())
@@ -199,6 +200,7 @@ def test_forward_mode_and_second_derivatives_raise():
 
 
 @pytest.mark.parametrize("relaxation", [rj.LinearBounds(), rj.BranchAndCut()], ids=str)
+@pytest.mark.costly
 def test_second_derivatives_of_forms_and_branches_are_refused(relaxation):
     loop, X0 = planar(0)
 
@@ -365,6 +367,7 @@ def test_the_gradient_of_an_inaccurate_bound_is_the_central_difference(status):
 
 
 @pytest.mark.parametrize("status", ONE_STATUS)
+@pytest.mark.costly
 def test_a_claim_that_is_borne_out_has_the_gradient_of_the_optimum_whatever_the_status(status):
     loop, X0 = planar(0)
     solver = Stubborn(status)
@@ -388,6 +391,7 @@ def test_a_claim_that_is_borne_out_has_the_gradient_of_the_optimum_whatever_the_
     ),
     ids=str,
 )
+@pytest.mark.costly
 def test_a_claim_that_is_not_borne_out_has_the_gradient_of_what_is_proved(changes):
     args = planar(0)
     f = partial(value, solver=Stubborn(rj.SolverStatus.SOLVED, 0.2, changes))
@@ -398,6 +402,7 @@ def test_a_claim_that_is_not_borne_out_has_the_gradient_of_what_is_proved(change
     assert relative_error(f, args, gradient, along("weights", *args, 0), 1e-5) <= 1e-6
 
 
+@pytest.mark.costly
 def test_what_a_solver_proposes_has_no_derivative():
     loop, X0 = planar(0)
 
@@ -412,6 +417,7 @@ def test_what_a_solver_proposes_has_no_derivative():
     [rj.LocalBounds(), pytest.param(rj.CuttingPlanes(), marks=pytest.mark.long)],
     ids=str,
 )
+@pytest.mark.costly
 def test_the_gradient_of_an_interval_bound_is_the_central_difference(monkeypatch, relaxation):
     def fail(cone, row):
         return rj.SolverStatus.FAILED, None

@@ -71,6 +71,7 @@ def test_what_clarabel_proposes_is_proved_nearly_as_it_stands(solved):
 
 
 @pytest.mark.parametrize("broken", ["nothing", "nan", "singular", "tiny", "huge"])
+@pytest.mark.costly
 def test_whatever_form_is_proposed_the_ellipsoid_holds_the_successors(solved, broken):
     loop, X, held, enclosure = solved
     A, b = enclosure.form

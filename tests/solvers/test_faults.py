@@ -90,6 +90,7 @@ def tube_of(relaxation, solver, template=TEMPLATE):
 
 @pytest.mark.parametrize("fault", WRONG)
 @pytest.mark.parametrize("relaxation", [rj.LocalBounds(), rj.CuttingPlanes()], ids=str)
+@pytest.mark.costly
 def test_facets_of_a_faulty_solver_have_the_bound_that_needs_none(fault, relaxation):
     spoil, message = WRONG[fault]
     with pytest.warns(RuntimeWarning, match=rf"(?s)the solver Faulty counts as FAILED.*{message}"):
@@ -103,6 +104,7 @@ def test_facets_of_a_faulty_solver_have_the_bound_that_needs_none(fault, relaxat
 
 @pytest.mark.parametrize("fault", [f for f in WRONG if f != "a plain tuple"])
 @pytest.mark.parametrize("shape", [None, np.eye(2)], ids=["free", "given"])
+@pytest.mark.costly
 def test_ellipsoids_of_a_faulty_solver_hold(fault, shape):
     loop, X0 = case(2, 0, hidden=(3,))
     solver = Faulty(WRONG[fault][0])
@@ -125,6 +127,7 @@ def test_ellipsoids_of_a_faulty_solver_hold(fault, shape):
     ],
     ids=["none", "text", "shape"],
 )
+@pytest.mark.costly
 def test_a_form_that_is_none_is_a_fault(spoil):
     loop, X0 = case(2, 0, hidden=(3,))
     with pytest.warns(RuntimeWarning, match=r"enclosure\.form"):
@@ -133,6 +136,7 @@ def test_a_form_that_is_none_is_a_fault(spoil):
 
 
 @pytest.mark.parametrize("fault", ["nothing", "too few multipliers", "an exception"])
+@pytest.mark.costly
 def test_faults_inside_jit_are_failed_proposals_too(fault):
     loop, X0 = planar(0)
     spoil, message = WRONG[fault]
@@ -182,6 +186,7 @@ def test_a_solver_may_be_wrong_in_a_compiled_step_too(answer, compiled):
     assert (np.asarray(found) == FAILED).all()
 
 
+@pytest.mark.costly
 def test_facets_that_are_no_numbers_leave_the_others_as_they_are():
     def spoil(found):
         found.multipliers[2, 0] = np.nan
@@ -196,6 +201,7 @@ def test_facets_that_are_no_numbers_leave_the_others_as_they_are():
     assert proof.bounds[2] == interval_offsets(jax.device_get(proof.program))[2]
 
 
+@pytest.mark.costly
 def test_numbers_of_other_kinds_are_numbers():
     """Single precision, lists and whole numbers prove what they prove; none of them is a fault."""
     spoil = changed(
@@ -211,6 +217,7 @@ def test_numbers_of_other_kinds_are_numbers():
     assert proof.multipliers.dtype == float
 
 
+@pytest.mark.costly
 def test_a_solver_that_says_that_it_failed_gives_no_warning():
     spoil = changed(multipliers=lambda y: np.nan * y, statuses=lambda s: 0 * s + 2)
     with warnings.catch_warnings():
@@ -219,6 +226,7 @@ def test_a_solver_that_says_that_it_failed_gives_no_warning():
     assert set(proof.statuses) == {rj.SolverStatus.INFEASIBLE}
 
 
+@pytest.mark.costly
 def test_auto_asks_the_other_solver_for_an_ellipsoid_where_one_is_at_fault():
     loop, X0 = case(2, 0, hidden=(3,))
     faulty = Faulty(raising(ValueError("broken")))
@@ -230,11 +238,13 @@ def test_auto_asks_the_other_solver_for_an_ellipsoid_where_one_is_at_fault():
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(1)])
+@pytest.mark.costly
 def test_interrupts_pass(error):
     with pytest.raises(type(error)):
         tube_of(rj.LocalBounds(), Faulty(raising(error)))
 
 
+@pytest.mark.costly
 def test_options_that_a_solver_does_not_know_are_errors():
     with pytest.raises(TypeError, match="nonsense"):
         tube_of(rj.LocalBounds(), rj.CvxpySolver("CLARABEL", {"nonsense": 1}))

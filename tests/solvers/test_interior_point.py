@@ -73,6 +73,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.costly
 def test_the_schur_matrix_is_that_of_traces_of_explicit_matrices(kind):
     rng, generators = np.random.default_rng(0), presolved(program(**KINDS[kind])).generators
     n = generators.rows.shape[1]
@@ -152,6 +153,7 @@ def test_facets_are_optimal_and_solved_or_inaccurate(answer):
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.costly
 def test_no_sampled_successor_is_outside(seed):
     data, region = random_loop(3, seed=seed), box_region(3, seed)
     loop, template = closed_loop(data), rj.Template(directions(3, seed, extra=2))
@@ -190,6 +192,7 @@ GARBAGE = {
 
 
 @pytest.mark.parametrize("kind", GARBAGE)
+@pytest.mark.costly
 def test_garbage_ends_with_finite_multipliers_and_a_status(kind):
     given = program(hidden=(4,))
     rows = GARBAGE[kind](given.facts.mid, np.random.default_rng(0))
@@ -360,6 +363,7 @@ def test_a_given_shape_gets_the_size_that_clarabel_gives_it(enclosed):
         np.testing.assert_allclose(ours.form.A, theirs.form.A, rtol=1e-5, atol=1e-8)
 
 
+@pytest.mark.costly
 def test_all_neurons_of_a_step_that_clarabel_gives_up_on():
     """The paper's constraints on a set so small that all neurons are affine there."""
     given = program(
@@ -372,6 +376,7 @@ def test_all_neurons_of_a_step_that_clarabel_gives_up_on():
     assert int(SOLVER.enclose(given).status) == rj.SolverStatus.SOLVED
 
 
+@pytest.mark.costly
 def test_a_shape_around_one_point_has_no_size():
     given = program(X=round_of, rows=np.eye(3))
     given = given.with_midpoints(given.facts.mid, 0 * given.objective.mid)
@@ -381,6 +386,7 @@ def test_a_shape_around_one_point_has_no_size():
 
 
 @pytest.mark.parametrize("kind", GARBAGE)
+@pytest.mark.costly
 def test_ellipsoids_from_garbage_are_sound_or_blank(kind):
     given = program(X=round_of, hidden=(4,), rows=np.eye(3))
     rows = GARBAGE[kind](given.facts.mid, np.random.default_rng(0))
@@ -408,6 +414,7 @@ def test_no_ellipsoid_is_proposed_from_what_is_no_number(kind):
 
 
 @pytest.mark.parametrize("network", [he_network, saturating_network, dead_network])
+@pytest.mark.costly
 def test_a_path_that_is_lost_still_gives_an_ellipsoid(network):
     """Stable neurons that are kept have opposite facts, whose multipliers grow without bound."""
     relaxation = rj.LocalBounds(repeated=False, remove_stable=False)
@@ -435,6 +442,7 @@ def test_gradients_of_ellipsoids_of_weights_that_are_no_numbers_are_none(shape):
 
 
 @pytest.mark.parametrize("shape", [None, np.diag([2.0, 1.0])], ids=["free", "given"])
+@pytest.mark.costly
 def test_the_barrier_s_derivatives_are_its_differences(shape, monkeypatch):
     monkeypatch.setattr(barrier, "DAMPING", 0.3)
     given = None if shape is None else NormalForm(shape, np.array([0.1, -0.2]))
@@ -457,6 +465,7 @@ def test_the_barrier_s_derivatives_are_its_differences(shape, monkeypatch):
         np.testing.assert_allclose(hessian @ move, slopes, rtol=1e-5, atol=1e-5 * abs(slopes).max())
 
 
+@pytest.mark.costly
 def test_programs_with_too_many_multipliers_are_left_alone(monkeypatch):
     monkeypatch.setattr(centring, "MOST_MULTIPLIERS", 3)
     found = SOLVER.enclose(program(X=round_of, rows=np.eye(3)))

@@ -49,6 +49,7 @@ def margins(reached, regions=REGIONS):
     "kind",
     [pytest.param(kind, marks=[pytest.mark.costly] * (kind in SLOW)) for kind in REACHED],
 )
+@pytest.mark.costly
 def test_margins_and_their_slopes_are_the_same_in_compiled_code(kind):
     reached = REACHED[kind]
 
@@ -69,6 +70,7 @@ def test_sets_that_are_made_in_compiled_code_are_required_there(name):
 
 
 @pytest.mark.parametrize("kind", ["goal", "safe", "avoid"])
+@pytest.mark.costly
 def test_an_ellipsoid_is_required_in_compiled_code(kind):
     ball, X0, template = rj.Ellipsoid([0.0], [[1.0]]), rj.Box([0.5], [2.0]), rj.Template.box(1)
 
@@ -83,6 +85,7 @@ def test_an_ellipsoid_is_required_in_compiled_code(kind):
 
 
 @pytest.mark.parametrize("X0", [REACHED["box"], REACHED["polytope"]], ids=["box", "polytope"])
+@pytest.mark.costly
 def test_penalties_are_the_same_whatever_is_traced(X0):
     """An obstacle over the middle of the box is deeper in it than its axes' gaps say."""
     plant = rj.AffinePlant([[0.9, 0.2], [-0.1, 0.8]], [[0.0], [0.3]])

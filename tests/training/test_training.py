@@ -75,6 +75,7 @@ def test_cells_have_derivatives_in_compiled_code(case):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.costly
 def test_several_initial_sets_are_penalised_at_once(case):
     loop, X0 = case
     sets = [rj.Box(X0.lower + shift, X0.upper + shift) for shift in (0.0, 0.1, 0.2)]
@@ -145,6 +146,7 @@ def test_a_schedule_warms_up_ramps_and_leaves_steps_out():
 
 
 @pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.costly
 def test_a_schedule_sharpens_the_relaxation(case, compiled):
     stages = {6: rj.LocalBounds(), 2: rj.LinearBounds(), 4: rj.PaperQC()}
     schedule = rj.PenaltySchedule(1.0, relaxations=stages)
@@ -204,6 +206,7 @@ def test_nothing_is_solved_at_steps_without_a_weight(case, compiled):
 
 @pytest.mark.filterwarnings("ignore:the solver Counting counts as FAILED:RuntimeWarning")
 @pytest.mark.parametrize("failing", [None, 3])
+@pytest.mark.costly
 def test_a_run_whose_solver_fails_at_every_third_call_keeps_improving(case, failing):
     """It says how often: no step is skipped, each follows the gradient of what is reported."""
     loop, X0 = case
@@ -354,6 +357,7 @@ def unboxed(case):
 @pytest.mark.parametrize(
     ("factor", "skipped"), [(np.nan, 1), (np.inf, 1), (1e200, 1), (1e12, 0), (1e4, 0)]
 )
+@pytest.mark.costly
 def test_weights_that_went_astray_are_skipped_where_they_have_no_bound(unboxed, factor, skipped):
     """Without an input box, sets that are not numbers have none; those that are large have."""
     controller, optimizer, advance = unboxed
@@ -365,6 +369,7 @@ def test_weights_that_went_astray_are_skipped_where_they_have_no_bound(unboxed, 
     assert any(moved) != bool(skipped) or np.isnan(factor)
 
 
+@pytest.mark.costly
 def test_a_loop_and_a_set_may_be_constants_of_a_compiled_function(case):
     plain = rj.specification_penalty(*case, 1, TEMPLATE, goal=GOAL, margin=0.1)
     compiled = jax.jit(lambda m: rj.specification_penalty(*case, 1, TEMPLATE, goal=GOAL, margin=m))

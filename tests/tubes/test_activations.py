@@ -58,6 +58,7 @@ def basis_points(loop, x):
         lambda place, n_x: (n_x in (1, 6)) == bool(place % 2),
     ),
 )
+@pytest.mark.costly
 def test_facts_products_and_successors_hold_on_simulated_trajectories(place, n_x):
     options = (CONTROLLERS + MIXED)[place]
     case, X = controlled(n_x=n_x, seed=n_x, **options), initial_box(n_x)
@@ -93,6 +94,7 @@ def test_the_units_of_a_loop_are_those_that_its_forward_pass_meets(options):
 
 
 @each_controller
+@pytest.mark.costly
 def test_intervals_hold_what_is_simulated(options):
     for n_x in STATES:
         case, X = controlled(n_x=n_x, seed=n_x, **options), initial_box(n_x)
@@ -167,6 +169,7 @@ def test_sets_of_other_dimensions_hold_every_sample(place, n_x):
 @pytest.mark.parametrize(
     "options", some(CONTROLLERS, lambda options: options is not CONTROLLERS[0]), ids=NAMES
 )
+@pytest.mark.costly
 def test_the_gradient_in_all_weights_is_the_central_difference(options):
     case, X = controlled(n_x=2, seed=3, **options), initial_box(2)
     loop, weights = case.loop, jnp.linspace(0.5, 2.0, 4)

@@ -123,6 +123,7 @@ def test_without_time_the_tube_holds_and_shows_its_gaps(case, limit):
     assert np.asarray(tube.proof(HORIZON).gaps).max() > 1e-3
 
 
+@pytest.mark.costly
 def test_a_larger_gap_leaves_no_more_than_that_open(case):
     loop, X0, start, tube = case
     template = rj.Template.box(loop.states)

@@ -55,6 +55,7 @@ def covered(verdict, X):
 
 @pytest.mark.parametrize("name", ["smooth", "rectified"])
 @pytest.mark.parametrize("cells", [(2, 3), 400])
+@pytest.mark.costly
 def test_what_simulations_keep_a_distance_of_is_proved(name, cells, request):
     loop = request.getfixturevalue(name)
     verdict = rj.decide(loop, X0, HORIZON, safe=around(loop, X0, 0.02), cells=cells)
@@ -76,6 +77,7 @@ def test_what_is_broken_is_refuted_by_a_trajectory(name, request):
     assert not region.contains(states[verdict.counterexample.time])
 
 
+@pytest.mark.costly
 def test_a_limit_leaves_cells_undecided_and_margins_that_say_so(smooth):
     region = around(smooth, X0, 1e-4)
     for limit in ({"cells": 5}, {"cells": (2, 2), "time_limit": 0.0}):
@@ -86,6 +88,7 @@ def test_a_limit_leaves_cells_undecided_and_margins_that_say_so(smooth):
         assert np.min(verdict.margins["safe"]) < 0
 
 
+@pytest.mark.costly
 def test_an_executor_finds_the_same(smooth):
     region = around(smooth, X0, 0.05)
     alone = rj.decide(smooth, X0, HORIZON, safe=region, cells=(2, 2))
@@ -95,6 +98,7 @@ def test_an_executor_finds_the_same(smooth):
     np.testing.assert_array_equal(alone.margins["safe"], shared.margins["safe"])
 
 
+@pytest.mark.costly
 def test_cells_of_polytopes_and_avoided_sets(smooth):
     triangle = rj.Polytope([[-1.0, 0], [0, -1], [1, 1]], [0.2, 0.2, 0.3])
     reached = around(smooth, triangle, 0.02)
@@ -104,6 +108,7 @@ def test_cells_of_polytopes_and_avoided_sets(smooth):
     assert covered(verdict, triangle)
 
 
+@pytest.mark.costly
 def test_a_bar_sees_every_cell_that_is_bounded(smooth):
     seen = []
 
@@ -118,6 +123,7 @@ def test_a_bar_sees_every_cell_that_is_bounded(smooth):
     assert seen[-1] == len(verdict.cells)
 
 
+@pytest.mark.costly
 def test_cells_are_drawn_by_what_is_known_of_them(smooth):
     verdict = rj.decide(smooth, X0, HORIZON, safe=around(smooth, X0, 1e-4), cells=6)
     ax = rj.plot_cells(verdict)
@@ -176,6 +182,7 @@ def rooted(f):
     return rj.ClosedLoop(rj.NonlinearPlant(lambda x, u: f(x) + 0 * u, states=1, inputs=1), law)
 
 
+@pytest.mark.costly
 def test_a_cell_over_which_a_unit_has_no_bounds_is_halved():
     waves = rooted(lambda x: jnp.sqrt(0.3 + jnp.sin(5 * x) * jnp.sin(5 * x + 0.2)))
     domain, goal = rj.Box([0.0], [2.0]), rj.Box([0.4], [1.3])
@@ -188,6 +195,7 @@ def test_a_cell_over_which_a_unit_has_no_bounds_is_halved():
     assert found.volume(rj.VerdictStatus.PROVED) == pytest.approx(2.0)
 
 
+@pytest.mark.costly
 def test_where_units_have_no_bounds_nothing_is_known():
     loop, goal = rooted(jnp.sqrt), rj.Box([-1.0], [3.0])
     verdict = rj.decide(loop, rj.Box([-1.0], [2.0]), 2, goal=goal, cells=8)

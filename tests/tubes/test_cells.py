@@ -78,6 +78,7 @@ def test_any_tree_is_sound(tube):
         assert (found >= np.asarray(tube.proof(3).witnesses) - 1e-12).all()
 
 
+@pytest.mark.costly
 def test_a_gap_that_may_stay_open_takes_fewer_cells():
     given = loop_of(2), STARTS["two"], 3, rj.Template.box(2)
     few, many = (rj.reach(*given, gap=gap).proof(3).cells for gap in (0.1, 1e-4))
@@ -91,6 +92,7 @@ def test_one_cell_climbs_the_ladder():
     assert isinstance(tube.proof(2), rj.BranchCertificate)
 
 
+@pytest.mark.costly
 def test_a_tube_goes_on():
     tube = rj.reach(loop_of(2), STARTS["two"], 2, rj.Template.box(2)).extended(2)
     whole = rj.reach(loop_of(2), STARTS["two"], 4, rj.Template.box(2))
@@ -131,6 +133,7 @@ def test_derivatives_are_those_of_what_is_proved():
     np.testing.assert_allclose(slopes[1], along, rtol=1e-5)
 
 
+@pytest.mark.costly
 def test_what_disturbances_leave_open_is_not_halved_for_ever():
     net = rj.MLP.from_layers([([[1.0, 0.5]], [0.0]), ([[-0.5]], [0.0])], activation=rj.Tanh())
     plant = rj.AffinePlant([[1.0, 0.2], [0.0, 1.0]], [[0.0], [0.3]], E=[[1.0], [1.0]])
@@ -143,6 +146,7 @@ def test_what_disturbances_leave_open_is_not_halved_for_ever():
 
 
 @pytest.mark.filterwarnings("error")
+@pytest.mark.costly
 def test_a_facet_that_never_moves_is_done():
     def f(x, u):
         return jnp.array([x[0] * x[1] + 0 * u[0], 0.0])

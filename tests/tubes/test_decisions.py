@@ -154,6 +154,7 @@ def test_certificates_own_their_numbers():
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(proof))
 
 
+@pytest.mark.costly
 def test_a_ball_that_touches_what_is_avoided_is_refuted():
     loop, X0 = halves(BALL)
     verdict = rj.decide(loop, X0, 2, avoid={2: [rj.Box([0.17, 0.17], [1.0, 1.0])]}, samples=100)
@@ -161,6 +162,7 @@ def test_a_ball_that_touches_what_is_avoided_is_refuted():
     checked(verdict, loop, X0)
 
 
+@pytest.mark.costly
 def test_what_cannot_be_decided_soon_leaves_work_for_what_comes_later(monkeypatch):
     """Else the first requirement takes everything, and a later counterexample is not found."""
     monkeypatch.setattr(rj.tubes.decisions, "WORK", 3e5)
@@ -175,6 +177,7 @@ def test_what_cannot_be_decided_soon_leaves_work_for_what_comes_later(monkeypatc
     checked(verdict, loop, X0)
 
 
+@pytest.mark.costly
 def test_without_time_what_forms_leave_open_is_unknown():
     loop, X0 = switching_loop(3, seed=23, hidden=(4, 3)), initial_set("box", 3, seed=3)
     tube = rj.reach(loop, X0, 3, rj.Template.box(3), samples=100)

@@ -69,6 +69,7 @@ def test_a_data_frame_of_cells_numbers_them(parts):
     np.testing.assert_array_equal(bounds, parts.bounds(2))
 
 
+@pytest.mark.costly
 def test_ellipsoids_have_no_facet(loop, X0):
     mixed = rj.reach(loop, X0, 1, rj.MixedTemplate(BOX), rj.LocalBounds(), 1).to_dataframe()
     assert mixed.facet.isna().tolist() == [False] * 4 + [True]
@@ -94,6 +95,7 @@ def test_a_plot_is_that_of_the_function(tube, parts):
         assert len(ax.patches) == sum(len(t.sets) for t in getattr(each, "tubes", (each,)))
 
 
+@pytest.mark.costly
 def test_notebooks_show_a_table_and_a_picture(tube, parts):
     for each in (tube, parts):
         shown = each._repr_html_()
@@ -139,6 +141,7 @@ def test_a_verdict_that_is_unknown(loop, X0):
     assert rj.verify(tube, goal=rj.Polytope(BOX.directions, best), samples=50).unknown
 
 
+@pytest.mark.costly
 def test_a_verdict_of_cells_and_a_winning_set_show_their_cells(loop, X0):
     verdict = rj.decide(loop, X0, 2, safe=SAFE, cells=2)
     assert "cells: " in verdict._repr_html_()
@@ -149,6 +152,7 @@ def test_a_verdict_of_cells_and_a_winning_set_show_their_cells(loop, X0):
     assert found.plot(Figure().subplots()).get_legend() is not None
 
 
+@pytest.mark.costly
 def test_the_package_lists_its_public_names_only():
     script = "import reachjax; print(*dir(reachjax))"
     done = subprocess.run(

@@ -76,6 +76,7 @@ def test_no_scenario_leaves_a_tube_by_long_windows_and_cuts():
 
 
 @pytest.mark.parametrize("kind", ["ellipsoid", "simplex", "intersection"])
+@pytest.mark.costly
 def test_initial_sets_of_every_kind(kind):
     X0 = initial_set(kind, 2)
     loop = disturbed_loop(2, disturbance_set("box", 2), disturbance_set("ellipsoid", 2, 3), seed=1)
@@ -83,6 +84,7 @@ def test_initial_sets_of_every_kind(kind):
     assert beyond(tube, attacked(loop, X0, 2)) < ROUNDING
 
 
+@pytest.mark.costly
 def test_time_varying_loops_from_a_later_time():
     W, n = disturbance_set("varying box", 2), 2
     loop = disturbed_loop(n, W, seed=1, steps=STEPS)
@@ -117,6 +119,7 @@ def _quiet(loop, X0):
     return loop.replace(plant=loop.plant.replace(E=None), disturbance=None, noise=None), X0
 
 
+@pytest.mark.costly
 def test_of_an_affine_loop_what_disturbances_add_is_known():
     """`x+ = x / 2 + w` from a point: after k steps `|x| <= 2 (1 - 2^-k)` of an ellipsoid `W`."""
     plant = rj.AffinePlant(np.eye(2) / 2, np.zeros((2, 1)), E=np.eye(2))
@@ -131,6 +134,7 @@ def test_of_an_affine_loop_what_disturbances_add_is_known():
         assert exact - 1e-9 <= offsets[diagonal] <= size * exact + 1e-9
 
 
+@pytest.mark.costly
 def test_noise_alone_and_disturbances_without_width():
     loop = disturbed_loop(2, None, disturbance_set("box", 2), seed=1)
     tube = rj.reach(loop, initial(2), 2, rj.Template.box(2))
@@ -197,6 +201,7 @@ def test_a_compiled_gradient_is_the_same():
     assert float(jnp.sum(plain.noise.upper)) != 0
 
 
+@pytest.mark.costly
 def test_verdicts_and_their_counterexamples():
     loop, X0 = double_integrator()
     tube = rj.reach(loop, X0, 4, rj.Template.box(2))
@@ -228,6 +233,7 @@ def _box(region):
     return -region.support(-np.eye(2)), region.support(np.eye(2))
 
 
+@pytest.mark.costly
 def test_partitions_and_longer_tubes_are_those_of_one_call():
     loop, X0 = double_integrator()
     template = rj.Template.box(2)
@@ -240,6 +246,7 @@ def test_partitions_and_longer_tubes_are_those_of_one_call():
         np.testing.assert_array_equal(one.facets[1], other.facets[1])
 
 
+@pytest.mark.costly
 def test_a_proof_is_checked_again():
     loop, X0 = double_integrator()
     for relaxation in (rj.LinearBounds(), rj.BranchAndCut()):
@@ -255,6 +262,7 @@ def test_a_proof_is_checked_again():
         assert np.all(proof.recheck(scale * rng.normal(size=proof.multipliers.shape)) >= largest)
 
 
+@pytest.mark.costly
 def test_simulations_of_a_tube_are_under_disturbances():
     loop, X0 = double_integrator()
     tube = rj.reach(loop, X0, 3, rj.Template.box(2))

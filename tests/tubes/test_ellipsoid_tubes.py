@@ -70,6 +70,7 @@ def test_any_set_starts_a_tube_of_any_template(X0, template):
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
+@pytest.mark.costly
 def test_the_image_of_an_affine_loop_is_exact(n):
     rng = np.random.default_rng(n)
     A, B, K, c = (rng.normal(size=s) for s in ((n, n), (n, 1), (1, n), n))
@@ -149,6 +150,7 @@ def test_a_nilpotent_loop_comes_to_rest():
 
 
 @pytest.mark.parametrize("shape", [None, [[1.0]]], ids=["free", "given"])
+@pytest.mark.costly
 def test_a_deadbeat_loop_comes_to_rest(shape):
     net = rj.MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-1.0, 1.0]], [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net)  # x+ = 0
@@ -158,12 +160,14 @@ def test_a_deadbeat_loop_comes_to_rest(shape):
 
 
 @pytest.mark.parametrize("thinness", [1e-2, 1e-4])
+@pytest.mark.costly
 def test_thin_images_keep_their_volume(thinness):
     loop = affine([[1.0, 1.0], [1.0, 1.0 + thinness]])
     region, _ = one_step(loop, rj.Ellipsoid([0.0, 0.0], np.eye(2)), rj.EllipsoidTemplate())
     np.testing.assert_allclose(region.volume(), np.pi * thinness, rtol=1e-4)
 
 
+@pytest.mark.costly
 def test_volumes_do_not_depend_on_units():
     """Half-axes of 1e8 and 1e-8: the coordinates are those of the ellipsoids themselves."""
     units = np.diag([1e8, 1e-8])
@@ -173,6 +177,7 @@ def test_volumes_do_not_depend_on_units():
     np.testing.assert_allclose(volumes, [1.0, 0.78, 0.78**2], rtol=1e-4)
 
 
+@pytest.mark.costly
 def test_specifications_are_decided_from_ellipsoids():
     net = rj.MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net)  # x+ = 0.6 x
@@ -272,6 +277,7 @@ def test_the_gradient_of_what_is_reported_is_the_central_difference(answering, s
 
 @pytest.mark.parametrize("shape", [None, np.eye(2)], ids=["free", "given"])
 @pytest.mark.parametrize("center", [0.0, 1e5, 1e7, 1e8])
+@pytest.mark.costly
 def test_the_recheck_of_an_ellipsoid_far_from_the_origin_is_no_larger_than_one(center, shape):
     """The proof is repeated in the frame in which it was made."""
     loop = affine([[0.9, 0.2], [-0.1, 0.8]])
@@ -353,6 +359,7 @@ def test_bad_shapes_are_named(shape, message):
         rj.EllipsoidTemplate(shape)
 
 
+@pytest.mark.costly
 def test_mismatches_are_named():
     loop, X0 = case(2, 0)
     with pytest.raises(ValueError, match=r"template is 3, but the loop's number of states is 2"):

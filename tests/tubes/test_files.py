@@ -103,6 +103,7 @@ def test_loops_of_every_kind(path):
         equal(tube, rj.load(path, recheck=True))
 
 
+@pytest.mark.costly
 def test_a_network_of_a_file_is_kept(path):
     net = rj.Network.from_onnx("tests/data/networks/torch_tanh.onnx")
     loop = rj.ClosedLoop(rj.AffinePlant(0.9 * np.eye(2), [[0.0], [0.1]]), net)
@@ -111,6 +112,7 @@ def test_a_network_of_a_file_is_kept(path):
     equal(tube, rj.load(path, recheck=True))
 
 
+@pytest.mark.costly
 def test_cells_are_kept(loop, X0, path):
     parts = rj.reach_partitioned(loop, X0, 2, BOX, cells=(2, 1))
     parts.save(path)
@@ -119,6 +121,7 @@ def test_cells_are_kept(loop, X0, path):
     equal(parts, again)
 
 
+@pytest.mark.costly
 def test_another_process_reads_the_same(tube, path):
     tube.save(path)
     script = (
@@ -131,6 +134,7 @@ def test_another_process_reads_the_same(tube, path):
     assert json.loads(done.stdout) == tube.sets[2].b.tolist()
 
 
+@pytest.mark.costly
 def test_a_function_is_given_again(path):
     loop, X0 = curved(), rj.Box([0.1, -0.1], [0.2, 0.1])
     tube = rj.reach(loop, X0, 2, BOX)
@@ -234,6 +238,7 @@ def test_a_file_that_is_cut_off(part, tube, path):
         rj.load(path)
 
 
+@pytest.mark.costly
 def test_a_file_with_a_flipped_bit(tube, path):
     tube.save(path)
     whole = path.read_bytes()

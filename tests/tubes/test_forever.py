@@ -75,6 +75,7 @@ def test_a_quadrotor_is_safe_for_ever():
     stays(verdict, loop, X0, safe)
 
 
+@pytest.mark.costly
 def test_a_tube_that_comes_back_to_where_it_began_is_closed():
     X0 = rj.Box([-1.0, -1.0], [1.0, 1.0])
     loop, safe = turning(0.9), rj.Box([-2.0, -2.0], [2.0, 2.0])
@@ -85,6 +86,7 @@ def test_a_tube_that_comes_back_to_where_it_began_is_closed():
     assert found.step == found.period
 
 
+@pytest.mark.costly
 def test_what_is_safe_may_cut_the_set():
     X0, safe = rj.Box([0.3, 0.3], [0.4, 0.4]), rj.Box([-0.02, -1.0], [1.0, 1.0])
     net = rj.MLP.from_layers([([[0.0, 0.0]], [0.0])])
@@ -107,6 +109,7 @@ def test_a_limit_cycle_is_safe_where_it_is_and_refuted_where_it_is_not():
 
 
 @pytest.mark.parametrize("loop", [scalar(1.05), turning(1.02)], ids=["line", "spiral"])
+@pytest.mark.costly
 def test_what_leaves_after_fifty_steps_is_refuted(loop):
     n = loop.states
     X0, safe = rj.Box([0.08] * n, [0.1] * n), rj.Box([-1.0] * n, [1.0] * n)
@@ -122,6 +125,7 @@ def test_what_leaves_after_fifty_steps_is_refuted(loop):
     np.testing.assert_allclose(again, example.states, rtol=1e-9)
 
 
+@pytest.mark.costly
 def test_what_leaves_after_any_simulation_is_unknown():
     loop, X0 = scalar(1.0005), rj.Box([0.1], [0.2])
     tube = rj.reach(loop, X0, 3, rj.Template.box(1))
@@ -147,6 +151,7 @@ def test_disturbances_that_never_end():
     assert S.contains(runs[:, -1], 1e-9).all()
 
 
+@pytest.mark.costly
 def test_what_cannot_be_asked_for_is_named():
     loop, X0 = scalar(0.5), rj.Box([0.1], [0.2])
     tube, safe = rj.reach(loop, X0, 2, rj.Template.box(1)), rj.Box([-1.0], [1.0])

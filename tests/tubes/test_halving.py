@@ -52,6 +52,7 @@ def room(wavy):
 
 
 @pytest.mark.parametrize("cells", [None, 300])
+@pytest.mark.costly
 def test_halves_prove_a_smooth_loop_without_any_program(wavy, room, programs, cells):
     verdict = rj.decide(*wavy, STEPS, safe=room, cells=cells)
     assert verdict.status is rj.VerdictStatus.PROVED
@@ -59,6 +60,7 @@ def test_halves_prove_a_smooth_loop_without_any_program(wavy, room, programs, ce
     assert not programs
 
 
+@pytest.mark.costly
 def test_a_whole_set_that_forms_prove_keeps_its_certificates(wavy):
     verdict = rj.decide(*wavy, STEPS, safe=rj.Box([-50.0, -50.0], [50.0, 50.0]))
     assert verdict.status is rj.VerdictStatus.PROVED
@@ -79,6 +81,7 @@ def test_programs_are_the_last_remedy_of_cells_that_may_not_be_halved(programs):
 
 
 @pytest.mark.parametrize("many", [8, 12])
+@pytest.mark.costly
 def test_a_set_without_bounds_is_halved_like_any_part_of_it(many):
     # all states go to -1, 0 or 1; forms of the whole set end beyond all numbers, or nearly
     def step(x, u):

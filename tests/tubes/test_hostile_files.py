@@ -336,6 +336,7 @@ def without(node, *names):
 
 
 @pytest.mark.parametrize("kind", ["branches", "programs"])
+@pytest.mark.costly
 def test_a_file_of_an_earlier_version_is_read(kind, path):
     tube = made(kind)
     tube.save(path)

@@ -60,6 +60,7 @@ def test_nothing_simulated_is_outside_whatever_the_polytope(name, linear):
 
 
 @pytest.mark.parametrize("name", ["triangle", "rotated square", "pentagon"])
+@pytest.mark.costly
 def test_the_default_is_exact(name):
     loop = polytope_loop(SETS[name])
     assert 0.1 < often_projected(loop) < 1
@@ -73,6 +74,7 @@ def test_the_default_is_exact(name):
         np.testing.assert_allclose(tube.proof(k).recheck(), tube.sets[k].b, atol=1e-12)
 
 
+@pytest.mark.costly
 def test_a_box_as_a_polytope_is_the_box():
     C, d = box_facets(2)
     loop = polytope_loop((C, d), seed=1)
@@ -136,6 +138,7 @@ def test_compiled_affine_forms_are_those_of_the_host_and_have_derivatives():
 
 
 @pytest.mark.parametrize(("room", "status"), [(1e-3, "PROVED"), (-1e-3, "REFUTED")])
+@pytest.mark.costly
 def test_verdicts_are_decided(room, status):
     loop = polytope_loop(SETS["rotated square"])
     upper, lower = exact_tube(loop, X0, HORIZON, [[1.0, 0.0], [-1.0, 0.0]]).values[-1]

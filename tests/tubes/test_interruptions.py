@@ -61,6 +61,7 @@ class Stopping:
             yield step
 
 
+@pytest.mark.costly
 def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(task, way):
     template, options = way
     whole = rj.reach(*task, STEPS, template, **options)
@@ -83,6 +84,7 @@ sys.stdout.buffer.write(pickle.dumps(tube.extended(int(sys.argv[1]))))
 """
 
 
+@pytest.mark.costly
 def test_a_tube_goes_on_in_another_process(task):
     template = rj.Template.octagonal(2)
     begun = rj.reach(*task, DONE, template)
@@ -114,6 +116,7 @@ class Heard:
             raise KeyboardInterrupt
 
 
+@pytest.mark.costly
 def test_a_bar_is_told_what_happens_within_a_step(task):
     bar = Heard()
     rj.reach(*task, STEPS, rj.Template.octagonal(2), progress=bar, gap=1e-9)
@@ -124,6 +127,7 @@ def test_a_bar_is_told_what_happens_within_a_step(task):
     assert "semidefinite programs" in bar.notes
 
 
+@pytest.mark.costly
 def test_ctrl_c_within_a_step_leaves_the_steps_before(task):
     template = rj.Template.octagonal(2)
     with pytest.raises(rj.Interrupted) as stopped:

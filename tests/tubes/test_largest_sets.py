@@ -43,6 +43,7 @@ def test_it_is_proved_and_much_larger(loop, X0):
     assert found.region.volume() > 20 * X0.volume()
 
 
+@pytest.mark.costly
 def test_a_set_that_is_too_large_is_shrunk():
     safe = rj.Box([-2.0], [1.0])
     found = rj.largest_set(scalar(0.9), rj.Box([-8.0], [9.0]), 3, safe=safe, rounds=10)
@@ -51,6 +52,7 @@ def test_a_set_that_is_too_large_is_shrunk():
     assert (found.region.upper <= 1.0) & (found.region.lower >= -2.0)
 
 
+@pytest.mark.costly
 def test_avoided_sets_are_kept_away_from():
     avoid = [rj.Box([1.0], [1.5]), rj.Box([-3.0], [-2.0])]
     found = rj.largest_set(scalar(0.5), rj.Box([0.1], [0.2]), 2, avoid=avoid, rounds=10)
@@ -75,6 +77,7 @@ def test_it_can_be_gone_on_with_and_shows_its_progress(loop):
     assert np.isfinite(seen).all()
 
 
+@pytest.mark.costly
 def test_what_begins_where_nothing_is_proved_is_named(loop):
     with pytest.raises(ValueError, match="nothing is proved around the center of X0"):
         rj.largest_set(loop, rj.Box([3.6, 0.0], [3.8, 0.1]), HORIZON, rounds=1, **WANTED)
@@ -94,6 +97,7 @@ def test_flat_sides_stay_flat(loop):
 
 
 @pytest.mark.filterwarnings("error")
+@pytest.mark.costly
 def test_a_side_that_nothing_limits_ends():
     net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant(0.5 * np.eye(2), np.zeros((2, 1))), net)

@@ -74,6 +74,7 @@ def test_a_limit_is_kept(switching, touching, call):
 
 
 @pytest.mark.parametrize("call", CALLS)
+@pytest.mark.costly
 def test_ctrl_c_ends_a_call_soon_and_keeps_what_was_found(switching, touching, call):
     called(call, *switching, touching, time_limit=0.5)  # what is compiled is compiled
     pressed = []
@@ -110,6 +111,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
+@pytest.mark.costly
 def test_programs_in_progress_are_cut_and_what_is_returned_holds(switching, way):
     (loop, X0), (template, relaxation, solver) = switching, WAYS[way]
     began = time.process_time()
@@ -141,6 +143,7 @@ def small():
     return rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net, rj.Box([-1.0], [1.0]))
 
 
+@pytest.mark.costly
 def test_partitions_go_on_from_the_cells_that_were_done(small):
     given = small, rj.Box([-3.0], [3.0]), 2, rj.Template.box(1)
     with pytest.raises(rj.Interrupted, match="known=found") as stopped:
@@ -163,6 +166,7 @@ def test_partitions_go_on_from_the_cells_that_were_done(small):
         rj.reach_partitioned(*given[:2], 3, given[3], cells=(6,), known=done)
 
 
+@pytest.mark.costly
 def test_verdicts_and_winning_sets_hold_what_was_decided(small):
     domain, safe = rj.Box([-8.0], [8.0]), rj.Box([-4.0], [4.0])
     with pytest.raises(rj.Interrupted) as stopped:
@@ -245,12 +249,14 @@ ANSWERS = {
 
 @pytest.mark.parametrize("call", ANSWERS)
 @pytest.mark.parametrize("after", [0, 2])
+@pytest.mark.costly
 def test_a_dead_worker_loses_nothing(small, call, after):
     with pytest.warns(RuntimeWarning, match="a worker of the executor has died"):
         found = ANSWERS[call](small, Dying(after))
     np.testing.assert_allclose(found, ANSWERS[call](small, None))
 
 
+@pytest.mark.costly
 def test_a_process_that_is_killed_loses_nothing(small):
     import multiprocessing
 

@@ -40,12 +40,14 @@ def test_every_trajectory_is_inside(options, n_x):
 
 @pytest.mark.parametrize("n_x", [2, 3])
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.costly
 def test_every_trajectory_from_any_set_is_inside(kind, n_x):
     loop = closed_loop(random_loop(n_x, seed=1))
     assert_holds(tube_of(loop, initial_set(kind, n_x, 1), rj.Template(directions(n_x, 0, 3))))
 
 
 @pytest.mark.parametrize("boxed", [True, False])
+@pytest.mark.costly
 def test_plants_and_input_boxes_may_vary_in_time(boxed):
     loop = closed_loop(random_loop(2, boxed=boxed, steps=7))
     tube = tube_of(loop, initial_set("box", 2), rj.Template.octagonal(2), start=2)
@@ -55,6 +57,7 @@ def test_plants_and_input_boxes_may_vary_in_time(boxed):
         assert (tube.sets[t].b >= late.sets[t].b - 1e-7).all()
 
 
+@pytest.mark.costly
 def test_templates_may_vary_in_time():
     loop, X0 = closed_loop(random_loop(2)), initial_set("box", 2)
     tube = tube_of(loop, X0, rj.Template.adapted(loop, X0, HORIZON, 8, samples=500))
@@ -64,6 +67,7 @@ def test_templates_may_vary_in_time():
 
 @pytest.mark.parametrize("width", [0.0, 1e-12])
 @pytest.mark.parametrize("flat", [1, 2])
+@pytest.mark.costly
 def test_flat_sets_stay_flat(flat, width):
     box = initial_set("box", 2)
     upper = np.where(np.arange(2) < flat, box.lower + width, box.upper)
@@ -74,6 +78,7 @@ def test_flat_sets_stay_flat(flat, width):
         assert (rj.log_widths(tube.sets[-1]) < np.log(1e-10)).all()
 
 
+@pytest.mark.costly
 def test_affine_loops_are_exact():
     A = np.array([[0.9, 0.4], [-0.4, 0.9]])
     X0, D = initial_set("ellipsoid", 2), directions(2)
@@ -82,6 +87,7 @@ def test_affine_loops_are_exact():
     np.testing.assert_allclose(tube.sets[20].b, exact, rtol=1e-12)
 
 
+@pytest.mark.costly
 def test_a_recheck_gives_the_same_bounds_and_holds_for_any_slopes():
     loop, X0 = closed_loop(random_loop(2, seed=1)), initial_set("box", 2, 1)
     tube = tube_of(loop, X0, rj.Template.octagonal(2))
@@ -98,6 +104,7 @@ def test_a_recheck_gives_the_same_bounds_and_holds_for_any_slopes():
 
 
 @pytest.mark.parametrize("kind", ["box", "polytope"])
+@pytest.mark.costly
 def test_slopes_that_overflow_prove_nothing(kind):
     """Nor do they end in the linear programs of a polytope."""
     loop = closed_loop(random_loop(2, hidden=(6, 4), seed=3))
@@ -107,6 +114,7 @@ def test_slopes_that_overflow_prove_nothing(kind):
         assert np.all(found >= proof.witnesses)
 
 
+@pytest.mark.costly
 def test_a_certificate_says_what_every_other_says():
     loop, X0 = closed_loop(random_loop(2)), initial_set("box", 2)
     tube = tube_of(loop, X0, rj.Template.octagonal(2))
@@ -122,6 +130,7 @@ def test_a_certificate_says_what_every_other_says():
     assert np.isfinite(float(rj.log_volume(tube)))
 
 
+@pytest.mark.costly
 def test_cells_are_tighter():
     loop, X0 = closed_loop(random_loop(2, seed=1)), initial_set("box", 2, 1)
     template = rj.Template.octagonal(2)
@@ -157,6 +166,7 @@ def test_a_gradient_is_that_of_the_bounds(options, kind):
     assert error_in_all_parts(penalty, args, gradient, 1e-5) < 1e-5
 
 
+@pytest.mark.costly
 def test_nothing_is_called_from_compiled_code():
     args = closed_loop(random_loop(2)), initial_set("box", 2)
     compiled = jax.jit(jax.value_and_grad(penalty)).lower(*args)

@@ -42,6 +42,7 @@ def starts(n):
         lambda n, X0: X0 == "polytope" or (X0 == "intersection" and n != 2),
     ),
 )
+@pytest.mark.costly
 def test_no_state_is_outside_and_every_bound_is_proved_anew(n, X0):
     region = starts(n)[X0]
     tube = recursion(case(n, 1)[0], region, 2, rj.MixedTemplate(FACETS[n]))
@@ -62,6 +63,7 @@ def test_no_state_is_outside_and_every_bound_is_proved_anew(n, X0):
 
 
 @pytest.mark.parametrize("X0", ["box", "polytope", "ellipsoid", "intersection"])
+@pytest.mark.costly
 def test_a_step_has_what_either_template_alone_has(X0):
     loop, region = case(2, 1, hidden=(3,))[0], starts(2)[X0]
     both, _ = one_step(loop, region, rj.MixedTemplate(FACETS[2]))
@@ -84,6 +86,7 @@ def test_later_sets_are_smaller_than_those_of_either_template_alone():
             assert both.sets[t].volume() <= tube.sets[t].volume() * (1 + 1e-6)
 
 
+@pytest.mark.costly
 def test_facets_tell_a_program_what_the_ellipsoid_does_not():
     # x+ = x / 2 from the half of a disk: the facet `x_1 <= 0` counts beside the cone
     net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
@@ -190,6 +193,7 @@ def test_specifications_are_decided_by_the_better_part():
     assert half.surely_contains(refuted.counterexample.states[0])
 
 
+@pytest.mark.costly
 def test_parts_and_mismatches_are_named():
     loop, X0 = case(2, 0)
     tube = recursion(loop, X0, 1, rj.MixedTemplate(rj.Template.box(2)))

@@ -152,6 +152,7 @@ def test_compiled_sets_are_those_of_the_host(name):
         ("car", 1.25),
     ],
 )
+@pytest.mark.costly
 def test_sets_are_tight(name, most):
     loop, X0 = LOOPS[name]
     tube = rj.reach(loop, X0, HORIZON, rj.Template.box(loop.states))
@@ -215,6 +216,7 @@ def test_a_remainder_that_is_infinite_says_where_and_what_to_do():
         rj.decide(loop, rj.Box([-1.0], [1.0]), 1, goal=rj.Box([-1e9], [1e9]), relaxation=whole)
 
 
+@pytest.mark.costly
 def test_specifications_are_decided():
     loop, X0 = LOOPS["pendulum"]
     runs = trajectories(loop, X0)

@@ -174,6 +174,7 @@ def test_no_sampled_successor_lies_outside_any_set(tube_of):
 
 
 @pytest.mark.parametrize("n_x", STATES)
+@pytest.mark.costly
 def test_a_box_and_the_polytope_of_its_facets_give_the_same_bounds(n_x):
     loop, region = closed_loop(loop_data(n_x, True, False)), box_region(n_x, seed=n_x)
     box = rj.Box(region.corners.min(axis=0), region.corners.max(axis=0))
@@ -193,6 +194,7 @@ def test_a_box_and_the_polytope_of_its_facets_give_the_same_bounds(n_x):
     np.testing.assert_allclose(*bounds, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.costly
 def test_neurons_whose_output_is_constant_do_not_tell_the_solver_their_value():
     """A dead layer makes the next one constant to rounding; the paper's program does not know."""
     rng = np.random.default_rng(0)

@@ -37,6 +37,7 @@ def partitioned(loop):
 
 
 @pytest.mark.parametrize("name", SETS)
+@pytest.mark.costly
 def test_cells_cover_the_set(name):
     X = SETS[name]
     points = X.sample(jax.random.key(0), 500)
@@ -48,6 +49,7 @@ def test_cells_cover_the_set(name):
         assert inside.any(axis=0).all()
 
 
+@pytest.mark.costly
 def test_cells_beside_the_set_are_left_out():
     # of 8 x 8 cells around a diamond those beyond its sides neither overlap nor touch it
     assert len(grid(DIAMOND, (8, 8))) == 52  # of which 16 meet it in a point
@@ -56,6 +58,7 @@ def test_cells_beside_the_set_are_left_out():
 
 
 @pytest.mark.parametrize("name", SETS)
+@pytest.mark.costly
 def test_every_cell_can_be_sampled(name):
     for cell in grid(SETS[name], (4, 4)):  # the diamond meets corner cells in a point
         points = cell.part.sample(jax.random.key(0), 5)
@@ -72,6 +75,7 @@ def test_cells_are_cut_in_every_dimension():
     assert halves(X, X, np.array([0.1, 2.0, 3.0]))[0].box.upper.tolist() == [0.5, 2, 3]
 
 
+@pytest.mark.costly
 def test_cells_of_cells_have_no_more_facets():
     ball = rj.Ellipsoid([0.0, 0.0], np.eye(2))
     half = halves(ball, ball.bounding_box(), np.ones(2))[0]
@@ -103,6 +107,7 @@ def test_the_union_holds_every_state(loop, partitioned):
         assert inside.any(axis=0).all()
 
 
+@pytest.mark.costly
 def test_the_union_is_tighter_than_one_cell(loop, partitioned):
     whole = recursion(loop, SETS["box"], 3, rj.Template.octagonal(2))
     for t in (1, 2, 3):
@@ -126,6 +131,7 @@ def test_guided_cells_close_the_gap_faster_than_none(loop):
     assert worst[2] < worst[1] < worst[0]
 
 
+@pytest.mark.costly
 def test_nothing_is_split_where_no_gap_is_left():
     still, template = autonomous(0.5 * np.eye(2)), rj.Template.box(2)
     tube = rj.reach_partitioned(still, SETS["box"], 1, template, cells=4, **RECURSION)
@@ -165,6 +171,7 @@ class Immediate(ThreadPoolExecutor):
         return future
 
 
+@pytest.mark.costly
 def test_any_executor_runs_the_cells(loop, partitioned):
     executor, seen = Immediate(), []
 
@@ -209,6 +216,7 @@ def test_a_cluster_runs_the_cells(loop, partitioned):
 
 
 @pytest.mark.parametrize("cells", [np.array([2, 1]), jnp.array([2, 1]), np.array(2), np.int64(2)])
+@pytest.mark.costly
 def test_cells_may_be_counted_by_arrays(loop, cells):
     given = loop, SETS["box"], 1, rj.Template.box(2)
     tube = rj.reach_partitioned(*given, cells=cells, gap=0.0, **RECURSION)
@@ -227,12 +235,14 @@ def test_a_gap_ends_the_halving_of_cells(loop):
     assert len(plain.tubes) == 1  # the default closes the gaps of the whole set
 
 
+@pytest.mark.costly
 def test_threads_leave_the_filters_of_warnings_alone(loop):
     before = list(warnings.filters)
     rj.reach_partitioned(loop, SETS["box"], 2, rj.Template.box(2), cells=(3, 2), **RECURSION)
     assert warnings.filters == before
 
 
+@pytest.mark.costly
 def test_an_error_in_a_cell_ends_the_run(loop):
     class Broken(rj.Clarabel):
         def solve(self, program):

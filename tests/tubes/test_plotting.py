@@ -27,6 +27,7 @@ def test_the_outline_of_a_polytope_is_its_corners_in_order():
     assert np.all(x * following_y - y * following_x > 0)  # counter-clockwise around the origin
 
 
+@pytest.mark.costly
 def test_a_tube_is_drawn_on_the_axes_given():
     import matplotlib.pyplot as plt
 
@@ -112,6 +113,7 @@ def loop_of(states):
     "template",
     [rj.Template.box(3), rj.EllipsoidTemplate(), rj.MixedTemplate(rj.Template.box(3))],
 )
+@pytest.mark.costly
 def test_a_tube_of_three_states_is_drawn_on_the_coordinates_given(template):
     import matplotlib.pyplot as plt
 
@@ -124,6 +126,7 @@ def test_a_tube_of_three_states_is_drawn_on_the_coordinates_given(template):
     plt.close("all")
 
 
+@pytest.mark.costly
 def test_what_cannot_be_drawn_is_refused():
 
     cube = rj.Box([0, 0, 0], [1, 1, 1])
@@ -141,6 +144,7 @@ def test_what_cannot_be_drawn_is_refused():
         rj.plot_set(rj.Polytope([[1, 0]], [1]))
 
 
+@pytest.mark.costly
 def test_importing_the_package_changes_no_flag_and_loads_neither_cvxpy_nor_matplotlib():
     code = (
         "import sys, jax; before = dict(jax.config.values); import reachjax; "

@@ -59,12 +59,14 @@ def test_a_start_time_shifts_a_time_varying_loop():
 
 
 @pytest.mark.parametrize("relaxation", RELAXATIONS, ids=str)
+@pytest.mark.costly
 def test_sets_grow_when_the_initial_set_grows(relaxation):
     small, large = (tube_of(2, relaxation, 2, scale)[2] for scale in (0.5, 1.0))
     for t in (1, 2):
         assert np.all(small.sets[t].b <= large.sets[t].b + 1e-7)
 
 
+@pytest.mark.costly
 def test_relaxations_with_more_products_are_tighter():
     bounds = [np.asarray(tube_of(2, relaxation, 1)[2].sets[1].b) for relaxation in RELAXATIONS]
     assert np.all(bounds[1] <= bounds[0] + 1e-7)
@@ -74,6 +76,7 @@ def test_relaxations_with_more_products_are_tighter():
 
 
 @pytest.mark.parametrize("n_x", [1, 2, 3])
+@pytest.mark.costly
 def test_an_affine_loop_without_units_is_exact(n_x):
     rng = np.random.default_rng(n_x)
     A, B, K = rng.normal(size=(n_x, n_x)), rng.normal(size=(n_x, 1)), rng.normal(size=(1, n_x))
@@ -119,18 +122,21 @@ def test_other_multipliers_are_rechecked_from_the_certificate(planar):
         certificate.replace(multipliers=np.nan * others).recheck()
 
 
+@pytest.mark.costly
 def test_one_step_equals_the_first_step_of_a_tube(planar):
     following, certificate = one_step(planar.loop, planar.sets[0], planar.template)
     np.testing.assert_array_equal(following.b, planar.sets[1].b)
     assert certificate.gaps.shape == (len(planar.template),)
 
 
+@pytest.mark.costly
 def test_a_tube_continued_from_its_last_set_is_the_longer_tube(planar):
     short = recursion(planar.loop, planar.sets[0], 2, planar.template)
     more = recursion(planar.loop, short.sets[2], 1, planar.template)
     np.testing.assert_allclose(more.sets[1].b, planar.sets[3].b, rtol=1e-12)
 
 
+@pytest.mark.costly
 def test_progress_wraps_the_steps(planar):
     seen = []
 
@@ -143,11 +149,13 @@ def test_progress_wraps_the_steps(planar):
     assert seen == [0, 1]
 
 
+@pytest.mark.costly
 def test_progress_does_not_choose_the_steps(planar):
     turned = recursion(planar.loop, planar.sets[0], 2, planar.template, progress=reversed)
     np.testing.assert_array_equal(turned.sets[2].b, planar.sets[2].b)
 
 
+@pytest.mark.costly
 def test_polytopes_and_boxes_may_start_a_tube_in_three_dimensions():
     data, region = random_loop(3), simplex_region(3, seed=0)
     X0 = rj.Polytope(region.A, region.b)
@@ -156,6 +164,7 @@ def test_polytopes_and_boxes_may_start_a_tube_in_three_dimensions():
     assert np.all(tube.sets[2].contains(simulate(data, states, 2)[2]))
 
 
+@pytest.mark.costly
 def test_networks_from_flax_certify_like_the_same_layers():
     from flax import nnx
 
@@ -171,6 +180,7 @@ def test_networks_from_flax_certify_like_the_same_layers():
     assert np.all(following.contains(np.asarray(states) + u, 1e-6))
 
 
+@pytest.mark.costly
 def test_a_bound_holds_where_the_compiler_rounds_one_interval_in_two_ways():
     """Weights and states at which midpoint and radius once came from differently rounded ends."""
     low, high, x, width = (
@@ -191,6 +201,7 @@ def test_a_bound_holds_where_the_compiler_rounds_one_interval_in_two_ways():
 
 
 @pytest.mark.parametrize("scale", [1e-10, 1e-6, 1e-2, 1e3, 1e6])
+@pytest.mark.costly
 def test_bounds_are_as_tight_for_small_and_large_units_of_the_state(scale):
     layers = he_network((2, 6, 1), seed=1)
     scaled = [(layers[0][0] / scale, layers[0][1]), (scale * layers[1][0], scale * layers[1][1])]

@@ -32,10 +32,12 @@ CASES = {
 
 
 @pytest.mark.parametrize(("spec", "expected"), CASES.values(), ids=CASES.keys())
+@pytest.mark.costly
 def test_the_shortfall_sums_what_is_missing(spec, expected):
     assert float(rj.shortfall(tube(), **spec)) == pytest.approx(expected, abs=1e-7)
 
 
+@pytest.mark.costly
 def test_it_is_zero_exactly_where_the_specification_is_proved():
     for half in (0.2, 0.24, 0.26, 0.3):
         goal = rj.Box([-half] * 2, [half] * 2)
@@ -54,11 +56,13 @@ def test_it_is_zero_exactly_where_the_specification_is_proved():
     ],
     ids=["goal", "safe", "avoid"],
 )
+@pytest.mark.costly
 def test_its_derivative_goes_through_the_sets(spec, slope):
     gradient = jax.jit(jax.grad(lambda rate: rj.shortfall(tube(rate), **spec)))(0.5)
     assert float(gradient) == pytest.approx(slope, rel=1e-5)
 
 
+@pytest.mark.costly
 def test_bad_specifications_are_named():
     with pytest.raises(ValueError, match="nothing to verify"):
         rj.shortfall(tube())
@@ -71,6 +75,7 @@ def test_bad_specifications_are_named():
 
 
 @pytest.mark.parametrize("scale", [1e155, 1e-170])
+@pytest.mark.costly
 def test_the_shortfall_does_not_depend_on_the_length_of_normals(scale):
     goal = lambda d: rj.Polytope(np.array([[3.0, 4.0]]) * scale, d[None] * scale)  # noqa: E731
     missing = lambda d: rj.shortfall(tube(), goal=goal(d))  # noqa: E731

@@ -80,6 +80,7 @@ def test_a_tube_that_was_copied_stored_or_mapped_to_itself_is_the_same_proof(tub
     assert {verify(each) for each in copies} == {rj.VerdictStatus.PROVED}
 
 
+@pytest.mark.costly
 def test_tubes_from_inside_jit_and_vmap_are_proofs_of_their_own_loops(tube):
     compiled = jax.jit(tube_of)
     inside = compiled(LOOP, X0)
@@ -106,6 +107,7 @@ def test_derivatives_go_through_a_sealed_tube(tube):
     assert np.any(slope.sets[2].b != 0)
 
 
+@pytest.mark.costly
 def test_a_tube_keeps_its_sets_when_the_arrays_that_it_came_from_change():
     upper, weights = aligned([1.0, 1.0]), aligned(0.5 * np.eye(2))
     loop = jax.tree.map(lambda leaf: weights if leaf.shape == (2, 2) else leaf, LOOP)
@@ -125,6 +127,7 @@ def test_certificates_hand_out_no_array_that_can_be_written(tube):
 @pytest.mark.parametrize(
     "template", [TEMPLATE, rj.EllipsoidTemplate()], ids=["facets", "ellipsoid"]
 )
+@pytest.mark.costly
 def test_a_tube_in_32_bits_is_neither_verified_nor_rechecked(template):
     tube = recursion(LOOP, X0, 1, template, samples=10)
     rough = jax.tree.map(
@@ -141,6 +144,7 @@ def test_a_tube_in_32_bits_is_neither_verified_nor_rechecked(template):
             tube.certificates[1].recheck()
 
 
+@pytest.mark.costly
 def test_no_cell_of_a_partition_can_be_left_out():
     cells = rj.reach_partitioned(
         LOOP, X0, 1, TEMPLATE, rj.LocalBounds(), 1, cells=(2, 1), samples=10
@@ -153,6 +157,7 @@ def test_no_cell_of_a_partition_can_be_left_out():
         rj.PartitionedTube(SAFE, cells.tubes)
 
 
+@pytest.mark.costly
 def test_64_bit_floats_may_be_on_in_a_scope_also_inside_jit():
     with jax.enable_x64(False), jax.enable_x64(True):
         expected = tube_of().sets[2].b

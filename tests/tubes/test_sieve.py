@@ -40,6 +40,7 @@ def cells(n, width=0.3):
 
 
 @pytest.mark.parametrize("kind", LOOPS)
+@pytest.mark.costly
 def test_what_is_decided_of_cells_is_true(kind):
     loop = LOOPS[kind]()
     n = loop.states
@@ -63,6 +64,7 @@ def test_what_is_decided_of_cells_is_true(kind):
     assert np.any(decided, axis=0).any()
 
 
+@pytest.mark.costly
 def test_few_cells_are_bounded_as_many():
     loop = LOOPS["three states"]()
     sieve = Sieve(
@@ -73,6 +75,7 @@ def test_few_cells_are_bounded_as_many():
     assert [str(one) for one in many[:2]] == [str(one) for one in few]
 
 
+@pytest.mark.costly
 def test_touching_at_first_is_inside():
     loop = LOOPS["one state"]()
     wanted = requirements(1, 1, None, None, rj.Box([-1e9], [1e9]))

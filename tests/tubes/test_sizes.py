@@ -48,6 +48,7 @@ def test_a_flat_set_has_volume_zero_and_sweeps_its_length_outwards(template):
     np.testing.assert_allclose(jax.grad(area)(flat), 2.0 * across)
 
 
+@pytest.mark.costly
 def test_beyond_four_dimensions_the_bounding_box_is_measured():
     template = rj.Template.box(6)
     offsets = jnp.arange(1.0, 13.0)
@@ -57,6 +58,7 @@ def test_beyond_four_dimensions_the_bounding_box_is_measured():
     np.testing.assert_allclose(gradient, jnp.repeat(1 / widths, 2), rtol=1e-9)
 
 
+@pytest.mark.costly
 def test_the_log_volume_of_a_tube_sums_its_steps():
     net = rj.MLP.from_layers([(np.zeros((1, 2)), [0.0])])
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2) / 2, np.zeros((2, 1))), net)

@@ -86,6 +86,7 @@ def test_a_margin_that_a_trajectory_does_not_have_is_an_error_though_both_are_po
 
 @pytest.mark.parametrize("name", CALLS)
 @pytest.mark.parametrize("beside", [0.0, 1e-12])
+@pytest.mark.costly
 def test_what_is_touched_but_for_rounding_is_no_error(name, beside):
     touched = rj.Box([0.0], [1.0 + beside])  # where trajectories are, and bounds all but are
     found = str(CALLS[name](sound_loop(1.0), safe=touched))

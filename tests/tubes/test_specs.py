@@ -113,6 +113,7 @@ def test_a_larger_goal_never_loses_a_proof(loose):
     assert order[0] is not rj.VerdictStatus.PROVED
 
 
+@pytest.mark.costly
 def test_the_safe_set_is_the_complement_of_its_outer_half_spaces(loose):
     box = rj.Box([-2.0, -1.0], [2.0, 1.0])
     A, b = box.facets
@@ -122,6 +123,7 @@ def test_the_safe_set_is_the_complement_of_its_outer_half_spaces(loose):
     np.testing.assert_allclose(safe.margins["safe"], worst, atol=1e-9)
 
 
+@pytest.mark.costly
 def test_three_dimensions_and_a_narrow_avoid_set():
     start = rj.Box(np.full(3, 0.5), np.ones(3))
     tube = recursion(contraction(3), start, 2, rj.Template.box(3))
@@ -137,6 +139,7 @@ def test_a_verdict_is_no_truth_value(tube):
         bool(verdict)
 
 
+@pytest.mark.costly
 def test_a_violation_that_rounding_makes_is_no_counterexample():
     """Exactly `u = x`, but the simulation rounds upwards over large intermediate numbers."""
     K, high = 2.0**30, 1 + 2.0**-22 * 0.9
@@ -151,6 +154,7 @@ def test_a_violation_that_rounding_makes_is_no_counterexample():
 SCALES = [1e155, 1e-170, 1e300, 1e-300]
 
 
+@pytest.mark.costly
 def test_nothing_is_proved_by_normals_whose_squares_are_no_numbers():
     """The sum of 13 coordinates reaches 6.5, where no corner is simulated."""
     start = rj.Box(-np.ones(13), np.ones(13))
@@ -176,6 +180,7 @@ def test_a_verdict_does_not_depend_on_the_length_of_normals(tube, scale):
                 np.testing.assert_allclose(verdict.margins[name], margins, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.costly
 def test_products_that_underflow_prove_and_refute_nothing():
     """At most 1e-200, where 1e-200 x <= 0 rounds to 0 <= 0."""
     tube = recursion(contraction(1), rj.Box([0.0], [2e-200]), 1, rj.Template.box(1))

@@ -35,6 +35,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize(("made", "options", "expected"), ENDS.values(), ids=ENDS)
+@pytest.mark.costly
 def test_a_facet_whose_gap_is_open_says_why(made, options, expected):
     loop, X0, template = made()
     tube = rj.reach(loop, X0, STEPS, template, **options)
@@ -56,6 +57,7 @@ def test_a_facet_whose_gap_is_open_says_why(made, options, expected):
 
 
 @pytest.mark.parametrize("made", [switching, smooth])
+@pytest.mark.costly
 def test_a_facet_whose_gap_is_closed_is_solved(made):
     loop, X0, template = made()
     tube = rj.reach(loop, X0, STEPS, template)
@@ -65,6 +67,7 @@ def test_a_facet_whose_gap_is_closed_is_solved(made):
     assert int(rj.unsolved(tube)) == 0
 
 
+@pytest.mark.costly
 def test_a_decision_that_ran_out_of_time_or_programs_says_so():
     loop, X0, template = switching()
     proof = rj.reach(loop, X0, STEPS, template).proof(STEPS)
@@ -102,6 +105,7 @@ def test_a_search_of_cells_that_is_interrupted_says_so():
     assert rj.SolverStatus.INTERRUPTED in tube.proof(1).statuses
 
 
+@pytest.mark.costly
 def test_statuses_are_kept_by_a_file_and_shown_by_tables(tmp_path):
     loop, X0, template = switching()
     tube = rj.reach(loop, X0, STEPS, template, time_limit=0)
@@ -124,6 +128,7 @@ def test_each_status_has_one_sentence_of_advice_and_solvers_report_the_first_one
     ]
 
 
+@pytest.mark.costly
 def test_forms_in_compiled_code_say_what_they_are():
     loop, X0, template = switching()
 

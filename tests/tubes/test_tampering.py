@@ -177,6 +177,7 @@ def test_a_tube_that_was_changed_is_not(kind, change, tmp_path):
         read(tmp_path / "tube.reach", changed(made(kind), change))
 
 
+@pytest.mark.costly
 def test_cells_that_leave_something_out(tmp_path):
     tube = made("partition")
     fewer = rj.PartitionedTube.sealed(tube.X0, tube.tubes[:1])
@@ -187,6 +188,7 @@ def test_cells_that_leave_something_out(tmp_path):
         read(tmp_path / "tube.reach", larger)
 
 
+@pytest.mark.costly
 def test_a_disagreement_says_what_was_said_and_what_is_proved(tmp_path):
     """Of the unit ball in eight dimensions the sum of all entries is bounded by the root of 8."""
     A = np.zeros((8, 8))

@@ -81,6 +81,7 @@ SIZE = np.sqrt(8) / 16
 """Of the largest state at the last time."""
 
 
+@pytest.mark.costly
 def test_a_round_goal(tube):
     assert statuses(tube, goal=ball(1.01 * SIZE)) == {"PROVED"}
     assert statuses(tube, goal=ball(0.99 * SIZE)) == {"REFUTED"}
@@ -88,6 +89,7 @@ def test_a_round_goal(tube):
     assert np.linalg.norm(found.states[-1]) > 0.99 * SIZE
 
 
+@pytest.mark.costly
 def test_within_rounding_of_a_round_goal_nothing_is_said(tube):
     for radius in (SIZE * (1 - 1e-15), SIZE * (1 + 1e-15)):
         said = verdicts(tube, goal=ball(radius))

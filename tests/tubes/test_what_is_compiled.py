@@ -53,6 +53,7 @@ def operations(monkeypatch):
     return counts
 
 
+@pytest.mark.costly
 def test_nothing_large_is_compiled_for_a_counterexample(operations):
     X0, safe = boxes(0.1, 0.105)
     found = rj.decide(cart_pole(), X0, 5, safe=safe)
@@ -61,6 +62,7 @@ def test_nothing_large_is_compiled_for_a_counterexample(operations):
 
 
 @pytest.mark.parametrize("call", ["decide", "winning_set"])
+@pytest.mark.costly
 def test_nothing_large_is_compiled_for_cells_under_a_limit(operations, call):
     X0, safe = boxes(0.1, 0.5)  # 64 cells are enough for a compiled call
     if call == "decide":

@@ -88,6 +88,7 @@ def test_what_is_known_is_gone_on_with_and_no_cell_is_lost(loop):
     assert [c.status for c in none.cells] == [UNKNOWN]
 
 
+@pytest.mark.costly
 def test_an_executor_finds_the_same_volumes(loop):
     alone = rj.winning_set(loop, DOMAIN, HORIZON, cells=100, **WANTED)
     seen = []
@@ -107,6 +108,7 @@ def test_an_executor_finds_the_same_volumes(loop):
 
 
 @pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.costly
 def test_other_dimensions(n):
     net = rj.MLP.from_layers([(np.zeros((1, n)), [0.0])])
     plant = rj.AffinePlant(0.5 * np.eye(n), np.zeros((n, 1)))
@@ -120,6 +122,7 @@ def test_other_dimensions(n):
     assert more.volume(UNKNOWN) < 0.01 * 4.0**n
 
 
+@pytest.mark.costly
 def test_disturbances_may_not_matter_to_what_is_proved():
     loop = scalar(0.5)
     loop = loop.replace(plant=loop.plant.replace(E=[[1.0]]), disturbance=rj.Box([-0.1], [0.1]))
@@ -130,6 +133,7 @@ def test_disturbances_may_not_matter_to_what_is_proved():
     assert 2.2 <= outer < 2.25  # for some w
 
 
+@pytest.mark.costly
 def test_it_is_shown(loop):
     found = rj.winning_set(loop, DOMAIN, HORIZON, cells=60, **WANTED)
     lines = str(found).splitlines()

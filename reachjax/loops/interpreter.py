@@ -312,10 +312,16 @@ def _folders() -> tuple[Path, ...]:
     return tuple(found)
 
 
+@lru_cache(maxsize=1024)
+def _is_a_users(file: str) -> bool:
+    """Whether a file is in none of these folders."""
+    return not any(Path(file).is_relative_to(each) for each in _folders())
+
+
 def line_of(equation: Any) -> str:
     """Where a user wrote it: ` (in NAME, FILE:LINE)`; nothing where that is not known."""
     frames = getattr(equation.source_info.traceback, "frames", ())
     for frame in frames:
-        if not any(Path(frame.file_name).is_relative_to(each) for each in _folders()):
+        if _is_a_users(frame.file_name):
             return f" (in {frame.function_name}, {frame.file_name}:{frame.line_num})"
     return ""

@@ -199,6 +199,7 @@ class _Search:
         self._sides = np.where(sides > 0, sides, 1.0)  # a side without length is not halved
         self._generations = max(GENERATIONS, 2 * int(np.sum(sides > 0)))
         self._deepest = 2 * math.ceil(math.log2(most))
+        self._longest = 0.0
         self._root = self._made(cell)
         self.leaves = [self._root]
         self._note()
@@ -208,11 +209,12 @@ class _Search:
 
     def _made(self, cell: Cell, parent: _Node | None = None) -> _Node:
         given = self._loop, cell.part, cell.box, self._directions, self._setting.start
-        steps, lost = list[ByForms](), None
+        began, steps, lost = time.monotonic(), list[ByForms](), None
         try:
             steps.extend(unrolled(*given))
         except UnboundedError as error:  # of halves there may be bounds
             lost = error
+        self._longest = max(self._longest, time.monotonic() - began)
         return _Node(cell, steps, self._directions.shape[:2], parent, lost)
 
     def _note(self) -> None:
@@ -223,6 +225,11 @@ class _Search:
     def axes(self) -> list[int]:
         """The tree of all cells."""
         return self._root.axes
+
+    @property
+    def _late(self) -> bool:
+        """Whether no time is left for two halves of a cell, as long as one took at most."""
+        return self._setting.budget.left < 2 * self._longest
 
     def enclose(self) -> None:
         """Halve cells that have no bounds until all have.
@@ -237,7 +244,7 @@ class _Search:
                 return self._note()
             number = max(open_cells, key=lambda i: self.leaves[i].depth)  # soon the smallest
             leaf = self.leaves[number]
-            spent = self._left < 2 or self._setting.budget.late or leaf.depth >= self._deepest
+            spent = self._left < 2 or self._late or leaf.depth >= self._deepest
             if spent or not self._halve(number):
                 break
             self._setting.note(f"{len(self.leaves)} cells, {len(open_cells)} without bounds")
@@ -258,9 +265,8 @@ class _Search:
                 least, most = self._simulated()
             # of the bounds so far: those of a wide set say nothing of a range
             excess, open_parts = self._open(least, most, self._floor(least, most))
-            if self._left < 2 or self._setting.budget.late:
-                late = self._setting.budget.late
-                self.ended = SolverStatus.TIME if late else SolverStatus.BUDGET
+            if self._left < 2 or self._late:
+                self.ended = SolverStatus.TIME if self._late else SolverStatus.BUDGET
                 return
             self.ended = SolverStatus.STALLED
             number = self._widest(open_parts, excess)

@@ -25,6 +25,7 @@ from reachjax.numerics.checks import (
 from reachjax.numerics.derivatives import first_order
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof
+from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
 from reachjax.sets.unusable import ThinSetError, UnusableSetError
@@ -188,14 +189,40 @@ def _following(
     box = boxed(X0, "X0")
     if relaxation.by_forms:  # forms go back to the initial set: they take milliseconds
         held = X0 if getattr(relaxation, "programs", False) else X0.closed_form(box)
-        steps = sets_by_forms(loop, X0, held, box, template, horizon, start)
-        return itertools.islice(steps, len(known), None)
+        forms = sets_by_forms(loop, X0, held, box, template, horizon, start)
+        return itertools.islice(forms, len(known), None)
     if window is None and isinstance(relaxation, BranchAndCut) and isinstance(template, Template):
         if loop.curved and relaxation.cells > 1 and X0.parts[1] is None:
             given = setting, relaxation.cells, X0, box, template, horizon
             return sets_by_cells(*given, known=len(known))
         return sets_by_branching(setting, relaxation.nodes, X0, box, template, horizon, known)
-    return sets_by_programs(setting, X0, template, horizon, window, known)
+    steps = sets_by_programs(setting, X0, template, horizon, window, known)
+    if not isinstance(template, Template) or not is_concrete((loop, X0, template)):
+        return steps
+    forms = sets_by_forms(loop, X0, X0.closed_form(box), box, template, horizon, start)
+    return _in_time(setting.budget, steps, forms, len(known))
+
+
+def _in_time(
+    budget: Budget, steps: Iterator[Reached], forms: Iterator[Reached], known: int
+) -> Iterator[Reached]:
+    """Steps by programs as long as there is time, then by forms, which take little.
+
+    Args:
+        budget: of the time.
+        steps: the ones by programs that are not known.
+        forms: all steps by forms.
+        known: how many steps are known.
+    """
+    while not budget.late:
+        step = next(steps, None)
+        if step is None:
+            return
+        known += 1
+        yield step
+    for step in itertools.islice(forms, known, None):
+        codes = np.full(len(step.proof.codes), int(SolverStatus.TIME))
+        yield step._replace(proof=step.proof.replace(codes=codes))
 
 
 def _as_reached(region: AbstractSet, proof: AbstractProof) -> Reached:

@@ -337,7 +337,9 @@ def reach(
             half the facet's simulated range. `LinearBounds` knows neither gaps nor limits.
         time_limit: seconds for the whole call, after which nothing is solved any more: what is
             proved by then is returned. It is shared out among the steps, and takes the place of the
-            budgets that end the call without it. None: until gaps are closed or these are used up.
+            budgets that end the call without it. Steps that have no time left for programs are
+            bounded by affine forms, and say so: their status is `TIME`. None: until gaps are closed
+            or these budgets are used up.
 
     Raises:
         Interrupted: Ctrl-C, a `KeyboardInterrupt` whose `tube` has the steps that were done.

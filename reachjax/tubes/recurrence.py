@@ -41,6 +41,10 @@ PROGRAMS = 0, 10, 10_000
 there are a tenth as many cells."""
 
 
+LOOKING = 0.3
+"""The part of the time in which sets to try are found."""
+
+
 class Wanted(NamedTuple):
     """What must hold at all times.
 
@@ -90,7 +94,7 @@ def for_ever(
     if verdict.status is VerdictStatus.REFUTED:
         return verdict
     wanted, runs = Wanted(safe, tuple(avoid or ())), _long_runs(loop, X0, start, seed)
-    example = _broken_later(loop, X0, wanted, runs, start)
+    example = _broken_later(loop, X0, wanted, runs, start, budget)
     if example is not None:
         refuted = VerdictStatus.REFUTED
         return dataclasses.replace(verdict, status=refuted, counterexample=example)
@@ -120,12 +124,17 @@ def _long_runs(loop: ClosedLoop, X0: AbstractSet, start: int, seed: int) -> Runs
 
 
 def _broken_later(
-    loop: ClosedLoop, X0: AbstractSet, wanted: Wanted, runs: Runs, start: int
+    loop: ClosedLoop, X0: AbstractSet, wanted: Wanted, runs: Runs, start: int, budget: Budget
 ) -> Counterexample | None:
-    """A trajectory that breaks what must hold at all times, cut where it does."""
+    """A trajectory that breaks what must hold at all times, cut where it does.
+
+    One that is found after the time is not looked for.
+    """
     tried = 0
     size = (runs.scenarios.shape[1] - loop.states) // LONG
     for item in requirements(loop.states, LONG, None, wanted.avoid or None, wanted.safe):
+        if budget.late:
+            return None
         until = runs.states[:, : item.time + 1]
         some = Runs(runs.scenarios, until).some(np.isfinite(until).all(axis=(1, 2)))
         if len(some.states):
@@ -182,8 +191,12 @@ def recurrence(
             if proved:
                 return found
             nearest = _nearer(nearest, found)
-    loop, candidates = tubes[0].loop, list(candidate_sets(tubes, runs, _flat(wanted.safe)))
-    tries = [(each, period) for each in candidates for period in periods(loop, each)]
+    loop, looking = tubes[0].loop, budget.share(LOOKING)
+    tries = list[tuple[Candidate, int]]()
+    for candidate in candidate_sets(tubes, runs, _flat(wanted.safe)):
+        if looking.late:
+            break
+        tries += ((candidate, period) for period in periods(loop, candidate))
     tries.sort(key=lambda each: each[0].step + each[1])  # what takes fewer steps is cheaper
     many = len(PROGRAMS) * len(tries)
     for nodes in PROGRAMS:

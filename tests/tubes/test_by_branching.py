@@ -1,7 +1,6 @@
 """Claims about the default's tubes: sound whatever they may spend, and tight where they may."""
 
 import pickle
-import time
 
 import jax
 import numpy as np
@@ -113,9 +112,7 @@ def test_without_nodes_the_tube_is_that_of_affine_forms(case):
 def test_without_time_the_tube_holds_and_shows_its_gaps(case, limit):
     loop, X0, start, _ = case
     template = rj.Template.box(loop.states)
-    began = time.monotonic()
     tube = rj.reach(loop, X0, HORIZON, template, start=start, time_limit=limit)
-    assert time.monotonic() - began < 10
     assert above_samples(tube) >= -1e-12
     for k in range(1, HORIZON + 1):
         assert set(tube.proof(k).ways) == {Rung.AFFINE_FORM}

@@ -230,6 +230,23 @@ def test_a_remainder_holds_for_any_slope(unit, compiled):
 
 @on_both
 @each_unit
+def test_the_steepest_slopes_are_met_where_they_are(unit, compiled):
+    """Next to where a derivative is largest a digit of the slope is half of those of the point."""
+    truth, rng = TRUTHS[unit], np.random.default_rng(2)
+    if truth.side in ("right", "one"):
+        return
+    y = 10.0 ** rng.uniform(-9, -5, size=300)
+    ends = np.stack([y / 1000, 10 * y])
+    slope = np.array([float(truth.derivative(mpf(each))) for each in y])
+    low, high = said(unit, "remainder", compiled, *ends, slope)
+    for part in (1, 0.3, 0.9, 1.1, 3):
+        point = exactly(y) * mpf(part)
+        values = np.vectorize(truth.value, otypes=[object])(point)
+        assert holds(low, values - exactly(slope) * point, high)
+
+
+@on_both
+@each_unit
 def test_lines_are_below_and_above_every_value_and_never_the_same(unit, compiled):
     lines = said(unit, "lines", compiled, *intervals(unit))
     y, values = inside(unit)

@@ -14,6 +14,9 @@ from reachjax.numerics.rounding import TINY, larger, namespace, smaller
 SLOPE = 2 / math.sqrt(math.pi)
 """The derivative of the error function at zero."""
 
+SLOPE_REST = 1.5335459613165881e-17
+"""What it is larger than this float."""
+
 LARGE = 1e150
 """Squares of larger numbers overflow; the functions here are flat by then, or logarithms."""
 
@@ -62,7 +65,9 @@ class Erf(SmoothUnit):
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`2 / sqrt(pi) exp(-y^2) = s` where `y^2 = log(2 / (sqrt(pi) s))`."""
         xp, slope = namespace(slope, lower), smaller(larger(slope, TINY), SLOPE)
-        point = xp.sqrt(larger(xp.log(SLOPE / slope), 0.0))
+        under = larger((slope - SLOPE - SLOPE_REST) / SLOPE, -0.5)  # no digits cancel near zero
+        square = xp.where(under > -0.5, -xp.log1p(under), xp.log(SLOPE / slope))
+        point = xp.sqrt(larger(square, 0.0))
         return point, -point
 
     def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
@@ -193,8 +198,7 @@ class ISRU(SmoothUnit):
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`(1 + y^2)^(-3/2) = s` where `y^2 = s^(-2/3) - 1`."""
         xp, slope = namespace(slope, lower), smaller(larger(slope, TINY), 1.0)
-        root = xp.cbrt(slope)
-        point = xp.sqrt((1 - root) * (1 + root)) / root
+        point = xp.sqrt(xp.expm1(-2 / 3 * xp.log(slope)))  # no digits cancel near zero
         return point, -point
 
     def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:

@@ -1,5 +1,6 @@
 """The library's loops from the arrays of `tests.networks`."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -7,6 +8,7 @@ import jax
 import numpy as np
 
 import reachjax as rj
+from reachjax.programs.horizon import Horizon
 from reachjax.programs.windows import Window
 from tests.networks import (
     LoopData,
@@ -83,6 +85,19 @@ def switching_loop(
     net = loop.controller.replace(activation=activation)
     skip = 0.3 * np.ones((net.outputs, n_x))
     return loop.replace(controller=rj.Residual(net, skip) if residual else net)
+
+
+def that_switches(
+    made: Callable[[int], rj.ClosedLoop], X0: rj.AbstractSet, seed: int, start: int = 0
+) -> rj.ClosedLoop:
+    """The first of the loops of seeds a thousand apart of which two units or more switch."""
+    for each in itertools.count(seed, 1000):
+        loop = made(each)
+        horizon = Horizon(*on_host(loop, X0), start)
+        horizon.advance()
+        if len(horizon.zero) >= 2:
+            return loop
+    raise AssertionError("unreachable")
 
 
 def on_host(loop: rj.ClosedLoop, X0: rj.AbstractSet) -> tuple[Any, Any, Any]:

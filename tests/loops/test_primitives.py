@@ -133,7 +133,7 @@ REFUSED = {
     ),
     "numbers drawn": (
         lambda x: x + jax.random.normal(jax.random.key(0), (2,)),
-        r"'random_seed' \(in .*test_primitives.*draws random numbers",
+        r"'random_seed' \(in .*draws random numbers",
     ),
     "dropout": (dropping, "draws random numbers.* evaluation mode"),
     "callbacks": (

@@ -158,8 +158,8 @@ def test_bounds_of_the_first_layer_are_attained_at_corners(n_x):
     data, box = loop_data(n_x, True), rj.Box(*state_box(n_x))
     y = np.asarray(box.vertices()) @ data.layers[0][0].T + data.layers[0][1]
     first = loop_bounds(closed_loop(data), box, TIME).preactivation[: y.shape[1]]
-    np.testing.assert_allclose(first.upper, y.max(axis=0), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(first.lower, y.min(axis=0), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(first.upper, y.max(axis=0), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(first.lower, y.min(axis=0), rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.parametrize("n_x", STATES)

@@ -6,7 +6,7 @@ import pytest
 import reachjax as rj
 from reachjax.programs.horizon import Horizon, joined, upper_bounds
 from reachjax.proofs.witnesses import initial_states
-from tests.closed_loops import initial_set, on_host, switching_loop
+from tests.closed_loops import initial_set, on_host, switching_loop, that_switches
 
 STEPS = 3
 
@@ -81,7 +81,10 @@ def case(request):
     """(loop, X0, start, horizon, initial states, trajectories, their columns)."""
     n_x, kind, options = request.param
     start = 2 if options == "time-varying" else 0
-    loop, X0 = switching_loop(n_x, seed=n_x, **LOOPS[options]), initial_set(kind, n_x, seed=n_x)
+    X0 = initial_set(kind, n_x, seed=n_x)
+    loop = that_switches(
+        lambda seed: switching_loop(n_x, seed=seed, **LOOPS[options]), X0, n_x, start
+    )
     horizon = horizon_of(loop, X0, start)
     states = initial_states(X0, 200, seed=0)
     runs = np.asarray(loop.simulate(states, STEPS, start))

@@ -18,7 +18,7 @@ from reachjax.proofs.branches import (
     covered,
     leaf_bounds,
 )
-from tests.closed_loops import initial_set, on_host, switching_loop
+from tests.closed_loops import initial_set, on_host, switching_loop, that_switches
 
 HORIZON = 3
 
@@ -101,8 +101,10 @@ CASES = [
 def case(request):
     """(proof of the last step, largest sampled values of its directions)."""
     n_x, kind, options = request.param
-    loop = switching_loop(n_x, seed=n_x + 20, hidden=(4, 3), **options)
     X0, template = initial_set(kind, n_x, seed=n_x), rj.Template.box(n_x)
+    loop = that_switches(
+        lambda seed: switching_loop(n_x, seed=seed, hidden=(4, 3), **options), X0, n_x + 20
+    )
     tube = rj.reach(loop, X0, HORIZON, template, samples=100, gap=0.01)
     proof = tube.proof(HORIZON)
     runs = np.asarray(tube.simulate(3000, seed=5))[:, -1]

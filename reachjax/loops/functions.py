@@ -217,7 +217,10 @@ class Function:
         recorder = Recorder([(size,) for size in sizes])
         try:
             require_traced(closed)
-            reading = Recording(Constants(self.constants), recorder)
+            seen, nothing = Constants(self.constants), [None] * len(sizes)
+            ConstantPart(seen).walk(closed, [*self._given(), *nothing])
+            known = {**seen.computed, **(self.constants or {})}
+            reading = Recording(Constants(known, seen.visited), recorder)
             (wanted,) = reading.walk(closed, [*self._given(), *recorder.inputs])
         except UnsupportedError as error:
             raise TypeError(

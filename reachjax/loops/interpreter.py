@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import abc
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -38,17 +38,34 @@ class Constants:
 
     Args:
         known: those that are known; the others are computed.
+        places: where operands depend on no input, whoever reads the function; None if everybody
+            who reads finds the same.
 
     Attributes:
         computed: those that were.
+        visited: the places of all that was asked for.
     """
 
-    def __init__(self, known: Mapping[str, Sequence[Any]] | None = None):
+    def __init__(
+        self,
+        known: Mapping[str, Sequence[Any]] | None = None,
+        places: Collection[str] | None = None,
+    ):
         self.computed: dict[str, list[Any]] = {}
-        self._known = known or {}
+        self.visited: set[str] = set()
+        self._known, self._places = known or {}, places
+
+    def have(self, equation: Any, place: str) -> bool:
+        """Whether what an equation makes of plain operands is the same in a simulation.
+
+        It is none of these constants where a reader has found out that its operands are plain, as
+        `jnp.where(x == x, p, 0.0)` is: XLA computes it together with what depends on inputs.
+        """
+        return self._places is None or place in self._places or not rounds(equation)
 
     def of(self, equation: Any, operands: Sequence[Any], place: str) -> list[Any]:
         """The results of an equation, at a place, whose operands are plain."""
+        self.visited.add(place)
         own = any(isinstance(each, Parameter) or not is_known(each) for each in operands)
         if not own or not rounds(equation):
             return _evaluated(equation, operands)
@@ -92,6 +109,10 @@ class Interpreter(abc.ABC):
     @abc.abstractmethod
     def stacked(self, column: Sequence[Operand]) -> Operand:
         """Operands, some of which depend on inputs, as one."""
+
+    def varying(self, operand: Operand) -> Operand:
+        """A plain operand as one that depends on inputs, where there are such numbers."""
+        return operand
 
     def whole(self, equation: Any, operands: Sequence[Operand]) -> list[Operand] | None:
         """The results of a call that is known as a whole; None if it is followed."""
@@ -142,7 +163,11 @@ class Interpreter(abc.ABC):
         if not any(varies):
             if name in PASSED:
                 return [*operands]
-            return self._constants.of(equation, operands, self._place)
+            if not self._constants.have(equation, self._place):
+                operands = [*map(self.varying, operands)]
+                varies = [not self.is_plain(each) for each in operands]
+            if not any(varies):
+                return self._constants.of(equation, operands, self._place)
         whole = self.whole(equation, operands)
         if whole is not None:
             return whole

@@ -65,6 +65,14 @@ class Recording(Interpreter):
             recorder.known[key] = found if isinstance(found, list) else [found], operands
         return recorder.known[key][0]
 
+    def varying(self, operand: Operand) -> Operand:
+        """A plain number as a value, which rounding is bounded of; what is whole stays as it is."""
+        shape, recorder = np.shape(operand), self._recorder
+        if not jnp.issubdtype(jnp.result_type(operand), jnp.floating):
+            return operand
+        some = recorder.taken(recorder.inputs[0], np.zeros(shape, int))
+        return recorder.shifted(recorder.scaled(some, np.zeros(shape)), operand)
+
     def whole(self, equation: Any, operands: Sequence[Operand]) -> list[Operand] | None:
         """The result of a function that has a rule as a whole."""
         rule = rule_of(equation)

@@ -171,6 +171,23 @@ def test_what_only_the_recording_knows_to_be_constant_takes_no_other_constants(n
         np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
+FOUND_OUT = {
+    "equal to itself": lambda p, x: jnp.where(x == x, p, 0.0) * p - 0.01,
+    "finite": lambda p, x: jnp.where(jnp.isfinite(x), p, 0.0) * p - 0.01,
+    "a branch": lambda p, x: jax.lax.cond(jnp.isfinite(x[0]), lambda: p, lambda: 0.0) * p - 0.01,
+    "of numbers alone": lambda p, x: jnp.where(x == x, 0.1, 0.0) * 0.1 - 0.01,
+    "twice": lambda p, x: (p + jnp.where(x < jnp.inf, p, 0.0)) * p - 0.02,
+}
+"""What only a reading of real numbers finds to be constant, with digits that cancel."""
+
+
+@pytest.mark.parametrize("name", FOUND_OUT)
+def test_what_is_found_to_be_constant_is_rounded_like_what_varies(name):
+    made = FOUND_OUT[name]
+    function = Partial(lambda p, x, u: x + 1e17 * made(p, x), jnp.array(0.1))
+    assert_simulated(rj.NonlinearPlant(function, states=1, inputs=1))
+
+
 def test_barriers_and_literals_are_passed_on():
     assert_simulated(
         rj.NonlinearPlant(lambda x, u: sum(jax.lax.optimization_barrier((x, u))), 1, 1)

@@ -169,7 +169,7 @@ class Recorder:
         """Entries as `picked`, but of sums as sums of entries, which comparisons look into."""
         if value.terms is None:
             return self.picked(value, index)
-        key = "taken", value.place, np.ravel(index).tobytes()
+        key = "taken", value.place, np.ravel(index).astype(np.int64).tobytes()
         if key in self._made:
             return self.reshaped(self._made[key], np.shape(index))
         found: Any = None

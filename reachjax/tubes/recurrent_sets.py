@@ -144,7 +144,7 @@ def _directions(
 
 
 def _jacobian(loop: ClosedLoop, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-    """That of a step at a state by differences, which are good enough for directions."""
+    """The Jacobian of a step at a state, by differences: they are good enough for directions."""
     off, host = DIFFERENCE * (1 + abs(x)), jax.device_get(loop)
     scenarios = Scenarios.of(loop, Box(x, x), 1)
     before, after = (

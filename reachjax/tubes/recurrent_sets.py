@@ -33,7 +33,7 @@ INSIDE = 0.1, 0.4
 """How far inside, in parts of a radius, states shall be when they return, as simulation has it."""
 
 DIFFERENCE = 1e-6
-"""Of a state's size: the step of differences of a loop."""
+"""The step of differences of a loop, as a part of a state's size."""
 
 TURNS = 4
 """Directions for the plane of a pair of complex modes."""

@@ -91,13 +91,13 @@ def that_switches(
     made: Callable[[int], rj.ClosedLoop], X0: rj.AbstractSet, seed: int, start: int = 0
 ) -> rj.ClosedLoop:
     """The first of the loops of seeds a thousand apart of which two units or more switch."""
-    for each in itertools.count(seed, 1000):
-        loop = made(each)
+
+    def switches(loop: rj.ClosedLoop) -> bool:
         horizon = Horizon(*on_host(loop, X0), start)
         horizon.advance()
-        if len(horizon.zero) >= 2:
-            return loop
-    raise AssertionError("unreachable")
+        return len(horizon.zero) >= 2
+
+    return next(filter(switches, map(made, itertools.count(seed, 1000))))
 
 
 def on_host(loop: rj.ClosedLoop, X0: rj.AbstractSet) -> tuple[Any, Any, Any]:

@@ -163,17 +163,21 @@ class Function:
         kept = self.__dict__.get("_evaluated")
         if kept is not None:
             return kept
-        constants = Constants()
-        nothing = [None] * len(self.structure.inputs)
-        ConstantPart(constants).walk(trace.closed, [*self._given(), *nothing])
         found = unchecked(
             Function,
             parameters=self.parameters,
             structure=self.structure,
-            constants=constants.computed,
+            constants=self._constant_part().computed,
         )
         if is_concrete(found):
             object.__setattr__(self, "_evaluated", found)
+        return found
+
+    def _constant_part(self) -> Constants:
+        """What is computed of parameters and constants alone, and where."""
+        found = Constants(self.constants)
+        nothing = [None] * len(self.structure.inputs)
+        ConstantPart(found).walk(self.structure.trace.closed, [*self._given(), *nothing])
         return found
 
     def _given(self) -> list[Any]:
@@ -217,10 +221,8 @@ class Function:
         recorder = Recorder([(size,) for size in sizes])
         try:
             require_traced(closed)
-            seen, nothing = Constants(self.constants), [None] * len(sizes)
-            ConstantPart(seen).walk(closed, [*self._given(), *nothing])
-            known = {**seen.computed, **(self.constants or {})}
-            reading = Recording(Constants(known, seen.visited), recorder)
+            seen = self._constant_part()
+            reading = Recording(Constants(seen.computed, seen.visited), recorder)
             (wanted,) = reading.walk(closed, [*self._given(), *recorder.inputs])
         except UnsupportedError as error:
             raise TypeError(

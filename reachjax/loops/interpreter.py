@@ -42,7 +42,7 @@ class Constants:
             who reads finds the same.
 
     Attributes:
-        computed: those that were.
+        computed: those that were, and of the known ones those that were asked for.
         visited: the places of all that was asked for.
     """
 
@@ -70,8 +70,10 @@ class Constants:
         if not own or not rounds(equation):
             return _evaluated(equation, operands)
         if place in self._known:
-            return [*map(Parameter.of, self._known[place])]
-        found = self.computed[place] = _evaluated(equation, operands)
+            found = [*map(Parameter.of, self._known[place])]
+        else:
+            found = _evaluated(equation, operands)
+        self.computed[place] = found
         return found
 
 
@@ -160,14 +162,13 @@ class Interpreter(abc.ABC):
         """What one equation makes of its operands."""
         name, params = equation.primitive.name, equation.params
         varies = [not self.is_plain(each) for each in operands]
+        if not any(varies) and not self._constants.have(equation, self._place):
+            operands = [*map(self.varying, operands)]
+            varies = [not self.is_plain(each) for each in operands]
         if not any(varies):
             if name in PASSED:
                 return [*operands]
-            if not self._constants.have(equation, self._place):
-                operands = [*map(self.varying, operands)]
-                varies = [not self.is_plain(each) for each in operands]
-            if not any(varies):
-                return self._constants.of(equation, operands, self._place)
+            return self._constants.of(equation, operands, self._place)
         whole = self.whole(equation, operands)
         if whole is not None:
             return whole

@@ -16,7 +16,7 @@ from tests.golden.cases import Golden, required
 Record = dict[str, Any]
 """By what it is: numbers `sets`, `bounds`, `gradient`; words `statuses`, `verdict`, `decision`."""
 
-NUMBERS = ("sets", "bounds", "gradient", "margins")
+NUMBERS = ("sets", "bounds", "gradient")
 SECONDS = "seconds"
 
 
@@ -28,14 +28,8 @@ def numbers(tree: Any) -> list[float]:
 
 def size(region: Any) -> Any:
     """A number that grows with a set: the sum of its offsets, or the logarithm of its volume."""
-    if isinstance(region, rj.Ellipsoid):
-        return rj.log_volume(region)
-    return sum(part.b.sum() if hasattr(part, "b") else size(part) for part in parts(region))
-
-
-def parts(region: Any) -> tuple[Any, ...]:
-    """The sets that a set is the intersection of; itself if it is none."""
-    return tuple(getattr(region, "members", ())) or (region,)
+    _, ball = region.parts
+    return region.facets[1].sum() + (0.0 if ball is None else rj.log_volume(ball))
 
 
 def recorded(case: Golden) -> Record:

@@ -160,14 +160,21 @@ def _columns(
     return [np.asarray(_scattered(equation, zeros, places, one, adding=True)) for one in ones]
 
 
+def _meets(equation: Equation, whole: Operand, places: Operand, part: Operand) -> bool:
+    """Whether two entries of what is scattered get to one entry of the whole."""
+    zeros, ones = np.zeros(shape_of(whole)), np.ones(shape_of(part))
+    return bool(np.any(np.asarray(_scattered(equation, zeros, places, ones, adding=True)) > 1))
+
+
 def _added(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
     """`x.at[i].add(y)` with known places: what is added is a sum of entries of `y`."""
     whole, places, part = operands
     _require_known([places])
+    if not isinstance(part, Value) and not _meets(equation, whole, places, part):
+        zeros = np.zeros(shape_of(whole))
+        return recorder.added(whole, equation.evaluate(zeros, places, part))
     columns = _columns(equation, whole, places, part)
     if not isinstance(part, Value):
-        if not np.any(sum(columns) > 1):
-            return recorder.added(whole, equation.evaluate(0 * columns[0], places, part))
         for column, number in zip(columns, part.reshape(-1), strict=True):
             whole = recorder.added(whole, number * column)  # sums of numbers would be rounded
         return whole
@@ -181,9 +188,9 @@ def _multiplied(recorder: Recorder, equation: Equation, operands: Sequence[Opera
     _require_known([places])
     ones = np.ones(shape_of(whole))
     if not isinstance(part, Value):
-        columns, xp = _columns(equation, whole, places, part), namespace(part)
-        if not np.any(sum(columns) > 1):
+        if not _meets(equation, whole, places, part):
             return recorder.scaled(whole, equation.evaluate(ones, places, part))
+        columns, xp = _columns(equation, whole, places, part), namespace(part)
         for column, number in zip(columns, part.reshape(-1), strict=True):
             whole = recorder.scaled(whole, xp.where(column > 0, number, 1.0))
         return whole

@@ -24,6 +24,13 @@ GRACE = 0.4
 """Seconds that forms, which are solved by nobody, may go on after the end."""
 
 
+MOST_BYTES = 2**32
+"""The memory that one program may take."""
+
+PACE = 2e9
+"""Operations a second of a core on numbers that do not fit into its cache, about."""
+
+
 class Budget:
     """Seconds until a deadline, and work, of which all parts of a budget spend together.
 
@@ -161,3 +168,28 @@ _IN_FORCE: ContextVar[Budget] = ContextVar("budget", default=ENDLESS)
 def clock() -> Budget:
     """The budget that is in force: without limits where none is."""
     return _IN_FORCE.get()
+
+
+def require_room(what: str, numbers: float, operations: float) -> None:
+    """Raise an error before work begins that is too large for memory or for the time in force.
+
+    Args:
+        what: is about to be done.
+        numbers: of 64 bits that it keeps.
+        operations: of floats until it asks the clock again.
+
+    Raises:
+        MemoryError: it would take more than `MOST_BYTES`.
+        TimeOverError: the time would be over before.
+
+    Example:
+        >>> require_room("a program of 10 unknowns", 100.0, 1e4)
+        >>> require_room("a program of 130,816 multipliers", 130_816.0**2, 1e15)
+        Traceback (most recent call last):
+        MemoryError: a program of 130,816 multipliers would take 128 GiB, and 4 GiB is the most
+    """
+    if 8 * numbers > MOST_BYTES:
+        asked, most = 8 * numbers / 2**30, MOST_BYTES / 2**30
+        raise MemoryError(f"{what} would take {asked:.0f} GiB, and {most:.0f} GiB is the most")
+    if operations > PACE * clock().left:
+        raise TimeOverError

@@ -374,5 +374,6 @@ def upper_bounds(
     """Upper bounds of forms, by multipliers of facts that are of the right signs; NaN is none."""
     width = max(forms.columns.shape[1], facts.columns.shape[1])
     with np.errstate(all="ignore"):
-        weighed = forms.widened(width) + multipliers @ facts.widened(width)
+        used = np.flatnonzero(np.any(multipliers != 0, axis=0))  # few are, of wide networks
+        weighed = forms.widened(width) + multipliers[:, used] @ facts[used].widened(width)
         return weighed.ends(start)[1]

@@ -14,10 +14,11 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from reachjax.numerics.budget import clock
+from reachjax.numerics.budget import clock, require_room
 from reachjax.programs.lmi import Program
 from reachjax.programs.presolve import NormalProgram, presolved
-from reachjax.proofs.proposal import Solution, SolverStatus
+from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
+from reachjax.sets import NormalForm
 from reachjax.solvers.base import require_positive
 from reachjax.solvers.conic import RESCALINGS, STALLED, AbstractConicSolver
 from reachjax.solvers.models import unit_generators
@@ -83,6 +84,8 @@ class Clarabel(AbstractConicSolver):
     def solve(self, program: Program) -> Solution:
         """Propose multipliers for every facet, on as many threads as there are cores."""
         reduced, solution = presolved(program), Solution.blank_for(program)
+        size, facets = reduced.objective.shape[1], len(reduced.objective)
+        _require_room(size, min(facets, os.cpu_count() or 1))
         budget = clock()  # of this thread; others have none
         cone = FacetCone(reduced, self._options)
 
@@ -118,6 +121,18 @@ class Clarabel(AbstractConicSolver):
             for i in facets:
                 solve(i)
         return solution
+
+    def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
+        """Propose the smallest ellipsoid around the successors, and its multipliers."""
+        _require_room(len(presolved(program).columns) + len(program.objective.mid))
+        return super().enclose(program, form)
+
+
+def _require_room(size: int, at_once: int = 1) -> None:
+    """Raise an error if the matrix of a cone's program, dense, is too large to be factorised."""
+    entries = size * (size + 1) / 2
+    named = f"a semidefinite cone of {size} columns, {at_once} at once,"
+    require_room(named, 2 * at_once * entries**2, entries**3 / 3)
 
 
 class FacetCone:

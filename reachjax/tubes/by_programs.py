@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from reachjax.numerics.checks import is_concrete
+from reachjax.programs.relaxations import PaperQC
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.tubes.steps import Reached, Setting, Step
 from reachjax.tubes.successors import successors
+
+LATE = PaperQC(repeated=False)
+"""The relaxation of a step for which there is no time left: its bounds are those of intervals."""
 
 
 def sets_by_programs(
@@ -36,7 +41,10 @@ def sets_by_programs(
     X, proof, steps = X0, None, []
     for k in range(horizon):
         before = steps if window is None else steps[max(0, k + 1 - window) :]
-        step = Step(setting, X, k, tuple(before), proof)
+        if setting.budget.late:
+            step = Step(dataclasses.replace(setting, relaxation=LATE), X, k, (), proof)
+        else:
+            step = Step(setting, X, k, tuple(before), proof)
         steps.append(step)
         if k < len(known):
             X, proof = known[k].region, _of_programs(known[k].proof)

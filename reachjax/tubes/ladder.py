@@ -306,8 +306,9 @@ class Ladder:
 
     def _grow(self, trees: list[Tree], share: float) -> None:
         """Grow trees by turns, until all are closed or this share of the work is done."""
-        pool = share * self._budget.work / self._size**2
-        count = len(trees)
+        if not trees:
+            return
+        pool, count = share * self._budget.work / self._size**2, len(trees)
         while trees := [tree for tree in trees if tree.is_open and tree.nodes < self._nodes]:
             largest = max(tree.gap for tree in trees)
             closed = count - len(trees)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import jax
 import numpy as np
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import Budget, TimeOverError
 from reachjax.numerics.checks import (
     is_concrete,
     owned,
@@ -176,7 +177,7 @@ def propagated(
         )
     proofs = [step.proof for step in steps]
     if simulations is not None and is_concrete(proofs):
-        proofs = _with_witnesses(steps, simulations)
+        proofs = _with_witnesses(steps, simulations, climb=not budget.late)
     return Propagated([step.region for step in steps], owned(proofs), interrupted)
 
 
@@ -214,11 +215,17 @@ def _in_time(
         forms: all steps by forms.
         known: how many steps are known.
     """
-    while not budget.late:
-        step = next(steps, None)
+    took = 0.0
+    while budget.left > took:  # a step takes about as long as the one before
+        began = time.monotonic()
+        try:
+            with budget.in_force():
+                step = next(steps, None)
+        except TimeOverError:
+            break
         if step is None:
             return
-        known += 1
+        known, took = known + 1, time.monotonic() - began
         yield step
     for step in itertools.islice(forms, known, None):
         codes = np.full(len(step.proof.codes), int(SolverStatus.TIME))
@@ -257,13 +264,21 @@ def simulations_from(
     return None
 
 
-def _with_witnesses(steps: list[Reached], simulations: Simulations) -> list[AbstractProof]:
-    """Simulate what the certificates bound, from the initial set."""
-    simulated = [step.states for step in steps if not step.climb and len(step.states)]
+def _with_witnesses(
+    steps: list[Reached], simulations: Simulations, climb: bool
+) -> list[AbstractProof]:
+    """Simulate what the certificates bound, from the initial set.
+
+    Args:
+        steps: all of them.
+        simulations: from the initial set.
+        climb: whether there is time for gradient ascent.
+    """
+    simulated = [step.states for step in steps if not (step.climb and climb) and len(step.states)]
     if simulated:
         simulations.include(*simulated)
     for k, step in enumerate(steps, start=1):
-        if step.climb and len(step.states):
+        if climb and step.climb and len(step.states):
             simulations.climb(k, step.region, np.arange(len(step.states)), step.states)
     found = [simulations.attained(k, step.region) for k, step in enumerate(steps, start=1)]
     return [

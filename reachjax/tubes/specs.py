@@ -57,7 +57,8 @@ def verify(
         seed: of the samples.
         forever: whether `safe` and `avoid` must hold beyond the horizon, at all times: proved if
             the sets return into the initial set, or into another one that does (`Recurrence`).
-        time_limit: seconds to look for such a set; None: until a few are tried.
+        time_limit: seconds for the whole call, of which the search for such a set has what the
+            verdict until the horizon leaves; None: until a few are tried.
 
     Raises:
         TypeError: a set is no Box, Polytope or Ellipsoid.
@@ -80,6 +81,7 @@ def verify(
         >>> verify(tube, safe=Box([-1.0], [2.0]), forever=True).status.name
         'PROVED'
     """
+    budget = Budget.of(time_limit)
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     require_kind("forever", forever, (bool, np.bool_), "True or False")
@@ -94,7 +96,7 @@ def verify(
         verdict = _decided(tube, required, samples, seed, X0)
     if not forever:
         return verdict
-    return for_ever(verdict, tubes, X0, safe, avoid, seed, Budget.of(time_limit))
+    return for_ever(verdict, tubes, X0, safe, avoid, seed, budget)
 
 
 def _decided(

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.budget import ENDLESS, Budget
+from reachjax.numerics.budget import ENDLESS, Budget, clock
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import Program
 from reachjax.programs.preactivations import first_inputs, first_rows
@@ -133,6 +133,8 @@ class Step:
         limit = self.setting.limit
         # a window that had to be shorter a step ago has to be now
         first = max(0, len(self.before) - len(self.before[-1].window)) if self.before else 0
+        if limit is not None and self.before and self.before[-1].window.taken > limit:
+            first = len(self.before)  # one that is as short as may be, and too large alone
         while True:
             window = self._reaching_back(self.before[first:])
             if limit is None or window.taken <= limit or len(window) == 1:
@@ -153,7 +155,12 @@ class Step:
         return window
 
     def added_to(self, window: Window) -> Window:
-        """A window that ends at the step's set of states, and this step."""
+        """A window that ends at the step's set of states, and this step.
+
+        Raises:
+            TimeOverError: the time in force is over.
+        """
+        clock().require()
         return window.extended(self.setting.loop, self.X, self.box, self.first_inputs)
 
     @cached_property
@@ -173,8 +180,16 @@ class Step:
         return self.proof.products_in_use if grown and self.proof is not None else NONE
 
     def program(self, directions: Float[Array, "f n_x"]) -> Program:
-        """Theorem 1 with these directions of the successor for an objective."""
-        return self.window.program(directions, self.setting.relaxation)
+        """Theorem 1 with these directions of the successor for an objective.
+
+        Raises:
+            TimeOverError: the time in force is over.
+        """
+        window = self.window
+        clock().require()
+        program = window.program(directions, self.setting.relaxation)
+        clock().require()
+        return program
 
     def attained(
         self, directions: Float[Array, "f n_x"], facet: int, column: Float[np.ndarray, " n"]

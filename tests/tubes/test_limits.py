@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes import by_cells
+from reachjax.numerics import budget
+from reachjax.tubes import by_cells, by_programs
 from tests.networks import he_network
 
 PATIENCE = 8.0
@@ -138,6 +139,44 @@ def test_steps_that_have_no_time_for_programs_are_by_forms(switching, tmp_path):
     again = rj.load(tmp_path / "tube", recheck=True)
     assert isinstance(again, rj.ReachTube)
     np.testing.assert_array_equal(again.sets[3].b, forms.sets[3].b)
+
+
+@pytest.mark.parametrize("solver", [rj.InteriorPoint(), rj.Clarabel()])
+def test_programs_that_are_too_large_for_memory_are_not_begun(switching, solver, monkeypatch):
+    """The answer says what they would take, and bounds need no solver."""
+    (loop, X0), template = switching, rj.Template.box(4)
+    monkeypatch.setattr(budget, "MOST_BYTES", 2**10)
+    with pytest.warns(RuntimeWarning, match=r"would take .* GiB"):
+        tube = rj.reach(loop, X0, 1, template, rj.LocalBounds(), solver=solver)
+    assert set(tube.proof(1).statuses) == {rj.SolverStatus.FAILED}
+    states = loop.simulate(X0.sample(jax.random.key(0), 200), 1)
+    assert bool(tube.sets[1].contains(states[:, 1], 1e-9).all())
+
+
+@pytest.mark.parametrize("solver", [rj.InteriorPoint(), rj.Clarabel()])
+def test_programs_that_would_end_after_the_time_are_not_begun(switching, solver, monkeypatch):
+    (loop, X0), template = switching, rj.Template.box(4)
+    monkeypatch.setattr(budget, "PACE", 1e-9)
+    tube = rj.reach(loop, X0, 1, template, rj.LocalBounds(), solver=solver, time_limit=1000.0)
+    assert set(tube.proof(1).statuses) == {rj.SolverStatus.LIMIT}
+
+
+def test_a_step_that_would_end_after_the_time_is_by_forms(small, monkeypatch):
+    """A step by programs takes about as long as the one before."""
+    begun, successors = [], by_programs.successors
+
+    def slowly(*given):
+        begun.append(given)
+        time.sleep(0.6)
+        return successors(*given)
+
+    monkeypatch.setattr(by_programs, "successors", slowly)
+    given = small, rj.Box([1.0], [2.0]), 3, rj.Template.box(1), rj.LocalBounds()
+    rj.reach(*given)  # nothing is compiled after it
+    begun.clear()
+    tube = rj.reach(*given, time_limit=1.0)
+    assert len(begun) == 1
+    assert set(tube.proof(3).statuses) == {rj.SolverStatus.TIME}
 
 
 def test_cells_that_would_end_after_the_time_are_not_begun(monkeypatch):

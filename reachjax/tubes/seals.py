@@ -50,7 +50,7 @@ def seal_of(*parts: Any, start: int = 0) -> Seal:
         found = hashlib.blake2b(named.encode(), digest_size=SIZE)
         for leaf in map(np.asarray, leaves):
             found.update(f"{leaf.dtype.str}{leaf.shape}".encode())
-            found.update(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8))
+            found.update(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8).data)
         return np.frombuffer(found.digest(), np.uint8)
 
     if is_concrete(leaves):

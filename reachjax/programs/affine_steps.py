@@ -145,10 +145,12 @@ def step_forms(
         ends = _cut(unit, y, start)
         if ranges is not None:
             ends = ranges(unit, y, ends, found)
-        if isinstance(unit, SmoothUnit) and place is None and _is_lost(unit, ends):
-            ends = met(ends, _ends_by_intervals(loop, start, int(t), before, len(found)))
         if isinstance(unit, SmoothUnit):
-            z, forms = _smooth(unit, y, ends, free, start)
+            line = unit.linear(*ends)
+            if place is None and _is_lost(line, ends):
+                ends = met(ends, _ends_by_intervals(loop, start, int(t), before, len(found)))
+                line = unit.linear(*ends)
+            z, forms = _smooth(unit, y, ends, line, free, start)
             if place is None:
                 _require_bounds(forms, int(t))
         else:
@@ -182,10 +184,10 @@ def step_forms(
     return StepForms(successor.within(Ball.between(*ends)), tuple(found), merged)
 
 
-def _is_lost(unit: SmoothUnit, ends: Ends) -> bool:
+def _is_lost(line: Quadratic, ends: Ends) -> bool:
     """Whether a unit has no bounds somewhere though its inputs have."""
     known = np.isfinite(ends[0]) & np.isfinite(ends[1])
-    return bool(np.any(known & ~np.isfinite(unit.linear(*ends).gap)))
+    return bool(np.any(known & ~np.isfinite(line.gap)))
 
 
 def _ends_by_intervals(
@@ -238,14 +240,19 @@ def _merged(
 
 
 def _smooth(
-    unit: SmoothUnit, y: AffineForms, ends: Ends, place: Place, start: InitialColumns
+    unit: SmoothUnit,
+    y: AffineForms,
+    ends: Ends,
+    line: Quadratic,
+    place: Place,
+    start: InitialColumns,
 ) -> tuple[AffineForms, UnitForms]:
-    """What a layer of smooth units makes of its inputs, whose bounds are known."""
+    """What a layer of smooth units makes of its inputs, whose bounds and lines are known."""
     xp, (lower, upper), w = namespace(y.rows), ends, start.spread.shape[1]
     values, center, rows = Ball.between(*unit.interval(lower, upper)), y.rows[:, 0], y.rows[:, 2:]
     own = start.norms(rows[:, :w])
     rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(rows.shape[1])) + y.radii[:, 0]
-    model, line = unit.quadratic(lower, upper), unit.linear(lower, upper)
+    model = unit.quadratic(lower, upper, line)
     lost = abs(model.curvature) * (2 * own + rest) * rest
     better = model.gap + lost <= line.gap
     model = Quadratic(*(xp.where(better, *pair) for pair in zip(model, line, strict=True)))

@@ -52,6 +52,10 @@ what is open, or the facet is done: what disturbances leave open, no halving clo
 functions leave open falls by a factor of 64 meanwhile."""
 
 
+SEARCHING = 0.9
+"""The part of the time in which cells are halved: sets, proofs and witnesses take the rest."""
+
+
 class _Node:
     """A part of the initial set, with its halves or what forms over it say.
 
@@ -192,6 +196,7 @@ class _Search:
         known: int,
     ):
         self._setting, self._X0, self._known = setting, X0, known
+        self._budget = setting.budget.share(SEARCHING)
         self._loop, self._directions = jax.device_get((loop, directions))
         self._scenarios = Scenarios.of(loop, X0, len(directions), setting.start)
         cell = Cell(X0.bounding_box(), X0)
@@ -229,7 +234,7 @@ class _Search:
     @property
     def _late(self) -> bool:
         """Whether no time is left for two halves of a cell, as long as one took at most."""
-        return self._setting.budget.left < 2 * self._longest
+        return self._budget.left < 2 * self._longest
 
     def enclose(self) -> None:
         """Halve cells that have no bounds until all have.

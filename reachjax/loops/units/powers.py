@@ -48,7 +48,7 @@ class Square(SmoothUnit):
         return namespace(lower, upper).zeros_like(lower)
 
     @np.errstate(all="ignore")
-    def quadratic(self, lower: Array, upper: Array) -> Quadratic:
+    def quadratic(self, lower: Array, upper: Array, linear: Quadratic | None = None) -> Quadratic:
         """`c^2 + 2 c (y - c) + (y - c)^2`, of which only `c^2` is rounded."""
         lower, upper = self.met(lower, upper)
         xp, center = namespace(lower, upper), settled(lower / 2 + upper / 2)

@@ -253,16 +253,20 @@ class SmoothUnit(AbstractUnit):
         return xp.where(fine & (abs(slope) < math.inf), slope, 0.0)
 
     @np.errstate(all="ignore")
-    def quadratic(self, lower: Array, upper: Array) -> Quadratic:
+    def quadratic(self, lower: Array, upper: Array, linear: Quadratic | None = None) -> Quadratic:
         """The interpolant at Chebyshev nodes, or the lines where those leave less out.
 
         The error at the nodes is measured. Between them it is at most 5/3 of that (the nodes'
         Lebesgue constant), here 2, beside the error of an exact interpolant.
+
+        Args:
+            lower: `(k,)`.
+            upper: `(k,)`.
+            linear: the lines on these intervals, where they are known.
         """
-        xp = namespace(lower, upper)
+        xp, linear = namespace(lower, upper), linear or self.linear(lower, upper)
         lower, upper = settled(self.met(lower, upper))
         center = settled(lower / 2 + upper / 2)
-        linear = self.linear(lower, upper)
         fine = self.defined(lower, upper)
         lower, upper, middle = (xp.where(fine, y, 1.0) for y in (lower, upper, center))
         radius = larger(upper - middle, middle - lower) * (1 + gamma(2)) + TINY

@@ -41,6 +41,8 @@ class WaveUnit(SmoothUnit):
         low, high = super().remainder(slope, lower, upper)
         far = ~self.defined(lower, upper) & super().defined(lower, upper)
         far = far & (abs(slope) < math.inf)
+        if xp is np and not far.any():
+            return low, high
         slope, lower, upper = (xp.where(far, each, 0.0) for each in (slope, lower, upper))
         ends, (least, most) = (slope * lower, slope * upper), self.extent(lower, upper)
         least, most = least - larger(*ends), most - smaller(*ends)

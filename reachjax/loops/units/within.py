@@ -51,9 +51,9 @@ class Within(SmoothUnit):
         return Lines(below=Line(slope, low), above=Line(slope, high))
 
     @np.errstate(all="ignore")
-    def quadratic(self, lower: Array, upper: Array) -> Quadratic:
+    def quadratic(self, lower: Array, upper: Array, linear: Quadratic | None = None) -> Quadratic:
         """The lines, which bend nowhere."""
-        return self.linear(lower, upper)
+        return linear or self.linear(lower, upper)
 
     def _is_kept(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
         """Where bounds of inputs say more than what is known of them."""

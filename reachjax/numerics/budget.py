@@ -25,10 +25,11 @@ GRACE = 0.4
 
 
 MOST_BYTES = 2**32
-"""The memory that one program may take."""
+"""The memory that one program may take. At `PACE` a larger one takes a minute an iteration."""
 
 PACE = 2e9
-"""Operations a second of a core on numbers that do not fit into its cache, about."""
+"""Operations a second. Measured with one thread: 0.9 to 2.7 in iterations of the interior-point
+method with 316 to 1,564 multipliers, 2.4 in Clarabel's with 53 columns."""
 
 
 class Budget:
@@ -170,26 +171,26 @@ def clock() -> Budget:
     return _IN_FORCE.get()
 
 
-def require_room(what: str, numbers: float, operations: float) -> None:
+def require_memory(what: str, numbers: float, operations: float) -> None:
     """Raise an error before work begins that is too large for memory or for the time in force.
 
     Args:
-        what: is about to be done.
-        numbers: of 64 bits that it keeps.
-        operations: of floats until it asks the clock again.
+        what: is about to be solved.
+        numbers: of 64 bits that it takes.
+        operations: of floats until there is a first iterate.
 
     Raises:
         MemoryError: it would take more than `MOST_BYTES`.
         TimeOverError: the time would be over before.
 
     Example:
-        >>> require_room("a program of 10 unknowns", 100.0, 1e4)
-        >>> require_room("a program of 130,816 multipliers", 130_816.0**2, 1e15)
+        >>> require_memory("a program of 10 unknowns", 100.0, 1e4)
+        >>> require_memory("a program of 130,816 multipliers", 130_816.0**2, 1e15)
         Traceback (most recent call last):
         MemoryError: a program of 130,816 multipliers would take 128 GiB, and 4 GiB is the most
     """
     if 8 * numbers > MOST_BYTES:
         asked, most = 8 * numbers / 2**30, MOST_BYTES / 2**30
-        raise MemoryError(f"{what} would take {asked:.0f} GiB, and {most:.0f} GiB is the most")
+        raise MemoryError(f"{what} would take {asked:.3g} GiB, and {most:.3g} GiB is the most")
     if operations > PACE * clock().left:
         raise TimeOverError

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from reachjax.numerics.budget import clock, require_room
+from reachjax.numerics.budget import MOST_BYTES, clock, require_memory
 from reachjax.programs.lmi import Program
 from reachjax.programs.presolve import NormalProgram, presolved
 from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
@@ -82,10 +82,14 @@ class Clarabel(AbstractConicSolver):
         }
 
     def solve(self, program: Program) -> Solution:
-        """Propose multipliers for every facet, on as many threads as there are cores."""
+        """Propose multipliers for every facet, on as many threads as there are cores and memory.
+
+        Raises:
+            MemoryError: one facet would take too much of it.
+            TimeOverError: the time in force would be over before the first iterate.
+        """
         reduced, solution = presolved(program), Solution.blank_for(program)
-        size, facets = reduced.objective.shape[1], len(reduced.objective)
-        _require_room(size, min(facets, os.cpu_count() or 1))
+        taken = _require_memory(reduced.objective.shape[1])
         budget = clock()  # of this thread; others have none
         cone = FacetCone(reduced, self._options)
 
@@ -110,9 +114,9 @@ class Clarabel(AbstractConicSolver):
                 used = np.ix_(reduced.columns, reduced.columns)
                 solution.moments[i][used] = moment / moment[-1, -1]
 
-        facets = range(len(reduced.objective))
+        facets, threads = range(len(reduced.objective)), int(MOST_BYTES // max(8 * taken, 1))
         if len(facets) > 1:
-            pool = ThreadPoolExecutor(os.cpu_count())
+            pool = ThreadPoolExecutor(min(os.cpu_count() or 1, threads))
             try:
                 list(pool.map(solve, facets))
             finally:  # nobody waits for them after Ctrl-C
@@ -123,16 +127,26 @@ class Clarabel(AbstractConicSolver):
         return solution
 
     def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
-        """Propose the smallest ellipsoid around the successors, and its multipliers."""
-        _require_room(len(presolved(program).columns) + len(program.objective.mid))
+        """Propose the smallest ellipsoid around the successors, and its multipliers.
+
+        Raises:
+            MemoryError: it would take too much memory.
+            TimeOverError: the time in force would be over before the first iterate.
+        """
+        _require_memory(int(program.used.sum()) + len(program.objective.mid))
         return super().enclose(program, form)
 
 
-def _require_room(size: int, at_once: int = 1) -> None:
-    """Raise an error if the matrix of a cone's program, dense, is too large to be factorised."""
+def _require_memory(size: int) -> float:
+    """The numbers that a semidefinite cone takes: its matrix is dense, and so is the factor.
+
+    Raises:
+        MemoryError: they are too many.
+        TimeOverError: the time in force would be over before the matrix is factorised.
+    """
     entries = size * (size + 1) / 2
-    named = f"a semidefinite cone of {size} columns, {at_once} at once,"
-    require_room(named, 2 * at_once * entries**2, entries**3 / 3)
+    require_memory(f"a semidefinite cone of {size} columns", 2 * entries**2, entries**3 / 3)
+    return 2 * entries**2
 
 
 class FacetCone:

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from reachjax.numerics.budget import clock, require_room
+from reachjax.numerics.budget import clock, require_memory
 from reachjax.numerics.checks import whole_number
 from reachjax.programs.lmi import Program
 from reachjax.programs.presolve import presolved
@@ -50,13 +50,18 @@ class InteriorPoint(AbstractSolver):
         whole_number("InteriorPoint.max_iterations", self.max_iterations, 1)
 
     def solve(self, program: Program) -> Solution:
-        """Propose multipliers for every facet."""
+        """Propose multipliers for every facet.
+
+        Raises:
+            MemoryError: an iteration would take too much memory.
+            TimeOverError: the time in force would be over before the first iterate.
+        """
         facets, size = program.objective.mid.shape
         solution = Solution.blank(facets, len(program.products.free), size)
         reduced = presolved(program)
         count, pairs = reduced.generators.size, len(reduced.generators.left)
         named = f"a program of {count:,} multipliers and {pairs:,} products"
-        require_room(named, count * (pairs + 2 * count), 8 * pairs**2 + count**3 / 3)
+        require_memory(named, count * (pairs + 2 * count), 8 * pairs**2 + count**3 / 3)
         used = np.ix_(reduced.columns, reduced.columns)
         for i, row in enumerate(reduced.objective):
             if clock().late:

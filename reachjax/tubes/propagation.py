@@ -201,23 +201,27 @@ def _following(
     if template.parts[1] is not None or not is_concrete((loop, X0, template)):
         return steps
     forms = sets_by_forms(loop, X0, X0.closed_form(box), box, template, horizon, start)
-    return _in_time(setting.budget, steps, forms, len(known))
+    return _in_time(setting.budget, steps, forms, len(known), horizon)
 
 
 def _in_time(
-    budget: Budget, steps: Iterator[Reached], forms: Iterator[Reached], known: int
+    budget: Budget, steps: Iterator[Reached], forms: Iterator[Reached], known: int, horizon: int
 ) -> Iterator[Reached]:
     """Steps by programs as long as there is time, then by forms, which take little.
+
+    A step shares the time that is left with the later ones. What it takes beyond its share is what
+    no clock cuts; the next one takes as much again, and is not begun where that is not left.
 
     Args:
         budget: of the time.
         steps: the ones by programs that are not known.
         forms: all steps by forms.
         known: how many steps are known.
+        horizon: how many there are in all.
     """
-    took = 0.0
-    while budget.left > took:  # a step takes about as long as the one before
-        began = time.monotonic()
+    beyond = 0.0
+    while known < horizon and budget.left > beyond:
+        began, share = time.monotonic(), budget.left / (horizon - known)
         try:
             with budget.in_force():
                 step = next(steps, None)
@@ -225,7 +229,7 @@ def _in_time(
             break
         if step is None:
             return
-        known, took = known + 1, time.monotonic() - began
+        known, beyond = known + 1, max(time.monotonic() - began - share, 0.0)
         yield step
     for step in itertools.islice(forms, known, None):
         codes = np.full(len(step.proof.codes), int(SolverStatus.TIME))

@@ -57,8 +57,8 @@ def verify(
         seed: of the samples.
         forever: whether `safe` and `avoid` must hold beyond the horizon, at all times: proved if
             the sets return into the initial set, or into another one that does (`Recurrence`).
-        time_limit: seconds for the whole call, of which the search for such a set has what the
-            verdict until the horizon leaves; None: until a few are tried.
+        time_limit: with `forever`, seconds from the beginning of the call after which no such set
+            is looked for any more; None: until a few are tried.
 
     Raises:
         TypeError: a set is no Box, Polytope or Ellipsoid.

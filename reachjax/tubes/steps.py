@@ -134,7 +134,7 @@ class Step:
         # a window that had to be shorter a step ago has to be now
         first = max(0, len(self.before) - len(self.before[-1].window)) if self.before else 0
         if limit is not None and self.before and self.before[-1].window.taken > limit:
-            first = len(self.before)  # one that is as short as may be, and too large alone
+            first = len(self.before)  # that window is of one step, and too large even so
         while True:
             window = self._reaching_back(self.before[first:])
             if limit is None or window.taken <= limit or len(window) == 1:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, joined, upper_bounds
 from reachjax.proofs.witnesses import initial_states
 from tests.closed_loops import initial_set, on_host, switching_loop, that_switches
@@ -162,6 +163,22 @@ def test_bounds_by_random_multipliers_hold(case, seed):
         found = upper_bounds(forms, horizon.facts, multipliers, horizon.start)
         assert np.all(found >= attained - 1e-12)
         np.testing.assert_array_equal(horizon.bounds(forms, multipliers), found)
+
+
+def test_facts_that_are_no_numbers_do_no_harm_without_multipliers(case):
+    loop, _, _, horizon, _, _, _ = case
+    forms, facts = np.eye(loop.states) @ horizon.state, horizon.facts
+    if not len(facts.rows):
+        pytest.skip("nothing switches, and nothing cuts the initial set")
+    multipliers = nonnegative(0)(horizon, forms)
+    multipliers[:, 0] = 0.0
+    lost = np.arange(len(facts.rows)) == 0
+    broken = AffineForms(np.where(lost[:, None], np.nan, facts.rows), facts.radii)
+    wanted = upper_bounds(forms, facts, multipliers, horizon.start)
+    found = upper_bounds(forms, broken, multipliers, horizon.start)
+    np.testing.assert_array_equal(found, wanted)
+    multipliers[:, 0] = 1.0
+    assert np.isnan(upper_bounds(forms, broken, multipliers, horizon.start)).all()
 
 
 def test_bounds_by_multipliers_of_any_sign_hold_where_facts_are_zero(case):

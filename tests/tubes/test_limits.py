@@ -15,7 +15,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.numerics import budget
-from reachjax.tubes import by_cells, by_programs
+from reachjax.tubes import by_cells, by_programs, propagation
 from tests.networks import he_network
 
 PATIENCE = 8.0
@@ -141,19 +141,31 @@ def test_steps_that_have_no_time_for_programs_are_by_forms(switching, tmp_path):
     np.testing.assert_array_equal(again.sets[3].b, forms.sets[3].b)
 
 
-@pytest.mark.parametrize("solver", [rj.InteriorPoint(), rj.Clarabel()])
-def test_programs_that_are_too_large_for_memory_are_not_begun(switching, solver, monkeypatch):
-    """The answer says what they would take, and bounds need no solver."""
-    (loop, X0), template = switching, rj.Template.box(4)
+SOLVERS = rj.InteriorPoint(), rj.Clarabel()
+
+
+@pytest.mark.parametrize(
+    ("template", "solver"),
+    [
+        (rj.Template.box(4), rj.InteriorPoint()),
+        (rj.Template.box(4), rj.Clarabel()),
+        (rj.EllipsoidTemplate(), rj.Clarabel()),
+    ],
+)
+def test_programs_that_are_too_large_for_memory_are_not_begun(
+    switching, template, solver, monkeypatch
+):
+    """The warning says what they would take, and bounds need no solver."""
+    loop, X0 = switching
     monkeypatch.setattr(budget, "MOST_BYTES", 2**10)
-    with pytest.warns(RuntimeWarning, match=r"would take .* GiB"):
+    with pytest.warns(RuntimeWarning, match=r"would take [0-9.e-]+ GiB, and 9.54e-07 GiB is"):
         tube = rj.reach(loop, X0, 1, template, rj.LocalBounds(), solver=solver)
     assert set(tube.proof(1).statuses) == {rj.SolverStatus.FAILED}
     states = loop.simulate(X0.sample(jax.random.key(0), 200), 1)
     assert bool(tube.sets[1].contains(states[:, 1], 1e-9).all())
 
 
-@pytest.mark.parametrize("solver", [rj.InteriorPoint(), rj.Clarabel()])
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_programs_that_would_end_after_the_time_are_not_begun(switching, solver, monkeypatch):
     (loop, X0), template = switching, rj.Template.box(4)
     monkeypatch.setattr(budget, "PACE", 1e-9)
@@ -161,22 +173,63 @@ def test_programs_that_would_end_after_the_time_are_not_begun(switching, solver,
     assert set(tube.proof(1).statuses) == {rj.SolverStatus.LIMIT}
 
 
-def test_a_step_that_would_end_after_the_time_is_by_forms(small, monkeypatch):
-    """A step by programs takes about as long as the one before."""
-    begun, successors = [], by_programs.successors
+class Clock:
+    """Seconds that pass where a test says so, in the place of the module `time`."""
+
+    now = 0.0
+    time = staticmethod(time.time)
+
+    def monotonic(self):
+        return self.now
+
+
+@pytest.mark.parametrize(("spent", "by_programs_are"), [(3.0, 3), (6.5, 1)])
+def test_steps_that_keep_to_their_shares_are_begun_and_others_are_not(
+    small, spent, by_programs_are, monkeypatch
+):
+    """A step that took more than its share is followed by none that would end after the time."""
+    clock, begun, successors = Clock(), [], by_programs.successors
 
     def slowly(*given):
-        begun.append(given)
-        time.sleep(0.6)
-        return successors(*given)
+        found = successors(*given)
+        clock.now += spent
+        begun.append(found)
+        return found
 
     monkeypatch.setattr(by_programs, "successors", slowly)
+    for module in (budget, propagation):
+        monkeypatch.setattr(module, "time", clock)
     given = small, rj.Box([1.0], [2.0]), 3, rj.Template.box(1), rj.LocalBounds()
-    rj.reach(*given)  # nothing is compiled after it
-    begun.clear()
-    tube = rj.reach(*given, time_limit=1.0)
-    assert len(begun) == 1
-    assert set(tube.proof(3).statuses) == {rj.SolverStatus.TIME}
+    tube = rj.reach(*given, time_limit=9.0)
+    assert len(begun) == by_programs_are
+    late = {t for t in (1, 2, 3) if rj.SolverStatus.TIME in tube.proof(t).statuses}
+    assert late == set(range(by_programs_are + 1, 4))
+
+
+@pytest.mark.costly
+def test_ellipsoids_that_have_no_time_hold_what_is_simulated(switching, tmp_path):
+    """No solver is asked, and what is kept is proved again."""
+    loop, X0 = switching
+    tube = rj.reach(loop, X0, 3, rj.EllipsoidTemplate(), time_limit=0.0)
+    states = loop.simulate(X0.sample(jax.random.key(0), 200), 3)
+    for t in (1, 2, 3):
+        assert bool(tube.sets[t].contains(states[:, t], 1e-9).all())
+        assert rj.SolverStatus.SOLVED not in tube.proof(t).statuses
+    tube.save(tmp_path / "tube")
+    again = rj.load(tmp_path / "tube", recheck=True)
+    np.testing.assert_array_equal(again.sets[3].shape, tube.sets[3].shape)
+
+
+@pytest.mark.costly
+def test_compiled_ellipsoids_are_what_was_asked_for_however_slowly_they_are_traced(small):
+    given = small, rj.Box([1.0], [2.0]), 2, rj.EllipsoidTemplate(), rj.LocalBounds(), 1
+
+    @jax.jit
+    def shape(X0):
+        return rj.reach(small, X0, *given[2:], time_limit=0.0).sets[-1].shape
+
+    wanted = rj.reach(*given).sets[-1].shape
+    np.testing.assert_allclose(shape(given[1]), wanted, rtol=1e-4)
 
 
 def test_cells_that_would_end_after_the_time_are_not_begun(monkeypatch):

@@ -260,11 +260,12 @@ class SmoothUnit(AbstractUnit):
         Lebesgue constant), here 2, beside the error of an exact interpolant.
 
         Args:
-            lower: `(k,)`.
-            upper: `(k,)`.
+            lower: the lower ends of the inputs, `(k,)`.
+            upper: the upper ends, `(k,)`.
             linear: the lines on these intervals, where they are known.
         """
-        xp, linear = namespace(lower, upper), linear or self.linear(lower, upper)
+        xp = namespace(lower, upper)
+        linear = self.linear(lower, upper) if linear is None else linear
         lower, upper = settled(self.met(lower, upper))
         center = settled(lower / 2 + upper / 2)
         fine = self.defined(lower, upper)

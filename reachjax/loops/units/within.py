@@ -53,7 +53,7 @@ class Within(SmoothUnit):
     @np.errstate(all="ignore")
     def quadratic(self, lower: Array, upper: Array, linear: Quadratic | None = None) -> Quadratic:
         """The lines, which bend nowhere."""
-        return linear or self.linear(lower, upper)
+        return self.linear(lower, upper) if linear is None else linear
 
     def _is_kept(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
         """Where bounds of inputs say more than what is known of them."""

@@ -217,6 +217,7 @@ def test_ellipsoids_that_have_no_time_hold_what_is_simulated(switching, tmp_path
         assert rj.SolverStatus.SOLVED not in tube.proof(t).statuses
     tube.save(tmp_path / "tube")
     again = rj.load(tmp_path / "tube", recheck=True)
+    assert isinstance(again, rj.ReachTube)
     np.testing.assert_array_equal(again.sets[3].shape, tube.sets[3].shape)
 
 

@@ -198,7 +198,8 @@ def _following(
             return sets_by_cells(*given, known=len(known))
         return sets_by_branching(setting, relaxation.nodes, X0, box, template, horizon, known)
     steps = sets_by_programs(setting, X0, template, horizon, window, known)
-    if template.parts[1] is not None or not is_concrete((loop, X0, template)):
+    concrete = is_concrete(jax.lax.stop_gradient((loop, X0, template)))
+    if template.parts[1] is not None or not concrete:
         return steps
     forms = sets_by_forms(loop, X0, X0.closed_form(box), box, template, horizon, start)
     return _in_time(setting.budget, steps, forms, len(known), horizon)

@@ -141,6 +141,21 @@ def test_steps_that_have_no_time_for_programs_are_by_forms(switching, tmp_path):
     np.testing.assert_array_equal(again.sets[3].b, forms.sets[3].b)
 
 
+@pytest.mark.costly
+def test_derivatives_of_steps_that_have_no_time_are_those_of_forms(small):
+    """The function that is differentiated is the one that is called."""
+
+    def largest(upper):
+        X0, template = rj.Box([1.0], jnp.array([upper])), rj.Template.box(1)
+        tube = rj.reach(small, X0, 2, template, rj.LocalBounds(), time_limit=0.0)
+        return tube.sets[2].b.sum()
+
+    value, slope = jax.value_and_grad(largest)(2.0)
+    np.testing.assert_allclose(value, largest(2.0), rtol=1e-12)
+    difference = (largest(2.0 + 1e-5) - largest(2.0 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(slope, difference, rtol=1e-6)
+
+
 SOLVERS = rj.InteriorPoint(), rj.Clarabel()
 
 

@@ -3,6 +3,7 @@
     python -m tests.golden write results/before.json
     python -m tests.golden compare results/before.json        # runs the cases again
     python -m tests.golden compare results/before.json results/after.json
+    python -m tests.golden write --kept tests/golden/kept.json  # where a change is meant
 
 What is compared is compared bit for bit: on one machine, and with the same versions of what the
 library stands on.
@@ -10,6 +11,7 @@ library stands on.
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -18,14 +20,15 @@ from rich.table import Table
 from tqdm import tqdm
 
 import conftest  # noqa: F401  (64-bit floats, quick compilation)
-from tests.golden.cases import every
+from tests.golden.cases import KEPT, every
 from tests.golden.records import SECONDS, Record, differences, read, recorded, written
 
 
-def run(pattern: str) -> dict[str, Record]:
-    """The records of the cases whose names have a pattern in them."""
-    found = {}
-    for case in tqdm([case for case in every() if pattern in case.name], unit="case"):
+def run(pattern: str, kept: bool) -> dict[str, Record]:
+    """The records of the cases whose names have a pattern in them; of those that are kept alone."""
+    some = [replace(case, differentiated=False) for case in every() if case.name in KEPT]
+    found, asked = {}, some if kept else every()
+    for case in tqdm([case for case in asked if pattern in case.name], unit="case"):
         found[case.name] = recorded(case)
         jax.clear_caches()  # what is compiled is compiled in each case's own seconds
     return found
@@ -58,12 +61,15 @@ def main(arguments: list[str] | None = None) -> int:
         "other", type=Path, nargs="?", help="what to compare with; runs if not given"
     )
     parser.add_argument("--case", default="", help="only cases whose names have this in them")
+    parser.add_argument(
+        "--kept", action="store_true", help="only cases that are kept beside the tests"
+    )
     given = parser.parse_args(arguments)
     if given.what == "write":
-        written(given.file, run(given.case))
+        written(given.file, run(given.case, given.kept))
         return 0
     before = {name: record for name, record in read(given.file).items() if given.case in name}
-    after = run(given.case) if given.other is None else read(given.other)
+    after = run(given.case, given.kept) if given.other is None else read(given.other)
     return 1 if compared(before, after) else 0
 
 

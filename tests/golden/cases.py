@@ -13,6 +13,21 @@ from tests.campaign.architectures import BLOCK, EVERY
 EACH = 2
 """So many cases of an architecture; the first of them is differentiated, too."""
 
+KEPT = (
+    "line, linear 104",
+    "small, adapted 426",
+    "tanh, affine 201",
+    "relu, disturbed 251",
+    "six 380",
+    "quotients 900",
+    "unicycle 925",
+    "hard, products 976",
+    "leaky, traced 951",
+    "relu, round 1051",
+    "linear, octagonal 301",
+)
+"""Cases of which nothing is compiled: what is said of them is kept beside the tests."""
+
 DRAWS = 60
 ROOM = 0.05
 """By this part of what trajectories visit a requirement is larger than it."""

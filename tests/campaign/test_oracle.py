@@ -76,6 +76,7 @@ def test_rooms_in_longdouble_are_off_by_no_more_than_they_say():
         room, off = ball.room_wide(points, np.zeros_like(points))
         right = np.array([ball.room(x) for x in exact(points)])
         assert np.all(abs(exact(room) - right) <= exact(off))
+        # seven roundings of numbers of this size, whatever is drawn
         assert np.all(off[:, :3] <= 8 * np.finfo(WIDE).eps * (1 + abs(points)))
 
 

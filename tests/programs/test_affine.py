@@ -109,17 +109,13 @@ def test_compiled_bounds_are_those_of_numpy(kind):
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
 @pytest.mark.parametrize("options", CONTROLLERS[:3], ids=NAMES[:3])
 def test_no_exact_trajectory_is_outside(options, scale):
-    """Corners are simulated in fractions, from sets so small that bounds are attained.
-
-    What rounding adds to a bound is less than a hundredth of the set's half width.
-    """
+    """Corners are simulated in fractions, from sets so small that bounds are attained."""
     case, D = controlled(**options, hidden=(4,), boxed=False, seed=1), directions(2)
     layers = [(W / (1 if k else scale), b) for k, (W, b) in enumerate(case.data.layers)]
     W, b = layers[-1]
     layers[-1] = scale * W, scale * b
     center = scale * np.array([0.7, -0.4])
-    half = 1e-9 * scale
-    X0 = rj.Box(center - half, center + half)
+    X0 = rj.Box(center - 1e-9 * scale, center + 1e-9 * scale)
     plant = rj.AffinePlant(case.data.A, case.data.B, scale * case.data.c)
     loop = rj.ClosedLoop(plant, rj.MLP.from_layers(layers, activation=options["activation"]))
     exact = np.vectorize(lambda number: Fraction(float(number)), otypes=[object])
@@ -135,7 +131,7 @@ def test_no_exact_trajectory_is_outside(options, scale):
         for found in (bounds[t], compiled[t]):
             assert all(Fraction(float(b)) >= value for b, value in zip(found, values, strict=True))
         off = bounds[t] - values.astype(float)
-        assert off.max() <= half / 100
+        assert off.max() <= 1e-12 * scale  # a few roundings, no more
 
 
 @pytest.mark.parametrize("unit", [*UNITS, "any other"], ids=str)

@@ -337,12 +337,10 @@ def test_the_affine_leaf_is_bounded_by_its_form(case):
 def small():
     """A horizon of few units that switch, with all patterns of their phases."""
     X0 = initial_set("box", 2, seed=10)
-    for seed in itertools.count(10, 1000):
-        loop = switching_loop(2, hidden=(5,), seed=seed)
-        horizon = horizon_of(loop, X0)
-        if 3 <= len(horizon.zero) <= 8:
-            return loop, X0, horizon, list(itertools.product((0, 1), repeat=len(horizon.zero)))
-    raise AssertionError
+    loops = (switching_loop(2, hidden=(5,), seed=seed) for seed in itertools.count(10, 1000))
+    found = ((loop, horizon_of(loop, X0)) for loop in loops)
+    loop, horizon = next(pair for pair in found if 3 <= len(pair[1].zero) <= 8)
+    return loop, X0, horizon, list(itertools.product((0, 1), repeat=len(horizon.zero)))
 
 
 def by_linprog(horizon, rows, constants, zero):

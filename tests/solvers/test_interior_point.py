@@ -119,17 +119,13 @@ def test_it_agrees_with_clarabel(answer):
     solved = reference.statuses == rj.SolverStatus.SOLVED
     assert solved.any()
     size = interval_offsets(given) - given.objective.mid[:, -1]
-    apart = (solution.offsets - reference.offsets) / np.maximum(size, 1e-9)
-    # one that stalls says so, and is looser
-    stalled = solution.statuses == rj.SolverStatus.INACCURATE
-    assert np.all(apart[solved & stalled] > -1e-5)
-    apart = apart[solved & ~stalled]
+    apart = (solution.offsets - reference.offsets)[solved] / np.maximum(size[solved], 1e-9)
     # Clarabel itself moves by 1.5e-5 from a tolerance of 1e-8 to one of 1e-9
     np.testing.assert_allclose(apart, 0, atol=1e-5)
     # what the recheck proves is never looser
     bounds = judged_offsets(given, solution).value
     others = judged_offsets(given, reference).value
-    assert np.all((bounds <= others + 1e-6 * size + 1e-12)[~stalled])
+    assert np.all(bounds <= others + 1e-6 * size + 1e-12)
 
 
 def test_what_it_proposes_is_well_formed(answer):

@@ -127,6 +127,14 @@ def test_programs_in_progress_are_cut_and_what_is_returned_holds(switching, way)
         assert statuses & {"LIMIT", "FAILED", "TIME"}
 
 
+def proved_again(tube, path):
+    """The tube as it is read from a file and proved again."""
+    tube.save(path)
+    again = rj.load(path, recheck=True)
+    assert isinstance(again, rj.ReachTube)
+    return again
+
+
 def test_steps_that_have_no_time_for_programs_are_by_forms(switching, tmp_path):
     (loop, X0), template = switching, rj.Template.box(4)
     tube = rj.reach(loop, X0, 3, template, rj.LocalBounds(), time_limit=0.0)
@@ -135,9 +143,7 @@ def test_steps_that_have_no_time_for_programs_are_by_forms(switching, tmp_path):
         np.testing.assert_array_equal(tube.sets[t].b, forms.sets[t].b)
         assert set(tube.proof(t).statuses) == {rj.SolverStatus.TIME}
     assert int(rj.unsolved(tube)) == 3 * len(template)
-    tube.save(tmp_path / "tube")
-    again = rj.load(tmp_path / "tube", recheck=True)
-    assert isinstance(again, rj.ReachTube)
+    again = proved_again(tube, tmp_path / "tube")
     np.testing.assert_array_equal(again.sets[3].b, forms.sets[3].b)
 
 
@@ -230,9 +236,7 @@ def test_ellipsoids_that_have_no_time_hold_what_is_simulated(switching, tmp_path
     for t in (1, 2, 3):
         assert bool(tube.sets[t].contains(states[:, t], 1e-9).all())
         assert rj.SolverStatus.SOLVED not in tube.proof(t).statuses
-    tube.save(tmp_path / "tube")
-    again = rj.load(tmp_path / "tube", recheck=True)
-    assert isinstance(again, rj.ReachTube)
+    again = proved_again(tube, tmp_path / "tube")
     np.testing.assert_array_equal(again.sets[3].shape, tube.sets[3].shape)
 
 

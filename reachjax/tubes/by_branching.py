@@ -39,9 +39,6 @@ A window that has fewer begins at a certified set, and hardly proves more than i
 LARGEST = 100
 """Columns of the horizon from which on no facet gets products, whatever the time."""
 
-EXACT = 1e-7
-"""Where derivatives are asked for, a facet climbs until its gap is a smaller part of its range."""
-
 
 def sets_by_branching(
     setting: Setting,
@@ -67,9 +64,6 @@ def sets_by_branching(
         ValueError: states overflow.
     """
     loop, begun, around = jax.device_get(jax.lax.stop_gradient((setting.loop, X0, box)))
-    gap = setting.gap
-    if not is_concrete(setting.loop, X0, template):  # a derivative is that of what is attained
-        gap = min(gap, EXACT)
     timed = setting.budget.timed  # then that is the budget
     of_programs, work = (np.inf, np.inf) if timed else (WORK, PRODUCTS)
     budget = setting.budget.with_work(of_programs)
@@ -97,7 +91,7 @@ def sets_by_branching(
         simulated = Simulated.nothing(scenarios.middle(around.center), len(rows))
         if setting.simulations is not None:
             simulated = setting.simulations.values(k, rows)
-        target, ranges = ladder.facets(rows, simulated, gap)
+        target, ranges = ladder.facets(rows, simulated, setting.gap)
         half = share.share(1 / 2)  # the other one is for products
         climbed = ladder.bounds(target, (horizon - k) * len(rows), half)
         if not np.isfinite(climbed.bounds).all():

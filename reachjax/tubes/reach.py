@@ -353,10 +353,9 @@ def reach(
     The offsets of the sets have first derivatives (reverse mode) in the loop's weights, plant and
     input box, in a box's ends and in a polytope's normals and offsets; so have centre and shape of
     ellipsoids, also in centre and shape of an ellipsoid `X0`. A derivative is that of the bound
-    that is reported: where a program was not solved, of what is proved without its optimum; where
-    no trajectory attains a bound of `BranchAndCut`, of its multipliers with the ranges of units
-    held. It is NaN where there is no bound. So that bounds are attained, facets climb to a `gap` of
-    1e-7 where a derivative is asked for, if theirs is larger.
+    that is reported, which the same `gap` ends with and without derivatives: where a program was
+    not solved, of what is proved without its optimum; where no trajectory attains a bound of
+    `BranchAndCut`, of what its multipliers prove. It is NaN where there is no bound.
 
     Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 

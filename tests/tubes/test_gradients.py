@@ -147,6 +147,17 @@ def test_gradients_are_differences(kind):
     claimed(kind, range(2, 4))
 
 
+@pytest.mark.costly
+@pytest.mark.parametrize("seed", [11, 14])
+def test_what_is_differentiated_is_what_is_called(seed):
+    # facets that climbed further under derivatives had other bounds there, and other slopes
+    rng = np.random.default_rng(seed)
+    loop, X0 = loop_of("affine", rj.HardTanh(), rng), region_of("box", rng)
+    called = functools.partial(offsets, METHODS["few nodes"])
+    value, _ = jax.value_and_grad(called)(loop, X0)
+    np.testing.assert_allclose(value, called(loop, X0), rtol=1e-7)
+
+
 @pytest.mark.long
 def test_two_hundred_gradients_are_differences():
     found = [error for kind in KINDS for error in claimed(kind, range(10, 14))]

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
@@ -16,6 +17,7 @@ from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
 from reachjax.proofs.linear import LinearCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
+from reachjax.tubes.cell_slopes import moving_forms
 from reachjax.tubes.steps import Reached, overflow
 
 ENDS = SolverStatus.AFFINE_FORM, SolverStatus.FAILED
@@ -59,10 +61,16 @@ def sets_by_forms(
         scenarios = Scenarios.of(loop, X0, horizon, start)
     if template.steps is None:
         directions = jnp.broadcast_to(directions, (horizon, *directions.shape))
-    if is_concrete(loop, X0, box, directions):
-        steps = _timed(unrolled(loop, held, box, np.asarray(directions[:horizon]), start), start)
+    given = loop, held, box, directions[:horizon]
+    fixed, cut = jax.lax.stop_gradient(given), held.parts[0]
+    if is_concrete(given):
+        steps = _timed(unrolled(*given, start), start)
+    elif (
+        cut is not None and cut.needs_programs and is_concrete(fixed)
+    ):  # compiled code would have none
+        steps = _moved(_timed(unrolled(*fixed, start), start), moving_forms(*given, start))
     else:
-        steps = _at_once(unrolled_at_once(loop, held, box, directions[:horizon], start))
+        steps = _at_once(unrolled_at_once(*given, start))
     for k, (step, seconds) in enumerate(steps, start=1):
         shaped, facets = template.at(k), len(template)
         proof = LinearCertificate(
@@ -100,6 +108,16 @@ def _timed(steps: Iterator[ByForms], start: int) -> Iterator[tuple[ByForms, floa
         seconds = time.perf_counter() - began
         yield step._replace(slopes=np.stack(slopes)), seconds
         began = time.perf_counter()
+
+
+def _moved(
+    steps: Iterator[tuple[ByForms, float]], slopes: Iterator[Float[Array, " f"]]
+) -> Iterator[tuple[ByForms, float]]:
+    """Each step, with derivatives of its offsets."""
+    for (step, seconds), moving in zip(steps, slopes, strict=True):
+        moved = jnp.where(jnp.isfinite(moving), moving, 0.0)  # what overflows has none
+        offsets = step.offsets + (moved - jax.lax.stop_gradient(moved))
+        yield step._replace(offsets=offsets), seconds
 
 
 def _at_once(found: ByForms) -> Iterator[tuple[ByForms, float]]:

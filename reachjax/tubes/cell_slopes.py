@@ -1,4 +1,4 @@
-"""Derivatives of what cells of an initial set prove, the tree of cells held as it is.
+"""Derivatives of what forms prove, over an initial set or over cells of it, held as they are.
 
 A bound is that of a form over the cell that decides it. Ends of cells move with the box around the
 initial set; where facets of the set itself decide, they have the multipliers of a linear program.
@@ -6,7 +6,7 @@ initial set; where facets of the set itself decide, they have the multipliers of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.programs.held import held_bounds, sources
+from reachjax.programs.held import Facets, held_bounds, sources
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.moving import HeldBounds, Moving, moving
 from reachjax.sets import AbstractSet, Box, Polytope
@@ -63,6 +63,29 @@ def moving_offsets(
     return jnp.stack(offsets)
 
 
+def moving_forms(
+    loop: ClosedLoop, X0: AbstractSet, box: Box, directions: Float[Array, "N f n_x"], start: int
+) -> Iterator[Float[Array, " f"]]:
+    """Numbers with the derivatives of what forms over a set prove, one step after the other.
+
+    Args:
+        loop: the closed loop.
+        X0: the initial set, cut by a polytope.
+        box: around it.
+        directions: of the facets of all steps.
+        start: the time of the initial set.
+    """
+    fixed = jax.lax.stop_gradient((loop, X0, box, directions))
+    *begun, rows = jax.device_get(fixed)
+    horizon = Horizon(*begun, start)
+    everywhere = jnp.zeros((len(rows), 2, loop.states))
+    facets = None if horizon.start.cut is None else horizon.start.cut.facets
+    for k in range(len(rows)):
+        horizon.advance()
+        held = _held_forms(horizon, rows, facets)
+        yield moving(Moving(loop, X0, box, directions[k], everywhere), held, k + 1, start)
+
+
 def _held(
     loop: ClosedLoop,
     X0: AbstractSet,
@@ -77,13 +100,26 @@ def _held(
     little larger for them, so that where the initial set has a corner, its own facets decide.
     """
     loop, part, box = jax.device_get((loop, cell.part, cell.box))
-    horizon = Horizon(loop, part, box, start)
+    horizon, facets = Horizon(loop, part, box, start), None
     for _ in range(k + 1):
         horizon.advance()
-    forms, facets = directions[k] @ horizon.state, None
     if isinstance(X0, Polytope):
         room = LOOSE * np.max(box.upper - box.lower)
         facets = X0.cut(Box(box.lower - room, box.upper + room)).facets
+    return _held_forms(horizon, directions, facets)
+
+
+def _held_forms(
+    horizon: Horizon, directions: Float[np.ndarray, "N f n_x"], facets: Facets | None
+) -> HeldBounds:
+    """What bounds of the last states of a horizon rest on.
+
+    Args:
+        horizon: over some of the steps.
+        directions: of all steps.
+        facets: of the polytope that the initial set is cut by, if it is.
+    """
+    forms = directions[len(horizon.steps) - 1] @ horizon.state
     _, upper = forms.ends(horizon.start, cut=facets is not None)
     bounds = sources(horizon.start, forms, upper, facets)
     return held_bounds(horizon, bounds, len(directions), facets)

@@ -95,6 +95,7 @@ SOME = [
     ("oscillator", "hard tanh", "ellipsoid", "one cell"),
     ("affine", "hard tanh", "polytope", "few nodes"),
     ("affine", "tanh", "box", "default"),
+    ("sine", "relu", "polytope", "LinearBounds"),
 ]
 """Of these some that are quick to compile."""
 
@@ -148,14 +149,21 @@ def test_gradients_are_differences(kind):
 
 
 @pytest.mark.costly
-@pytest.mark.parametrize("seed", [11, 14])
-def test_what_is_differentiated_is_what_is_called(seed):
-    # facets that climbed further under derivatives had other bounds there, and other slopes
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        (("affine", "hard tanh", "box", "few nodes"), 11),  # whose facets climbed further
+        (("affine", "hard tanh", "box", "few nodes"), 14),
+        (("sine", "relu", "polytope", "LinearBounds"), 10),  # which counted as the box around it
+    ],
+)
+def test_what_is_differentiated_is_what_is_called(kind, seed):
+    plant, activation, region, method = kind
     rng = np.random.default_rng(seed)
-    loop, X0 = loop_of("affine", rj.HardTanh(), rng), region_of("box", rng)
-    called = functools.partial(offsets, METHODS["few nodes"])
-    value, _ = jax.value_and_grad(called)(loop, X0)
-    np.testing.assert_allclose(value, called(loop, X0), rtol=1e-7)
+    args = loop_of(plant, ACTIVATIONS[activation], rng), region_of(region, rng)
+    called = functools.partial(offsets, METHODS[method])
+    value, _ = jax.value_and_grad(called, argnums=(0, 1))(*args)
+    np.testing.assert_allclose(value, called(*args), rtol=1e-7)
 
 
 @pytest.mark.long

@@ -36,6 +36,9 @@ from reachjax.tubes.verdicts import Counterexample, Recurrence, Verdict, Verdict
 LONG = 500
 """So many steps are simulated to see where trajectories end, and whether they break anything."""
 
+TURNS = 4
+"""In so many turns these are simulated, between which the clock is asked."""
+
 PROGRAMS = 0, 10, 10_000
 """How many linear programs a bound may take, by turns: there are other sets to try. Of smooth loops
 there are a tenth as many cells."""
@@ -93,7 +96,7 @@ def for_ever(
         raise ValueError("nothing is required for ever: give avoid sets or a safe set")
     if verdict.status is VerdictStatus.REFUTED:
         return verdict
-    wanted, runs = Wanted(safe, tuple(avoid or ())), _long_runs(loop, X0, start, seed)
+    wanted, runs = Wanted(safe, tuple(avoid or ())), _long_runs(loop, X0, start, seed, budget)
     example = _broken_later(loop, X0, wanted, runs, start, budget)
     if example is not None:
         refuted = VerdictStatus.REFUTED
@@ -116,11 +119,16 @@ def for_ever(
     return dataclasses.replace(verdict, status=status, recurrence=found)
 
 
-def _long_runs(loop: ClosedLoop, X0: AbstractSet, start: int, seed: int) -> Runs:
-    """Many steps of trajectories from corners of a set and from points of it."""
-    scenarios = Scenarios.of(loop, X0, LONG, start)
+def _long_runs(loop: ClosedLoop, X0: AbstractSet, start: int, seed: int, budget: Budget) -> Runs:
+    """Many steps of trajectories from corners of a set and from points of it; few without time."""
+    scenarios, on_host = Scenarios.of(loop, X0, LONG, start), jax.device_get(loop)
     drawn = scenarios.drawn(initial_states(X0, TRAJECTORIES, seed), seed)
-    return Runs(drawn, scenarios.runs(jax.device_get(loop), drawn, LONG, start))
+    found = list[Runs]()
+    for some in np.array_split(drawn, min(TURNS, len(drawn))):
+        if found and budget.late:
+            break
+        found.append(Runs(some, scenarios.runs(on_host, some, LONG, start)))
+    return Runs(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 def _broken_later(
@@ -191,6 +199,8 @@ def recurrence(
             if proved:
                 return found
             nearest = _nearer(nearest, found)
+    if budget.late:
+        return nearest
     loop, looking = tubes[0].loop, budget.share(LOOKING)
     tries = list[tuple[Candidate, int]]()
     for candidate in candidate_sets(tubes, runs, _flat(wanted.safe)):

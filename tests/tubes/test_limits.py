@@ -15,7 +15,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.numerics import budget
-from reachjax.tubes import by_cells, by_programs, propagation
+from reachjax.tubes import by_cells, by_programs, propagation, recurrence
 from tests.networks import he_network
 
 PATIENCE = 8.0
@@ -267,6 +267,20 @@ def test_cells_that_would_end_after_the_time_are_not_begun(monkeypatch):
     tube = rj.reach(loop, rj.Box([-1.0], [2.0]), 2, rj.Template.box(1), time_limit=0.5)
     assert len(made) == 1
     assert set(tube.proof(2).statuses) == {rj.SolverStatus.TIME}
+
+
+def test_without_time_no_more_is_simulated_for_ever_than_one_turn(small):
+    """Hundreds of steps of hundreds of trajectories of a wide network take seconds."""
+    X0 = rj.Box([1.0], [2.0])
+    runs = [
+        recurrence._long_runs(small, X0, 0, 0, budget.Budget(seconds)) for seconds in (0.0, 600.0)
+    ]
+    some, every = (len(each.states) for each in runs)
+    assert some == len(runs[0].scenarios) == -(-every // recurrence.TURNS)
+    np.testing.assert_allclose(runs[0].states, runs[1].states[:some], rtol=1e-12)
+    tube = rj.reach(small, X0, 2, rj.Template.box(1))
+    found = rj.verify(tube, safe=rj.Box([-3.0], [3.0]), forever=True, time_limit=0.0)
+    assert found.status is not rj.VerdictStatus.REFUTED
 
 
 class Stopping:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -62,9 +63,10 @@ def sets_by_forms(
     if template.steps is None:
         directions = jnp.broadcast_to(directions, (horizon, *directions.shape))
     given = loop, held, box, directions[:horizon]
-    fixed, cut = jax.lax.stop_gradient(given), held.parts[0]
+    fixed: Any = jax.lax.stop_gradient(given)
+    cut = held.parts[0]
     if is_concrete(given):
-        steps = _timed(unrolled(*given, start), start)
+        steps = _timed(unrolled(*fixed, start), start)
     elif (
         cut is not None and cut.needs_programs and is_concrete(fixed)
     ):  # compiled code would have none

@@ -76,8 +76,8 @@ def moving_forms(
         start: the time of the initial set.
     """
     fixed = jax.lax.stop_gradient((loop, X0, box, directions))
-    *begun, rows = jax.device_get(fixed)
-    horizon = Horizon(*begun, start)
+    on_host, begun, around, rows = jax.device_get(fixed)
+    horizon = Horizon(on_host, begun, around, start)
     everywhere = jnp.zeros((len(rows), 2, loop.states))
     facets = None if horizon.start.cut is None else horizon.start.cut.facets
     for k in range(len(rows)):

@@ -63,7 +63,7 @@ def sets_by_forms(
     if template.steps is None:
         directions = jnp.broadcast_to(directions, (horizon, *directions.shape))
     given = loop, held, box, directions[:horizon]
-    fixed: Any = jax.lax.stop_gradient(given)
+    fixed: tuple[Any, Any, Any, Any] = jax.lax.stop_gradient(given)
     cut = held.parts[0]
     if is_concrete(given):
         steps = _timed(unrolled(*fixed, start), start)

@@ -1,7 +1,7 @@
 """Numbers that have a first derivative, by reverse mode, and no other.
 
-A bound is differentiated with its multipliers held. That derivative differentiated again would be
-a number, and a wrong one.
+A bound is differentiated with its multipliers held (`moved_by`). That derivative differentiated
+again would be a number, and a wrong one (`first_order`).
 """
 
 from __future__ import annotations
@@ -67,6 +67,33 @@ def _once(number: Array) -> Array:
 
 
 _once.defvjp(lambda number: (number, None), lambda _, slope: (_twice(slope),))
+
+
+@jax.custom_vjp
+def moved_by(value: Array, moving: Array) -> Array:
+    """A number with the derivatives of another one, NaN where that one is not finite.
+
+    Args:
+        value: the number, which is held.
+        moving: what has its derivatives, of the same shape.
+
+    Example:
+        >>> value, slope = jax.value_and_grad(lambda x: moved_by(5.0, x**2))(3.0)
+        >>> float(value), float(slope)
+        (5.0, 6.0)
+    """
+    return value
+
+
+def _held(value: Array, moving: Array) -> tuple[Array, Array]:
+    return value, jnp.isfinite(moving)
+
+
+def _passed_on(finite: Array, slope: Array) -> tuple[Array, Array]:
+    return jnp.zeros_like(slope), jnp.where(finite | (slope == 0), slope, jnp.nan)
+
+
+moved_by.defvjp(_held, _passed_on)
 
 
 def first_order(tree: Any) -> Any:

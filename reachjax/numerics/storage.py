@@ -71,9 +71,12 @@ class Writer:
         if isinstance(value, np.ndarray | np.generic | jax.Array):
             return {"array": self._placed(value), "on": "device" * isinstance(value, jax.Array)}
         if isinstance(value, self._outside):
+            held = len(self.arrays), dict(self._known), dict(self._numbers)
             try:
                 return self._object(value)
-            except UnstorableError:
+            except UnstorableError:  # nor are its arrays, if nothing else has them
+                del self.arrays[held[0] :]
+                _, self._known, self._numbers = held
                 self.left_out = True
                 return {"outside": _name(type(value))}
         if isinstance(value, tuple) and hasattr(value, "_fields"):

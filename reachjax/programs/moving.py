@@ -19,6 +19,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.functions import with_constants
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.checks import is_concrete
+from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, states_facts, step_columns, step_forms
 from reachjax.programs.initial import Ends, InitialColumns
@@ -198,7 +199,7 @@ def _values(
                 moving = jnp.where(bound == INTERVAL, end, by_form) if intervals else by_form
                 if besides is not None:
                     moving = jnp.where(bound == KNOWN, besides[side], moving)
-                moved.append(value + (moving - jax.lax.stop_gradient(moving)))
+                moved.append(moved_by(value, moving))
             return moved[0], moved[1]
 
         place = first + k * more

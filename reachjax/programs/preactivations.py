@@ -15,13 +15,15 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.closed_loop import UnitLayer
 from reachjax.loops.functions import Compiled
 from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.rounding import Ball, gamma
-from reachjax.programs.basis import Rows, columns, loop_rows, picking
+from reachjax.programs.basis import Rows, columns, loop_rows
 from reachjax.programs.bounds import LoopBounds, loop_bounds
 from reachjax.sets import AbstractSet, Box
 
@@ -60,19 +62,19 @@ def bounds_over(
     if loop.units == 0:
         return loop_bounds(loop, box, t)
     n, size = loop.states, loop.states + loop.units + 1
-    places = n + jnp.arange(loop.units)
+    places, layers = n + jnp.arange(loop.units), loop.unit_layers
 
     def once(_, found: tuple[Ball, LoopBounds]) -> tuple[Ball, LoopBounds]:
         known, _ = found
         bounds = loop_bounds(loop, box, t, known)
         rows = loop_rows(loop, columns(0, n, size), places, t, bounds, prune=True)
-        return _meet(_ranges(rows.preactivation, X, bounds), known), bounds
+        return _meet(_ranges(rows.preactivation, X, bounds, layers), known), bounds
 
     # a layer is settled when those before it are: one pass each, of which the last one's ranges go
     # unused, so that one pass is all that is compiled
     shapes = jax.eval_shape(loop_bounds, loop, box, t, known)
     blank = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)
-    return jax.lax.fori_loop(0, len(loop.unit_layers) + 1, once, (known, blank))[1]
+    return jax.lax.fori_loop(0, len(layers) + 1, once, (known, blank))[1]
 
 
 def _meet(one: Ball, other: Ball) -> Ball:
@@ -81,40 +83,45 @@ def _meet(one: Ball, other: Ball) -> Ball:
     return Ball.between(lower, jnp.maximum(lower, jnp.minimum(one.upper, other.upper)))
 
 
-def _ranges(rows: Rows, X: AbstractSet, bounds: LoopBounds) -> Ball:
+def _ranges(rows: Rows, X: AbstractSet, bounds: LoopBounds, layers: tuple[UnitLayer, ...]) -> Ball:
     """Intervals of rows over the basis `[x, z, 1]`, by intervals and by the lines of `z`."""
     both = jax.tree.map(lambda *part: jnp.concatenate(part), rows, -rows)
-    relaxed = _relaxed(both, rows, bounds)
+    relaxed = _relaxed(both, rows, bounds, layers)
     upper, below = jnp.minimum(_upper(both, X, bounds), _upper(relaxed, X, bounds)).reshape(2, -1)
     return Ball.between(-below, jnp.maximum(-below, upper))
 
 
-def _relaxed(rows: Rows, inputs: Rows, bounds: LoopBounds) -> Rows:
+def _relaxed(rows: Rows, inputs: Rows, bounds: LoopBounds, layers: tuple[UnitLayer, ...]) -> Rows:
     """Rows that are nowhere smaller, over the state alone but for rounding.
 
-    Where a coefficient is positive the line above takes the place of `z`, else the line below.
+    Where a coefficient is positive the line above takes the place of `z`, else the line below: the
+    units of a layer at once, the last layer first.
 
     Args:
         rows: over the basis `[x, z, 1]`.
         inputs: those of the units `z`.
         bounds: of the units.
+        layers: of units.
     """
+    sizes = np.array([layer.size for layer in layers])
+    ends, width = jnp.asarray(np.cumsum(sizes)), int(sizes.max())
     k = len(inputs.mid)
     n = inputs.mid.shape[1] - 1 - k
 
     def replaced(i, rows: Rows) -> Rows:
-        unit = k - 1 - i
-        weight = jnp.where(bounds.affine[unit], 0.0, rows.mid[:, n + unit])
-        y, z = _row(inputs, unit), picking((n + unit)[None], inputs.mid.shape[1])
+        end, size = ends[len(layers) - 1 - i], jnp.asarray(sizes)[len(layers) - 1 - i]
+        first = jnp.maximum(end - width, 0)
+        unit = first + jnp.arange(width)
+        known = bounds.affine[unit] | (unit < end - size) | (unit >= end)
+        place = (0, n + first)
+        weights = jax.lax.dynamic_slice(rows.mid, place, (len(rows.mid), width))
+        left = jax.lax.dynamic_update_slice(rows.mid, jnp.where(known, weights, 0.0), place)
+        weights, y = jnp.where(known, 0.0, weights), inputs[unit]
         below, above = (line.slope[unit] * y + line.offset[unit] for line in bounds.lines)
-        over, under = jnp.maximum(weight, 0.0)[:, None], jnp.minimum(weight, 0.0)[:, None]
-        return rows + over @ (above - z) + under @ (below - z)
+        over, under = jnp.maximum(weights, 0.0), jnp.minimum(weights, 0.0)
+        return Rows(left, rows.rad) + over @ above + under @ below
 
-    return jax.lax.fori_loop(0, k, replaced, rows)
-
-
-def _row(rows: Rows, number: Array) -> Rows:
-    return jax.tree.map(lambda part: jax.lax.dynamic_slice_in_dim(part, number, 1), rows)
+    return jax.lax.fori_loop(0, len(layers), replaced, rows)
 
 
 def _upper(rows: Rows, X: AbstractSet, bounds: LoopBounds) -> Float[Array, " k"]:

@@ -15,7 +15,7 @@ from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
 from reachjax.sets import NormalForm
 from reachjax.solvers.base import AbstractSolver, require_positive
 from reachjax.solvers.centring import enclosed
-from reachjax.solvers.primal_dual import FacetProgram, minimised
+from reachjax.solvers.primal_dual import minimised
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,8 +68,8 @@ class InteriorPoint(AbstractSolver):
                 solution.statuses[i:] = SolverStatus.LIMIT
                 break
             began = time.perf_counter()
-            facet = FacetProgram(reduced.generators, reduced.free, row)
-            found = minimised(facet, self.tolerance, self.max_iterations)
+            given = reduced.generators, reduced.free, row
+            found = minimised(*given, self.tolerance, self.max_iterations)
             solution.seconds[i] = time.perf_counter() - began
             solution.statuses[i] = found.status
             solution.offsets[i] = reduced.centers[i] + reduced.units[i] * found.offset

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, owned
+from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.held import attained, held_bounds, sources
 from reachjax.programs.moving import Moving, moving
 from reachjax.proofs.branches import BranchCertificate, Rung
@@ -98,9 +99,8 @@ def sets_by_branching(
             raise overflow(setting.start + k)
         offsets = proved = owned(climbed.bounds)
         if not is_concrete(setting.loop, X0, directions):
-            moved = _moving(setting, X0, box, directions, climbed, ladder, ends, horizon)
-            moved = jnp.where(jnp.isfinite(moved), moved, 0.0)  # what overflows has none
-            offsets = proved + (moved - jax.lax.stop_gradient(moved))
+            moving = _moving(setting, X0, box, directions, climbed, ladder, ends, horizon)
+            offsets = moved_by(proved, moving)
         gaps = climbed.bounds - climbed.attained
         opened = np.flatnonzero(gaps > setting.gap * ranges)
         opened = opened[np.argsort(-gaps[opened], kind="stable")]

@@ -24,6 +24,7 @@ from reachjax.loops.scenarios import Scenarios
 from reachjax.loops.units import UnboundedError
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, owned
+from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.affine_steps import step_columns
 from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.proofs.cells import CellCertificate
@@ -152,9 +153,7 @@ def sets_by_cells(
         bounds = owned(offsets)
         if not is_concrete(setting.loop, X0, directions):
             cells = [search.leaves[i].cell for i in deciding]
-            moving = moving_offsets(setting, X0, box, directions, cells, k)
-            moving = jnp.where(jnp.isfinite(moving), moving, 0.0)
-            bounds = bounds + (moving - jax.lax.stop_gradient(moving))
+            bounds = moved_by(bounds, moving_offsets(setting, X0, box, directions, cells, k))
         facets = len(offsets)
         proof = CellCertificate(
             loop=setting.loop,

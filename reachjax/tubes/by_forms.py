@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.checks import is_concrete, owned
+from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
 from reachjax.proofs.linear import LinearCertificate
 from reachjax.proofs.proposal import SolverStatus
@@ -117,9 +118,7 @@ def _moved(
 ) -> Iterator[tuple[ByForms, float]]:
     """Each step, with derivatives of its offsets."""
     for (step, seconds), moving in zip(steps, slopes, strict=True):
-        moved = jnp.where(jnp.isfinite(moving), moving, 0.0)  # what overflows has none
-        offsets = step.offsets + (moved - jax.lax.stop_gradient(moved))
-        yield step._replace(offsets=offsets), seconds
+        yield step._replace(offsets=moved_by(step.offsets, moving)), seconds
 
 
 def _at_once(found: ByForms) -> Iterator[tuple[ByForms, float]]:

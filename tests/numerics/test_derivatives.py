@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.numerics.derivatives import ONLY_FIRST, first_order
+from reachjax.numerics.derivatives import ONLY_FIRST, first_order, moved_by
 from reachjax.tubes import propagation
 from tests.closed_loops import autonomous
 
@@ -56,3 +56,11 @@ def test_first_derivatives_pass_through_all_that_maps_and_compiles():
     with pytest.raises(TypeError) as caught:
         second(squared)(3.0)
     assert str(caught.value) == ONLY_FIRST
+
+
+def test_what_moves_out_of_the_numbers_has_no_derivative():
+    known = jnp.array([1.0, 2.0])
+    value, back = jax.vjp(lambda x: moved_by(known, jnp.exp(x)), jnp.array([0.5, 1e3]))
+    np.testing.assert_array_equal(value, known)
+    np.testing.assert_allclose(back(jnp.array([3.0, 0.0]))[0][0], 3 * np.exp(0.5))
+    assert np.isnan(back(jnp.array([3.0, 1.0]))[0][1])

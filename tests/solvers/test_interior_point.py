@@ -14,7 +14,7 @@ from reachjax.proofs.proposal import ANSWERS
 from reachjax.proofs.recheck import interval_offsets
 from reachjax.proofs.reported import judged_form, judged_offsets, log_volume
 from reachjax.sets import NormalForm
-from reachjax.solvers import barrier, centring
+from reachjax.solvers import barrier, centring, primal_dual
 from reachjax.solvers.barrier import EllipsoidBarrier
 from tests.closed_loops import closed_loop, one_step, random_loop, recursion, step_program
 from tests.differences import dot, error_in_all_parts
@@ -112,6 +112,15 @@ def answer(request):
     """(program, solution, Clarabel's)."""
     given = program(**request.param)
     return given, SOLVER.solve(given), rj.Clarabel().solve(given)
+
+
+def test_a_run_that_stalls_goes_again_with_less_damping(monkeypatch):
+    given = program(X=simplex)
+    expected = SOLVER.solve(given)
+    monkeypatch.setattr(primal_dual, "DAMPING", 100.0)  # stalls
+    found = SOLVER.solve(given)
+    assert np.all(found.statuses == rj.SolverStatus.SOLVED)
+    np.testing.assert_allclose(found.offsets, expected.offsets, atol=1e-6)
 
 
 def test_it_agrees_with_clarabel(answer):

@@ -1,5 +1,6 @@
 """Tubes from files are those that were written, and other files are refused."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -187,6 +188,29 @@ def test_the_loop_of_a_file_is_compared(tube, loop, path):
     equal(rj.load(path, loop), tube)
     with pytest.raises(ValueError, match="loop must be that of the tube"):
         rj.load(path, closed_loop(random_loop(2, (4, 3), seed=5)))
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class OwnPlant(rj.AbstractPlant):
+    """A plant of a class that a user wrote, whose arrays are not those of the proofs."""
+
+    A: jax.Array
+    B: jax.Array
+    states, inputs, steps = 2, 1, None
+
+    def propagate(self, x, u, t=0, unit=None, w=None):
+        return self.A @ x + self.B @ u
+
+
+def test_a_loop_with_a_plant_of_its_own_is_asked_for_again(X0, path):
+    plant = OwnPlant(jnp.array([[0.5, 0.1], [0.2, 0.7]]), jnp.array([[1.0], [0.5]]))
+    loop = rj.ClosedLoop(plant, curved().controller)
+    tube = rj.reach(loop, X0, 2, BOX)
+    tube.save(path)
+    with pytest.raises(ValueError, match="loop"):
+        rj.load(path)
+    equal(rj.load(path, loop, recheck=True), tube)
 
 
 # files that are something else -------------------------------------------------------------------

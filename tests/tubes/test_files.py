@@ -197,7 +197,18 @@ class OwnPlant(rj.AbstractPlant):
 
     A: jax.Array
     B: jax.Array
-    states, inputs, steps = 2, 1, None
+
+    @property
+    def states(self):
+        return 2
+
+    @property
+    def inputs(self):
+        return 1
+
+    @property
+    def steps(self):
+        return None
 
     def propagate(self, x, u, t=0, unit=None, w=None):
         return self.A @ x + self.B @ u

@@ -131,6 +131,7 @@ def test_no_exact_trajectory_is_outside(options, scale):
         for found in (bounds[t], compiled[t]):
             assert all(Fraction(float(b)) >= value for b, value in zip(found, values, strict=True))
         off = bounds[t] - values.astype(float)
+        assert off.max() <= 1e-12 * scale  # a few roundings, no more
         # a step is some thirty sums and products, each rounded, and twice as much outwards
         z = abs(layers[-1][0]) @ (abs(layers[0][0]) @ size + abs(layers[0][1])) + abs(layers[-1][1])
         size = abs(case.data.A) @ size + abs(case.data.B) @ z + abs(plant.c)

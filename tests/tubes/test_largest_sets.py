@@ -70,7 +70,7 @@ def test_it_can_be_gone_on_with_and_shows_its_progress(loop):
             yield item
 
     X0, more = rj.Box([1.0, -0.1], [1.1, 0.1]), {"relaxation": QUICK, "progress": bar, **WANTED}
-    some = rj.largest_set(loop, X0, HORIZON, rounds=2, time_limit=0.5, **more)
+    some = rj.largest_set(loop, X0, HORIZON, rounds=2, **more)
     later = rj.largest_set(loop, some.region, HORIZON, rounds=5, **more)
     assert later.region.volume() >= some.region.volume() * (1 - 1e-9)
     assert seen

@@ -75,6 +75,6 @@ def test_nothing_large_is_compiled_for_cells_under_a_limit(operations, call):
 @pytest.mark.costly
 def test_nothing_large_is_compiled_for_the_largest_set(operations):
     X0, safe = boxes(0.01, 0.05)
-    found = rj.largest_set(cart_pole(), X0, 2, safe=safe, rounds=2, time_limit=5.0)
+    found = rj.largest_set(cart_pole(), X0, 2, safe=safe, rounds=2, time_limit=60.0)
     assert found.verdict.status is rj.VerdictStatus.PROVED
     assert 0 < max(operations) < SMALL

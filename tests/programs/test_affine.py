@@ -122,7 +122,7 @@ def test_no_exact_trajectory_is_outside(options, scale):
     network = rj.MLP.from_layers([(W, a), (V, b)], activation=options["activation"])
     loop = rj.ClosedLoop(rj.AffinePlant(A, B, c), network)
     exact = np.vectorize(lambda number: Fraction(float(number)), otypes=[object])
-    x, bounds = exact(X0.vertices()), offsets(loop, X0, D)
+    x, bounds, size = exact(X0.vertices()), offsets(loop, X0, D), np.asarray(abs(center))
     compiled = np.asarray(unrolled_at_once(loop, X0, X0, repeated(D)).offsets)
     for t in range(STEPS):
         z = ACTIVATIONS[options["activation"]](x @ exact(W).T + exact(a))
@@ -133,6 +133,9 @@ def test_no_exact_trajectory_is_outside(options, scale):
             assert all(Fraction(float(y)) >= value for y, value in zip(found, values, strict=True))
         off = bounds[t] - values.astype(float)
         assert off.max() <= 1e-12 * scale  # a few roundings, no more
+        # a step is some thirty sums and products, each rounded, and twice as much outwards
+        size = abs(A) @ size + abs(B) @ (abs(V) @ (abs(W) @ size + abs(a)) + abs(b)) + abs(c)
+        assert np.all(off <= 128 * (t + 1) * np.finfo(float).eps * (abs(D) @ size))
 
 
 @pytest.mark.parametrize("unit", [*UNITS, "any other"], ids=str)

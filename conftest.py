@@ -8,8 +8,9 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
-import mmap
-from importlib.util import find_spec
+import subprocess
+import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
@@ -32,15 +33,18 @@ LARGEST, MOST = 5 * 2**28, 2**32
 """Bytes that a process may take before it forgets what it compiled; and where every case runs."""
 
 
-def known(flags: dict[str, str]) -> str:
-    """Those that the installed XLA has: it ends a process that names another."""
-    (folder,) = find_spec("jaxlib").submodule_search_locations
-    libraries = []
-    for path in Path(folder).glob("libjax_common*"):
-        with path.open("rb") as file:
-            libraries.append(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-    there = [name for name in flags if any(held.find(name.encode()) >= 0 for held in libraries)]
-    return " ".join(f"--{name}={flags[name]}" for name in there)
+def accepted(flags: dict[str, str]) -> str:
+    """Those that the installed XLA accepts: it ends a process that names another, so one tries."""
+
+    def said(names: Iterable[str]) -> str:
+        return " ".join(f"--{name}={flags[name]}" for name in names)
+
+    def are_accepted(*names: str) -> bool:
+        own = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": said(names)}
+        command = [sys.executable, "-c", "import jax; jax.devices()"]
+        return subprocess.run(command, check=False, env=own, capture_output=True).returncode == 0
+
+    return said(flags if are_accepted(*flags) else filter(are_accepted, flags))
 
 
 # One folder for all processes: half an entry, which another one is writing, fails its checksum,
@@ -48,7 +52,8 @@ def known(flags: dict[str, str]) -> str:
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("XLA_FLAGS", known(QUICKER))
+if "XLA_FLAGS" not in os.environ:
+    os.environ["XLA_FLAGS"] = accepted(QUICKER)
 
 # JAX, imported already, reads only XLA's flags from now on
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])

@@ -40,13 +40,23 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Draw all that is random from the seed of the session, before tests are imported."""
     config.addinivalue_line("markers", "costly: a claim that only `--every-case` or a path runs")
-    if seed := config.getoption("seed"):
-        for module, name in (
-            (np.random, "default_rng"),
-            (jax.random, "key"),
-            (jax.random, "PRNGKey"),
-        ):
-            setattr(module, name, _shifted(getattr(module, name), seed))
+    draw_from(config.getoption("seed"))
+
+
+def draw_from(seed: int) -> None:
+    """Draw all that is random in this process from a seed, before what draws is imported.
+
+    Args:
+        seed: the seed; 0 leaves all as it is.
+    """
+    if not seed:
+        return
+    for module, name in (
+        (np.random, "default_rng"),
+        (jax.random, "key"),
+        (jax.random, "PRNGKey"),
+    ):
+        setattr(module, name, _shifted(getattr(module, name), seed))
 
 
 def _shifted(draws: Callable[..., Any], seed: int) -> Callable[..., Any]:

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from conftest import QUICKER, accepted
 from reachjax.numerics.compilations import CompiledBeside
 
 RUN = """
 import sys
 import jax, jax.numpy as jnp
 import reachjax as rj
+from conftest import QUICKER, accepted
 jax.block_until_ready(jnp.sin(jnp.ones(3)))  # compiled before there is a cache
 folder = rj.keep_compilations(*sys.argv[1:])
 before = set(folder.iterdir())
@@ -102,3 +104,11 @@ def test_what_is_slower_than_numpy_or_cannot_be_measured_is_not_used():
     given = {"evaluations": 1000, "left": np.inf}
     assert not found.pays(x, by=2.0, seconds=lambda: None, **given)
     assert not found.pays(x, by=2.0, seconds=lambda: 1e-12, **given)
+
+
+@pytest.mark.costly
+def test_of_the_settings_of_the_suite_the_installed_xla_accepts_all_that_are_used():
+    """XLA ends a process that names one which it no longer has."""
+    used = accepted({"xla_no_such_setting": "true"} | QUICKER)
+    assert used == accepted(QUICKER)
+    assert "xla_no_such_setting" not in used

@@ -77,6 +77,8 @@ def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(task, way):
 CONTINUE = """
 import pickle, sys
 import jax
+from tests.selection import draw_from
+draw_from(int(sys.argv[2]))
 jax.config.update("jax_enable_x64", True)
 import reachjax as rj
 tube = pickle.load(sys.stdin.buffer)
@@ -85,10 +87,11 @@ sys.stdout.buffer.write(pickle.dumps(tube.extended(int(sys.argv[1]))))
 
 
 @pytest.mark.costly
-def test_a_tube_goes_on_in_another_process(task):
+def test_a_tube_goes_on_in_another_process(task, request):
     template = rj.Template.octagonal(2)
     begun = rj.reach(*task, DONE, template)
-    command = [sys.executable, "-c", CONTINUE, str(STEPS - DONE)]
+    seed = request.config.getoption("seed")  # the other process draws from it too
+    command = [sys.executable, "-c", CONTINUE, str(STEPS - DONE), str(seed)]
     found = subprocess.run(command, input=pickle.dumps(begun), capture_output=True, check=True)
     assert same(pickle.loads(found.stdout), rj.reach(*task, STEPS, template))
 

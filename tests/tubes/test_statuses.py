@@ -7,13 +7,24 @@ import pytest
 
 import reachjax as rj
 from reachjax.proofs.proposal import AS_ASKED, OF_SOLVERS
-from tests.closed_loops import closed_loop, initial_set, random_loop
 
 STEPS = 2
 
 
 def switching() -> tuple[rj.ClosedLoop, rj.Box, rj.Template]:
-    return closed_loop(random_loop(3)), initial_set("box", 3), rj.Template.box(3)
+    """A loop whose bounds need the phases of three units, whatever is drawn elsewhere.
+
+    The input, the sum of `relu(x_i + x_j) - relu(x_i) - relu(x_j)` over pairs, is zero at most;
+    lines above and below units do not show that before one unit of each pair is in one phase.
+    """
+    single, pairs = np.eye(3), np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 1.0], [1.0, 0.0, 1.0]])
+    layers = [
+        (np.vstack([single, pairs]), np.zeros(6)),
+        (np.array([[-2.0, -2.0, -2.0, 1.0, 1.0, 1.0]]), np.zeros(1)),
+    ]
+    plant = rj.AffinePlant(0.5 * single, np.ones((3, 1)))
+    loop = rj.ClosedLoop(plant, rj.MLP.from_layers(layers))
+    return loop, rj.Box([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]), rj.Template.box(3)
 
 
 def smooth() -> tuple[rj.ClosedLoop, rj.Box, rj.Template]:

@@ -18,7 +18,6 @@ RUN = """
 import sys
 import jax, jax.numpy as jnp
 import reachjax as rj
-from conftest import QUICKER, accepted
 jax.block_until_ready(jnp.sin(jnp.ones(3)))  # compiled before there is a cache
 folder = rj.keep_compilations(*sys.argv[1:])
 before = set(folder.iterdir())

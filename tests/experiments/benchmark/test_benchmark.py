@@ -24,6 +24,7 @@ from experiments.benchmark.parts import PARTS, parts
 from experiments.benchmark.steps import REFERENCE, STEPS_NOTE, measured, methods, steps_table
 from experiments.double_integrator.problem import INITIAL_BOX
 from experiments.verified_training import step_cost
+from tests.selection import draw_from
 
 QUICK = {"networks": ("random",), "widths": (3,), "repetitions": 1, "patience": 1e3}
 COLUMNS = 80
@@ -156,8 +157,15 @@ def test_the_table_of_growth_fits_in_eighty_columns(growing):
     assert sum("InteriorPoint" in line for line in lines) == 2
 
 
-def test_a_new_process_gives_the_same_bounds(growing):
-    row = in_new_process(grown, 3, "Clarabel", GROWTH)
+def grown_from(seed, *given):
+    """A row of the table whose case is drawn as in a session of this seed."""
+    draw_from(seed)
+    return grown(*given)
+
+
+def test_a_new_process_gives_the_same_bounds(growing, request):
+    seed = request.config.getoption("seed")
+    row = in_new_process(grown_from, seed, 3, "Clarabel", GROWTH)
     np.testing.assert_array_equal(row["bounds"], growing[1]["bounds"])
     assert row["memory"] > 2**20  # the program was compiled there, and nothing before it
 

@@ -115,7 +115,8 @@ def test_stored_samples_are_what_the_mpc_decides(learned):
 
 def test_stored_samples_are_drawn_as_documented(learned):
     samples, _ = learned
-    drawn = Draws()(QuadrotorMPC(), np.random.default_rng([0, 0]))
+    documented = np.random.Generator(np.random.PCG64([0, 0]))  # whatever the session's seed is
+    drawn = Draws()(QuadrotorMPC(), documented)
     assert len(drawn) == 200
     distances = np.linalg.norm(samples.states[:150, None] - drawn[None], axis=2).min(axis=1)
     np.testing.assert_allclose(distances, 0, atol=1e-5)

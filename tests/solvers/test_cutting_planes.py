@@ -223,7 +223,8 @@ def test_the_gradient_is_that_of_differences(window):
         moved = jax.tree.map(lambda leaf, d, by=k * step: leaf + by * d, layers, along)
         ends.append(sizes(moved, X0, data, window))
     difference = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
-    assert float(expected) == pytest.approx(float(difference), rel=1e-3)
+    # where it is next to nothing, as of a loop whose input stays at a limit, bounds are off by 1e-7
+    assert float(expected) == pytest.approx(float(difference), rel=1e-3, abs=1e-5)
 
 
 @pytest.mark.long

@@ -19,6 +19,10 @@ def intersection(n, seed=0):
     return rj.Intersection(rj.Polytope(region.A, region.b), round_part)
 
 
+SIGMAS = 5.5
+"""An estimate is farther off with probability 4e-8."""
+
+
 def members(X, count=20_000):
     """Points of the bounding box that are in the set, by a route that its sampler does not take."""
     points = X.bounding_box().sample(jax.random.key(7), count)
@@ -63,9 +67,13 @@ def test_samples_are_uniform_and_reach_both_parts_of_the_surface(n):
     X = intersection(n)
     x, others = X.sample(jax.random.key(0), 5000), members(X)
     assert bool(X.contains(x, 1e-12).all())
-    scale = np.sqrt(np.diag(np.atleast_2d(np.cov(others.T))))
-    np.testing.assert_allclose((x.mean(axis=0) - others.mean(axis=0)) / scale, 0.0, atol=0.08)
-    np.testing.assert_allclose(x.std(axis=0) / others.std(axis=0), 1.0, atol=0.05)
+    # moments of both are independent estimates, of which there may be few from the bounding box
+    off = SIGMAS * np.sqrt(1 / len(x) + 1 / len(others))
+    first = (x - others.mean(axis=0)) / x.std(axis=0)
+    second = (x - x.mean(axis=0)) ** 2
+    spread = second.std(axis=0) / second.mean(axis=0)
+    assert np.all(abs(first.mean(axis=0)) <= off)
+    assert np.all(abs(others.var(axis=0) / x.var(axis=0) - 1) <= off * spread)
     surface = X.sample_boundary(jax.random.key(1), 500)
     assert bool(X.contains(surface, 1e-9).all())
     at_facets = (X.polytope.bounded_values(surface) - X.polytope.b).max(axis=1) > -1e-9

@@ -56,7 +56,7 @@ def test_a_derivative_is_the_central_difference_in_every_argument(name, n):
     weights = jnp.linspace(1.0, 2.0, len(f(*args)))
     weighed = lambda *args: weights @ f(*args)  # noqa: E731
     gradients = jax.jit(jax.grad(weighed, argnums=tuple(range(len(args)))))(*args)
-    rng, h = np.random.default_rng(0), 1e-4
+    rng, h = np.random.default_rng(0), 2e-5
     for k, gradient in enumerate(gradients):
         move = jnp.asarray(rng.normal(size=args[k].shape))
         at = lambda s, k=k, move=move: weighed(*args[:k], args[k] + s * h * move, *args[k + 1 :])  # noqa: E731

@@ -45,6 +45,8 @@ def test_the_projection_is_the_clip_to_the_input_box(n_x):
     v = controller(data.layers, x)
     low, high = v.min(axis=0), v.max(axis=0)
     lower, upper = low + 0.3 * (high - low), low + 0.7 * (high - low)  # some are on either side
+    assert (v < lower).any()
+    assert (v > upper).any()
     loop = closed_loop(data).replace(input_box=rj.Box(lower, upper))
     u = np.asarray(jax.vmap(loop.input)(x))
     np.testing.assert_allclose(u, np.clip(v, lower, upper), rtol=0, atol=1e-13)

@@ -73,7 +73,7 @@ def test_affine_forms_are_linear_bounds_where_these_have_no_better_interval(n_x)
         values = loop.simulate(X0.vertices(), 1)[:, 1] @ template.directions.T
         above.append(bounds - np.asarray(values).max(axis=0))
     assert np.min(differences) > -1e-9
-    assert np.any(abs(np.array(differences)) < 1e-9)
+    assert np.mean(abs(np.array(differences)) < 1e-9) > 0.5
     assert np.max(above) > 1e-3  # some unit switches
 
 

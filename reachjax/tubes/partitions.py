@@ -255,7 +255,7 @@ def reach_partitioned(
         "gap": real_number("gap", gap, 0.0),
     }
     budget = Budget.of(time_limit)
-    own = ThreadPoolExecutor() if executor is None else None
+    own = ThreadPoolExecutor(os.cpu_count()) if executor is None else None
     run = _Run(loop, template, options, own or executor, progress, budget)
     run.remember(known)
     try:

@@ -5,6 +5,7 @@ from reachjax.loops.discretisation import runge_kutta, zero_order_hold
 from reachjax.loops.networks import MLP, AbstractNetwork, Network
 from reachjax.loops.plants import AbstractPlant, AffinePlant, NonlinearPlant
 from reachjax.loops.residual import Residual
+from reachjax.loops.sampled import SampledPlant
 from reachjax.loops.units import (
     ISRU,
     AbstractActivation,
@@ -53,6 +54,7 @@ __all__ = [
     "ReLU",
     "Reciprocal",
     "Residual",
+    "SampledPlant",
     "Sigmoid",
     "Sin",
     "Sinc",

@@ -198,8 +198,10 @@ class ClosedLoop(Replaceable):
 
     @property
     def curved(self) -> bool:
-        """Whether any unit is smooth."""
-        return any(isinstance(layer.unit, SmoothUnit) for layer in self.unit_layers)
+        """Whether the plant bends smoothly, or any unit is smooth."""
+        return self.plant.bends or any(
+            isinstance(layer.unit, SmoothUnit) for layer in self.unit_layers
+        )
 
     @property
     def units(self) -> int:

@@ -198,13 +198,13 @@ class Function:
         """The value over any kind of number, with `unit` at each layer of units."""
         if unit is evaluate and all(isinstance(each, jax.Array) for each in inputs):
             return self(*inputs)
-        recorder, wanted = self._steps()
+        recorder, wanted = self.recorded()
         if not isinstance(wanted, Value):  # a constant: as a number of this kind
             nothing = np.zeros((np.size(wanted), self.structure.inputs[0]))
             return nothing @ inputs[0] + wanted
         return recorder.run(inputs, unit, wanted)
 
-    def _steps(self) -> tuple[Recorder, Operand]:
+    def recorded(self) -> tuple[Recorder, Operand]:
         """The steps; of numpy arrays they are kept."""
         given = jax.tree.leaves((self.parameters, self.constants))
         if not all(isinstance(each, np.ndarray) for each in given):

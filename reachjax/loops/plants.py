@@ -39,6 +39,11 @@ class AbstractPlant(Replaceable, abc.ABC):
         return 0
 
     @property
+    def bends(self) -> bool:
+        """Whether its successors bend smoothly by more than the units it has; not here."""
+        return False
+
+    @property
     @abc.abstractmethod
     def steps(self) -> int | None:
         """The number of times a time-varying plant is given for; `None` when time-invariant."""

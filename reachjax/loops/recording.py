@@ -426,6 +426,11 @@ def _multiplied(unit: AtUnit, more: Any, less: Any, one: Any, other: Any) -> Any
     return squares.meeting(one.times(other)) if known else squares
 
 
+def product_of(step: Step) -> tuple[int, int] | None:
+    """The places of the factors of which a step is the product; None if it is none."""
+    return step.parents[2:] if step.apply is _multiplied else None  # type: ignore[return-value]
+
+
 def _size(y: Ball) -> Ball:
     """Sizes `|y|` of intervals."""
     least = larger(larger(y.lower, -y.upper), 0.0)

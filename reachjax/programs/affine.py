@@ -23,6 +23,7 @@ fixed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -176,6 +177,13 @@ class AffineForms:
         rows[where, n + np.arange(count)] = by[where]
         places = np.where(needed, n - 3 + np.cumsum(needed), -1)
         return AffineForms(rows, self.radii), places
+
+
+def widest(parts: Sequence[AffineForms]) -> AffineForms:
+    """All of these forms, over the columns of the widest."""
+    xp, width = namespace(*(part.rows for part in parts)), max(len(p.rows[0]) for p in parts) - 2
+    rows = [part.rows if xp is not np else part.widened(width).rows for part in parts]
+    return AffineForms(xp.concatenate(rows), xp.concatenate([part.radii for part in parts]))
 
 
 def _sum(one: Any, other: Any) -> Any:

@@ -20,10 +20,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.flows.flow import Flow
 from reachjax.loops.limits import Limits
 from reachjax.loops.units import AbstractUnit, Quadratic, SmoothUnit, UnboundedError
 from reachjax.numerics.rounding import Ball, gamma, namespace
 from reachjax.programs.affine import AffineForms, Place
+from reachjax.programs.flows import flowed_forms
 from reachjax.programs.initial import Ends, InitialColumns, constant, met, settled
 from reachjax.sets import Box
 
@@ -136,8 +138,10 @@ def step_forms(
     found: list[UnitForms] = []
     done, width, free = 0, state.columns.shape[1], place
 
-    def apply(unit: AbstractUnit, y: AffineForms) -> AffineForms:
+    def apply(unit: Any, y: Any) -> AffineForms:
         nonlocal done, width, free
+        if isinstance(unit, Flow):
+            return flowed_forms(unit, y, start)[0]
         here, done = slice(done, done + len(y.rows)), done + len(y.rows)
         slope = None if slopes is None else slopes[here]
         if place is None:  # branches that began alike must not share the columns they add

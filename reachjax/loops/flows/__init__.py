@@ -1,0 +1,1 @@
+"""Flows: what follows the states of a differential equation, enclosed."""

@@ -1,0 +1,328 @@
+"""One period of a differential equation, in steps of Taylor models.
+
+With `X` and `U` what the state and the input are in, `B` what solutions do not leave within a step
+of length `h` (`enclosures`), and `x_k` the coefficients of the solution,
+
+    x(t + h)  in  sum_{k <= p} h^k x_k(x, u)  +  h^{p+1} x_{p+1}(B, U),
+
+where the first sum is over Taylor models, which know what it has in common with `x` and `u`
+(Berz, Makino, Reliable Computing 1998), and the second is an interval. Between both ends the cubic
+with their values and derivatives has the Bernstein points
+
+    x_t,   x_t + h/3 x'_t,   x_{t+h} - h/3 x'_{t+h},   x_{t+h},
+
+and `|x(s) - cubic(s)| <= h^4/384 sup |x^(4)|`: so is what is in between.
+
+**Disturbances** that may change at any time. Let `y` be the solution with the mean `v` of `w` over
+the period in place of `w`, and `e = x - y`. Then `e' = A(t) e + G(t) (w - v)`, where `A` and `G` are
+in what the derivatives of `f` are in, so that
+
+    |e(h)| = |int (Phi(h, s) G(s) - K) (w(s) - v) ds|  <=  h (rad G + (exp(h |A|) - 1) |G|) rad W
+
+with `K = mid G`, as `w - v` has no mean, and for `w` in a box of radius `r` the mean of `|w - v|` is
+at most `r`. So what `w` does within a period is worth its mean, but for the second order in `h`.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import reduce
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.loops.flows.enclosures import enclosed
+from reachjax.loops.flows.series import Series, Solution, Tape
+from reachjax.loops.flows.taylor_models import Symbols, TaylorModels, zeros
+from reachjax.loops.units import Origin, UnboundedError, Within
+from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
+
+ORDER = 6
+"""The order of compiled steps, where none is given."""
+
+HIGHEST = 20
+"""The highest order that is chosen on the host: beyond, a step is better halved."""
+
+WORTH = 1e-4
+"""On the host the remainder of a step shall be at most this part of how far the set spreads."""
+
+EXACT = 1e-14
+"""Or this part of its size, where that is larger."""
+
+SHORTEST = 2.0**-12
+"""No step is a smaller part of a period: solutions escape, or are too fast."""
+
+MOST = 64
+"""Beyond so many steps in a period a remainder is taken as it is."""
+
+TERMS = 16
+"""Terms of the series of a matrix exponential, the rest of which is bounded."""
+
+
+class Settings(NamedTuple):
+    """How periods are done.
+
+    Attributes:
+        period: how long they are.
+        order: of the Taylor polynomials; None to choose it.
+        steps: at least so many in each period.
+        held: whether disturbances are constant over periods.
+    """
+
+    period: Any
+    order: int | None = None
+    steps: int = 1
+    held: bool = False
+
+
+class Control(NamedTuple):
+    """The control points of one step.
+
+    Attributes:
+        points: four of them, each a state.
+        part: how long the step is, of a period.
+    """
+
+    points: tuple[TaylorModels, ...]
+    part: float
+
+
+class Flowed(NamedTuple):
+    """The state after one period, of the symbols of the state before.
+
+    Attributes:
+        state: at the end.
+        controls: of each step, if they were asked for.
+    """
+
+    state: TaylorModels
+    controls: tuple[Control, ...]
+
+
+class _Piece(NamedTuple):
+    """One step whose solutions are enclosed.
+
+    Attributes:
+        B: what they stay in.
+        remainder: of the polynomials.
+        fourth: bounds of `|h^4 x_4|`.
+        order: of the polynomials.
+        excess: the remainder over what it shall be.
+    """
+
+    B: Ball
+    remainder: Ball
+    fourth: Any
+    order: int
+    excess: float
+
+
+def flowed(
+    tape: Tape,
+    x: TaylorModels,
+    others: list[TaylorModels],
+    box: Ball,
+    settings: Settings,
+    between: bool = False,
+) -> Flowed:
+    """The state after one period.
+
+    Args:
+        tape: of `f`.
+        x: the state before, each with a symbol of its own, which are the first ones.
+        others: the input and, if there are any, disturbances, the same, the next ones.
+        box: what else is known of the state.
+        settings: how it is done.
+        between: whether control points are asked for.
+
+    Raises:
+        UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
+    """
+    todo, controls, boxes = [1.0 / settings.steps] * settings.steps, list[Control](), list[Ball]()
+    state, proved, count = x, np.array(True), settings.steps
+    while todo:
+        part = todo.pop()
+        h = settings.period * part
+        here, given = _refreshed(state, others)
+        X = here.ball if boxes else here.ball.meeting(box)
+        piece, holds = _enclosed(tape, X, [each.ball for each in given], h, part, settings)
+        if piece is None or (piece.excess > 1 and count < MOST and part / 2 >= SHORTEST):
+            todo, count = [*todo, part / 2, part / 2], count + 1
+            continue
+        proved = proved & holds
+        solution = Solution(tape, here, given, h)
+        terms = [solution.advance() for _ in range(max(piece.order, 1))]
+        found = reduce(lambda one, more: one + more, terms[: piece.order], here)
+        found = (found + piece.remainder.mid).widened(piece.remainder.rad * (1 + gamma(4)))
+        if between:
+            last = h * Series(tape).advance([found, *given])
+            inner = here + (1 / 3) * terms[0], found - (1 / 3) * last
+            wide = [point.widened(piece.fourth / 16) for point in (here, *inner, found)]
+            controls.append(Control(tuple(_composed(each, state) for each in wide), part))
+        boxes.append(piece.B)
+        state = _composed(found, state)
+    end, within = _drift(tape, boxes, others, settings)
+    xp = namespace(state.rows)
+    lost = xp.where(proved, 0.0, xp.inf)
+    controls = [
+        each._replace(points=tuple(point.widened(within + lost) for point in each.points))
+        for each in controls
+    ]
+    return Flowed(state.widened(end + lost), tuple(controls))
+
+
+def _refreshed(
+    state: TaylorModels, others: list[TaylorModels]
+) -> tuple[TaylorModels, list[TaylorModels]]:
+    """A state with a new symbol each for all of it that is not of the initial set.
+
+    Returns:
+        The state, and the other arguments, of these symbols.
+    """
+    xp, n, (initial, curved, radii) = namespace(state.rows), len(state), state.symbols
+    first = 1 + state.symbols.count
+    own = abs(state.rows[:, first:]) @ radii * (1 + gamma(len(radii))) + state.radii
+    symbols = Symbols(initial, curved, xp.concatenate([own * (1 + gamma(2)), radii[n:]]))
+    eye = xp.eye(n, len(radii))
+    rows = xp.concatenate([state.rows[:, :first], eye], axis=1)
+    here = TaylorModels(rows, xp.zeros_like(state.radii), symbols)
+    return here, [TaylorModels(each.rows, each.radii, symbols) for each in others]
+
+
+def _composed(found: TaylorModels, state: TaylorModels) -> TaylorModels:
+    """What was found of a state's new symbols, of the state's own ones."""
+    xp, n, symbols = namespace(found.rows), len(state), state.symbols
+    first = 1 + symbols.count
+    slope, own = found.rows[:, first : first + n], state.rows[:, first:]
+    more = xp.concatenate([xp.zeros((len(found), n)), found.rows[:, first + n :]], axis=1)
+    rows = xp.concatenate([found.rows[:, :first], slope @ own + more], axis=1)
+    sizes = (abs(slope) @ abs(own) + abs(more)) @ symbols.radii
+    radii = found.radii + abs(slope) @ state.radii * (1 + gamma(n)) + gamma(2 * n + 8) * sizes
+    return TaylorModels(rows, radii * (1 + gamma(4)), symbols)
+
+
+def _enclosed(
+    tape: Tape, X: Ball, others: list[Ball], h: Any, part: float, settings: Settings
+) -> tuple[_Piece | None, Any]:
+    """A step with its enclosure, and whether that is proved; None of one that has to be halved.
+
+    Raises:
+        UnboundedError: it cannot be halved any more, in numpy.
+    """
+    on_host, shortest = namespace(X.mid) is np, part / 2 < SHORTEST
+    if on_host and not np.isfinite(X.rad).all():  # there is nothing to know
+        unknown = Ball(X.mid, X.rad + np.inf)
+        return _Piece(unknown, unknown, np.inf, 0, 0.0), np.array(False)
+    try:
+        B, proved = enclosed(tape, X, others, h)
+        if on_host and not proved:
+            if shortest:
+                raise _escaped(X, B)
+            return None, proved
+        return _remainder(tape, X, B, others, h, settings.order), proved
+    except UnboundedError:
+        if shortest:
+            raise
+        return None, np.array(False)
+
+
+def _remainder(
+    tape: Tape, X: Ball, B: Ball, others: list[Ball], h: Any, order: int | None
+) -> _Piece:
+    """A step of the order that was asked for, or of the lowest whose remainder is small enough.
+
+    If none is, of the one whose remainder is smallest.
+    """
+    solution, terms = Solution(tape, B, others, h), list[Ball]()
+    chosen, least = order or ORDER, 0.0
+    choosing = order is None and namespace(X.mid) is np
+    if choosing:
+        chosen, least, rate = 0, np.inf, h * Series(tape).advance([X, *others])
+        for k in range(HIGHEST + 1):
+            terms.append(solution.advance())
+            excess = _excess(terms[k], rate, X)
+            if k and excess < least:
+                chosen, least = k, excess
+            if least <= 1 or (k > 4 and excess > 4 * least):
+                break
+    while len(terms) <= max(chosen, 3):
+        terms.append(solution.advance())
+    fourth = larger(abs(terms[3].lower), abs(terms[3].upper))
+    return _Piece(B, terms[chosen], fourth, chosen, least)
+
+
+def _excess(remainder: Ball, rate: Ball, X: Ball) -> float:
+    """A remainder over what it shall be, of the worst state; infinite if it is not known."""
+    allowed = WORTH * (X.rad + rate.rad) + EXACT * (abs(X.mid) + X.rad + abs(rate.mid))
+    with np.errstate(all="ignore"):
+        found = np.where(remainder.rad > 0, remainder.rad / allowed, remainder.rad)
+    return float(np.nan_to_num(found, nan=np.inf).max(initial=0.0))
+
+
+def _escaped(X: Ball, B: Ball) -> UnboundedError:
+    """The error of the state that grows most."""
+    with np.errstate(all="ignore"):
+        growth = np.nan_to_num(B.rad / (X.rad + abs(X.mid) + 1e-300), nan=np.inf)
+    k = int(np.argmax(growth))
+    origin = Origin(
+        f"state {k + 1} of the differential equation",
+        "has no enclosure, however short the steps, from",
+        "solutions escape in finite time, or are too fast for explicit steps. Take a shorter "
+        "period, or slower units",
+    )
+    return UnboundedError(Within(origin=origin), 0, float(X.lower[k]), float(X.upper[k]))
+
+
+def _drift(
+    tape: Tape, boxes: list[Ball], others: list[TaylorModels], settings: Settings
+) -> tuple[Any, Any]:
+    """How far disturbances that vary can take states from where their means do.
+
+    Returns:
+        Bounds `(n,)` at the end of a period, and within it.
+    """
+    if len(others) < 2 or settings.held:
+        return 0.0, 0.0
+    given = [each.ball for each in others]
+    pairs = [_slopes(tape, [B, *given]) for B in boxes]
+    low, high = (
+        reduce(extreme, (getattr(G, end) for _, G in pairs))
+        for extreme, end in ((smaller, "lower"), (larger, "upper"))
+    )
+    G, h, n = Ball.between(low, high), settings.period, len(boxes[0].mid)
+    rate = reduce(larger, (larger(abs(A.lower), abs(A.upper)) for A, _ in pairs))
+    size, radius = larger(abs(low), abs(high)), h * given[-1].rad * (1 + gamma(4))
+    growth = _exponential_less_one(h * rate * (1 + gamma(2)))
+    error = 1 + gamma(4 * n + 16)
+    end = (G.rad * (1 + gamma(2)) + growth @ size * error) @ radius * error
+    return end, (size + growth @ size * error) @ radius * error
+
+
+def _slopes(tape: Tape, given: list[Ball]) -> tuple[Ball, Ball]:
+    """What the derivatives of `f` are in, in states and in the last argument: `(n, n)`, `(n, d)`."""
+    base, xp = Series(tape), namespace(given[0].mid)
+    base.advance(given)
+    nothing, found = [zeros(each) for each in given], list[Ball]()
+    for place in (0, len(given) - 1):
+        columns = list[Ball]()
+        for unit in np.eye(len(given[place].mid)):
+            moved = [*nothing]
+            moved[place] = Ball.exact(xp.asarray(unit))
+            columns.append(base.copy().advance(moved))
+        parts = ([getattr(each, name) for each in columns] for name in ("mid", "rad"))
+        found.append(Ball(*(xp.stack(part, axis=1) for part in parts)))
+    return found[0], found[1]
+
+
+def _exponential_less_one(M: Float[Array | np.ndarray, "n n"]) -> Any:
+    """An upper bound of `exp(M) - 1`, entry by entry, for `M >= 0`; infinite for large ones."""
+    xp = namespace(M)
+    term = total = M
+    for k in range(2, TERMS + 1):
+        term = term @ M / k
+        total = total + term
+    norm = M.sum(axis=1).max() * (1 + gamma(len(M)))
+    small = norm < TERMS / 2
+    rest = xp.where(small, norm, 1.0) ** (TERMS + 1) / math.factorial(TERMS + 1) * 2
+    return (total + xp.where(small, rest, xp.inf)) * (1 + gamma(TERMS * (len(M) + 4)))

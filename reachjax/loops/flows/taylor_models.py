@@ -1,0 +1,293 @@
+"""Taylor models: polynomials of degree two with a bound on what they leave out.
+
+Numbers of one small set of symbols, whatever they came from: `w`, the columns of the initial set,
+their products `2 w_i^2 - 1` and `w_i w_j` where forms have these, and one symbol `r_i` for all else
+that there is to a state, an input or a disturbance. Each number is
+
+    c + g . w + q . (products of w) + l . r  up to a radius,    |w_i| <= 1,  |r_i| <= radii_i,
+
+and a product of two leaves out all that is of degree three in `w`, or of degree two with an `r`.
+
+Since symbols are few, what is computed with them does not grow with the columns of a horizon; the
+`l` are the derivatives by which these are carried on (`programs.flowed`).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.loops.units import AbstractUnit, SmoothUnit, UnboundedError
+from reachjax.numerics.rounding import TINY, Ball, constant, gamma, namespace
+
+SQUARE = 0.5
+"""`w^2` is half of one and of `2 w^2 - 1`."""
+
+
+@lru_cache(maxsize=64)
+def _pairs(n: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.triu_indices(n)
+
+
+class Symbols(NamedTuple):
+    """What polynomials are of.
+
+    Attributes:
+        initial: how many `w` there are.
+        curved: whether products of them are symbols too.
+        radii: `(K,)`, of the `r`.
+    """
+
+    initial: int
+    curved: bool
+    radii: Float[Array | np.ndarray, " K"]
+
+    @property
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which `w_i` and `w_j` each product is of, `i <= j`."""
+        return _pairs(self.initial if self.curved else 0)
+
+    @property
+    def count(self) -> int:
+        """How many `w` and products of them there are."""
+        return self.initial + len(self.pairs[0])
+
+
+class TaylorModels:
+    """A vector of such numbers.
+
+    Attributes:
+        rows: `(k, 1 + count + K)`, the constants, and coefficients of all symbols.
+        radii: `(k,)`, by how much numbers may be off, rounding included.
+        symbols: what they are of.
+    """
+
+    # numpy arrays on the left leave `array @ models` and `array - models` to this class
+    __array_ufunc__ = None
+
+    def __init__(self, rows: Any, radii: Any, symbols: Symbols):
+        self.rows, self.radii, self.symbols = rows, radii, symbols
+
+    @classmethod
+    def of(cls, ball: Ball) -> TaylorModels:
+        """Numbers that are intervals, each with a symbol of its own."""
+        xp, n = namespace(ball.mid), len(ball.mid)
+        rows = xp.concatenate([ball.mid[:, None], xp.eye(n)], axis=1)
+        return cls(rows, xp.zeros(n), Symbols(0, False, ball.rad * (1 + gamma(2))))
+
+    def _with(self, rows: Any, radii: Any, rounding: Any) -> TaylorModels:
+        """Numbers of the same symbols."""
+        return TaylorModels(rows, (radii + constant(rounding)) * (1 + gamma(8)), self.symbols)
+
+    @cached_property
+    def _parts(self) -> tuple[Any, Any, Any]:
+        """Sizes of what is linear in `w`, of products of `w`, and of what is of other symbols."""
+        n, count = self.symbols.initial, self.symbols.count
+        sizes = abs(self.rows[:, 1:])
+        error = 1 + gamma(self.rows.shape[1])
+        others = sizes[:, count:] @ self.symbols.radii
+        return (
+            sizes[:, :n].sum(axis=1) * error,
+            sizes[:, n:count].sum(axis=1) * error,
+            others * error,
+        )
+
+    @cached_property
+    def _size(self) -> Any:
+        """Bounds of `|c|` and all terms, for rounding."""
+        return abs(self.rows[:, 0]) + sum(self._parts)
+
+    @property
+    def spread(self) -> Any:
+        """How far numbers can be from their constants."""
+        return (sum(self._parts) + self.radii) * (1 + gamma(8))
+
+    def ends(self) -> tuple[Any, Any]:
+        """Lower and upper bounds `(k,)`."""
+        center, spread = self.rows[:, 0], self.spread
+        spread = spread + gamma(4) * constant(abs(center) + spread)
+        return center - spread, center + spread
+
+    @property
+    def ball(self) -> Ball:
+        """Intervals around the numbers."""
+        return Ball.between(*self.ends())
+
+    def zeros(self) -> TaylorModels:
+        """As many numbers that are zero."""
+        xp = namespace(self.rows)
+        return TaylorModels(xp.zeros_like(self.rows), xp.zeros_like(self.radii), self.symbols)
+
+    def widened(self, by: Any) -> TaylorModels:
+        """The numbers up to errors of so much more."""
+        return self._with(self.rows, self.radii + by, 0.0)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: Any) -> TaylorModels:
+        return TaylorModels(self.rows[index], self.radii[index], self.symbols)
+
+    def __rmatmul__(self, matrix: Any) -> TaylorModels:
+        matrix = namespace(self.rows).asarray(matrix)
+        weights, error = abs(matrix), gamma(matrix.shape[1])
+        return self._with(
+            matrix @ self.rows, weights @ self.radii * (1 + error), error * (weights @ self._size)
+        )
+
+    def __add__(self, other: Any) -> TaylorModels:
+        xp = namespace(self.rows)
+        if isinstance(other, TaylorModels):
+            rows = self.rows + other.rows
+            return self._with(rows, self.radii + other.radii, gamma(1) * (self._size + other._size))
+        first = self.rows[:, :1] + xp.asarray(other)[..., None]
+        rows = xp.concatenate([first, self.rows[:, 1:]], axis=1)
+        return self._with(rows, self.radii, gamma(1) * abs(first[:, 0]))
+
+    __radd__ = __add__
+
+    def __neg__(self) -> TaylorModels:
+        return TaylorModels(-self.rows, self.radii, self.symbols)
+
+    def __sub__(self, other: Any) -> TaylorModels:
+        return self + (-other)
+
+    def __rsub__(self, other: Any) -> TaylorModels:
+        return (-self) + other
+
+    def __mul__(self, factor: Any) -> TaylorModels:
+        """Each number times an exact one, or all times one."""
+        factor = namespace(self.rows).broadcast_to(factor, (len(self.rows),))
+        size = gamma(1) * abs(factor) * self._size + TINY
+        return self._with(factor[:, None] * self.rows, abs(factor) * self.radii, size)
+
+    __rmul__ = __mul__
+
+    def times(self, other: TaylorModels) -> TaylorModels:
+        """Products, entry by entry, without what is of degree three."""
+        xp, symbols = namespace(self.rows, other.rows), self.symbols
+        n, count, (i, j) = symbols.initial, symbols.count, symbols.pairs
+        a, b = self.rows, other.rows
+        center, another = a[:, :1], b[:, :1]
+        rows = center * b + another * a
+        (one, two, three), (one_, two_, three_) = self._parts, other._parts
+        whole, whole_ = one + two + three, one_ + two_ + three_
+        if symbols.curved:
+            g, h = a[:, 1 : 1 + n], b[:, 1 : 1 + n]
+            half = g[:, i] * h[:, j] * np.where(i == j, SQUARE, 1.0)
+            mixed = np.where(i == j, 0.0, 1.0) * g[:, j] * h[:, i]
+            products = half + mixed
+            parts = [center * another + SQUARE * (g * h).sum(axis=1, keepdims=True)]
+            parts += [rows[:, 1 : 1 + n], rows[:, 1 + n : 1 + count] + products]
+            left = one * (two_ + three_) + (two + three) * whole_
+        else:
+            parts = [center * another, rows[:, 1 : 1 + count]]
+            left = whole * whole_
+        rows = xp.concatenate([*parts, rows[:, 1 + count :]], axis=1)
+        size, size_ = abs(center[:, 0]) + whole, abs(another[:, 0]) + whole_
+        radii = left + self.radii * (size_ + other.radii) + other.radii * size
+        rounding = gamma(rows.shape[1] + 4) * size * size_ + 8 * TINY
+        return self._with(rows, radii * (1 + gamma(16)), rounding)
+
+    def at(self, unit: AbstractUnit) -> TaylorModels:
+        """The values of smooth units: by a quadratic, or by lines where these leave less out.
+
+        Raises:
+            UnboundedError: known inputs leave the domain.
+        """
+        xp, (lower, upper) = namespace(self.rows), self.ends()
+        if not isinstance(unit, SmoothUnit):
+            return self._bent(unit, lower, upper)
+        line = unit.linear(lower, upper)
+        require_bounds(unit, line.gap, lower, upper)
+        if not self.symbols.curved:
+            return (line.slope * (self - line.center) + line.offset).widened(line.gap)
+        model = unit.quadratic(lower, upper, line)
+        off = self - model.center
+        square = off.times(off)
+        size = model.gap + abs(model.curvature) * square.radii
+        better = size <= line.gap
+        curved = model.curvature * square + (model.slope * off + model.offset)
+        straight = line.slope * (self - line.center) + line.offset
+        curved, straight = curved.widened(model.gap), straight.widened(line.gap)
+        rows = xp.where(better[:, None], curved.rows, straight.rows)
+        radii = xp.where(better, curved.radii, straight.radii)
+        return TaylorModels(rows, radii, self.symbols)
+
+    def _bent(self, unit: AbstractUnit, lower: Any, upper: Any) -> TaylorModels:
+        """The values of units that are not smooth, where no input reaches a bend."""
+        slope, offset = straight(unit, lower, upper)
+        return slope * self + offset
+
+
+def straight(unit: AbstractUnit, lower: Any, upper: Any) -> tuple[Any, Any]:
+    """Slopes and offsets of units that are affine on these intervals; NaN where they are not.
+
+    Raises:
+        UnboundedError: known intervals hold a bend.
+    """
+    lines, xp = unit.lines(lower, upper), namespace(lower, upper)
+    require_bounds(unit, xp.where(lines.affine, 0.0, xp.inf), lower, upper)
+    slope, offset = (xp.where(lines.affine, each, xp.nan) for each in lines.above)
+    return slope, offset
+
+
+def require_bounds(unit: AbstractUnit, gap: Any, lower: Any, upper: Any) -> None:
+    """Raise an error where known units have no bounds, or none with derivatives.
+
+    Raises:
+        UnboundedError: so it is.
+    """
+    if namespace(gap, lower, upper) is not np:
+        return
+    lost = np.flatnonzero(~np.isfinite(gap))
+    if len(lost):
+        raise UnboundedError(unit, 0, float(lower[lost[0]]), float(upper[lost[0]]))
+
+
+def image(unit: AbstractUnit, y: Ball) -> Ball:
+    """What a unit makes of intervals.
+
+    Ends of inputs may be rounded differently where the midpoint and the radius are formed.
+
+    Raises:
+        UnboundedError: known inputs leave the domain, or hold a bend.
+    """
+    y = Ball(y.mid, y.rad + 2 * gamma(8) * (abs(y.mid) + y.rad))
+    if isinstance(unit, SmoothUnit):
+        lower, upper = unit.interval(y.lower, y.upper)
+        require_bounds(unit, upper - lower, y.lower, y.upper)
+        return Ball.between(lower, upper)
+    slope, offset = straight(unit, y.lower, y.upper)
+    return slope * y + offset
+
+
+def joined(numbers: list[Any]) -> Any:
+    """Numbers of one kind, one behind the other."""
+    first = numbers[0]
+    if isinstance(first, TaylorModels):
+        xp = namespace(first.rows)
+        rows = xp.concatenate([each.rows for each in numbers])
+        return TaylorModels(rows, xp.concatenate([each.radii for each in numbers]), first.symbols)
+    xp = namespace(*numbers) if not isinstance(first, Ball) else namespace(first.mid)
+    if isinstance(first, Ball):
+        parts = zip(*((each.mid, each.rad) for each in numbers), strict=True)
+        return Ball(*(xp.concatenate(part) for part in parts))
+    return xp.concatenate(numbers)
+
+
+def product(one: Any, other: Any) -> Any:
+    """Products, entry by entry, of numbers of one kind."""
+    return one.times(other) if hasattr(one, "times") else one * other
+
+
+def zeros(number: Any) -> Any:
+    """As many zeros of the same kind."""
+    if isinstance(number, TaylorModels):
+        return number.zeros()
+    if isinstance(number, Ball):
+        return Ball.exact(namespace(number.mid).zeros_like(number.mid))
+    return namespace(number).zeros_like(number)

@@ -1,0 +1,190 @@
+"""Plants that are differential equations, whose inputs are held over each period."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.loops.flows.flow import Flow
+from reachjax.loops.flows.series import Tape
+from reachjax.loops.flows.steps import Settings
+from reachjax.loops.functions import Function
+from reachjax.loops.limits import Limits
+from reachjax.loops.plants import AbstractPlant
+from reachjax.loops.units import AtUnit, UnboundedError, evaluate
+from reachjax.loops.values import UnsupportedError, Value
+from reachjax.numerics.checks import is_concrete, real_number, whole_number
+from reachjax.numerics.pytrees import pytree, static
+from reachjax.numerics.rounding import Ball
+
+NAME = "SampledPlant"
+
+
+@pytree
+class SampledPlant(AbstractPlant):
+    """A differential equation `dx/dt = f(x, u, w)`, whose input is held over each period.
+
+    The states of a loop are those at its samples. They are enclosed by Taylor models, rounding and
+    remainders included (`loops.flows`).
+
+    Args:
+        f: of a state `(states,)`, an input `(inputs,)` and, if there are any, disturbances
+            `(disturbances,)`, with the derivative of the state for a result. It is traced as that
+            of a `NonlinearPlant` is, and has to be smooth where solutions are.
+        states: how many there are.
+        inputs: how many there are.
+        period: the time between two samples, in the plant's units of time.
+        disturbances: how many there are; of none `f` takes two arguments. What they may be the
+            `disturbance` of a `ClosedLoop` says.
+        order: of the Taylor polynomials; None to choose it by what the remainder is worth.
+        steps: how many a period is done in, at least; None for one. Where nothing is compiled,
+            steps are halved as often as it takes.
+        held: whether disturbances are constant over each period; if not, they are any measurable
+            signal in their set. What is constant for all time is a state whose derivative is zero.
+
+    Raises:
+        TypeError: `f` is no function, or contains what has no bounds or no derivatives; the error
+            names the line.
+        ValueError: `f` cannot be called so, its result has another shape, or the period is not
+            above zero.
+
+    Example:
+        >>> def pendulum(x, u):
+        ...     return jnp.array([x[1], jnp.sin(x[0]) + u[0]])
+        >>> plant = SampledPlant(pendulum, states=2, inputs=1, period=0.1)
+        >>> plant.propagate(jnp.array([0.0, 1.0]), jnp.array([-2.0])).round(6).tolist()
+        [0.090146, 0.804668]
+    """
+
+    f: Function
+    period: Float[Array | np.ndarray, ""]
+    order: int | None = static(default=None)
+    fewest: int = static(default=1)
+    held: bool = static(default=False)
+
+    def __init__(
+        self,
+        f: Any,
+        states: int | None = None,
+        inputs: int | None = None,
+        period: Any = None,
+        disturbances: int = 0,
+        order: int | None = None,
+        steps: int | None = None,
+        held: bool = False,
+    ):
+        if not isinstance(f, Function):
+            n = whole_number(f"{NAME}.states", states, 1)
+            m = whole_number(f"{NAME}.inputs", inputs, 1)
+            d = whole_number(f"{NAME}.disturbances", disturbances, 0)
+            f = Function.of(f, (n, m, d) if d else (n, m), n, f"{NAME}.f")
+        if is_concrete(period) and real_number(f"{NAME}.period", period, 0) == 0:
+            raise ValueError(f"{NAME}.period must be above 0, but {float(period)} arrived")
+        order = None if order is None else whole_number(f"{NAME}.order", order, 1)
+        steps = 1 if steps is None else whole_number(f"{NAME}.steps", steps, 1)
+        self._set(f=f, period=jnp.asarray(period, float), order=order, held=bool(held))
+        self._set(fewest=1 << (steps - 1).bit_length())  # parts of a period are exact
+        try:
+            jax.eval_shape(lambda plant: plant.period * len(plant.flow.tape.nodes), self)
+        except UnsupportedError as error:
+            raise TypeError(f"{NAME}.f has no Taylor series: {error}") from None
+
+    def replace(self, **changes: Any) -> SampledPlant:
+        """A copy with some of the constructor's arguments changed."""
+        names = "states", "inputs", "disturbances", "f", "period", "order", "held"
+        given = {name: getattr(self, name) for name in names}
+        return SampledPlant(**{**given, "steps": self.fewest, **changes})
+
+    def __repr__(self) -> str:
+        more = f", disturbances={self.disturbances}" if self.disturbances else ""
+        period = f"{float(self.period):g}" if is_concrete(self.period) else "traced"
+        return f"{NAME}(states={self.states}, inputs={self.inputs}{more}, period={period})"
+
+    @property
+    def states(self) -> int:
+        """The number `n_x` of states."""
+        return self.f.structure.inputs[0]
+
+    @property
+    def inputs(self) -> int:
+        """The number `n_u` of inputs."""
+        return self.f.structure.inputs[1]
+
+    @property
+    def disturbances(self) -> int:
+        """The number `n_w` of disturbances."""
+        return sum(self.f.structure.inputs[2:])
+
+    @property
+    def steps(self) -> int | None:
+        """No number of steps: the function does not know the time."""
+        return None
+
+    @property
+    def bends(self) -> bool:
+        """Whether its successors bend smoothly, whatever its units are."""
+        return True
+
+    @property
+    def flow(self) -> Flow:
+        """Its flow over one period; of numpy arrays it is kept."""
+        on_host = all(isinstance(each, np.ndarray) for each in jax.tree.leaves(self))
+        kept = self.__dict__.get("_flow") if on_host else None
+        if kept is None:
+            settings = Settings(self.period, self.order, self.fewest, self.held)
+            kept = Flow(self.f, _taped(self.f), settings)
+            if on_host:
+                object.__setattr__(self, "_flow", kept)
+        return kept
+
+    def propagate(
+        self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
+    ) -> Any:
+        """The state a period after `x` under input `u` and disturbances `w`.
+
+        Of plain numbers it is integrated, of intervals enclosed. What other kinds of number make of
+        it is done at a layer of units, the `Flow`.
+
+        Raises:
+            UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
+        """
+        if self.disturbances and w is None:
+            w = np.zeros((self.disturbances, self.states)) @ x
+        given = (x, u) if w is None else (x, u, w)
+        if isinstance(x, np.ndarray | jax.Array) or hasattr(x, "values"):
+            return self.flow.simulated(given, unit)
+        try:
+            if type(x) is Ball:
+                return self.flow.enclosed(tuple(map(_interval, given))).state.ball
+            if isinstance(x, Limits):
+                return self._limits(given)
+            return unit(self.flow, given)  # type: ignore[arg-type]
+        except UnboundedError as error:
+            unit_of, _, lower, upper = error.given
+            raise UnboundedError(unit_of, t, lower, upper, line=error.line) from None
+
+    def _limits(self, given: tuple[Limits, ...]) -> Limits:
+        """What limits lead to; nothing is known if they are infinite."""
+        ends = [(each.least, each.most) for each in given]
+        if not np.isfinite(ends[0]).all() or not np.isfinite(ends[1]).all():
+            return Limits.unknown(self.states)
+        found = self.flow.enclosed(tuple(Ball.between(*each) for each in ends)).state.ball
+        return Limits(np.asarray(found.lower), np.asarray(found.upper))
+
+
+def _interval(number: Any) -> Ball:
+    return number if isinstance(number, Ball) else Ball.exact(number)
+
+
+def _taped(f: Function) -> Tape:
+    """What a function's series are made of."""
+    recorder, wanted = f.recorded()
+    if isinstance(wanted, Value):
+        return Tape(recorder, wanted)
+    size = f.structure.inputs[0]
+    constant = recorder.mapped(recorder.inputs[0], np.zeros((np.size(wanted), size)), (size,))
+    return Tape(recorder, recorder.shifted(constant, wanted))

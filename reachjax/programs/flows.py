@@ -1,0 +1,86 @@
+"""What the flow of a differential equation makes of affine forms.
+
+It is a function of the initial columns and of one symbol for all else that there is to each state,
+input and disturbance (`loops.flows`). What stands for such a symbol in a form is again a row over
+all columns, so the derivatives by the symbols carry these on, and nothing is wrapped. What the flow
+leaves out of a state is part of its radius, which gets a column.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Float
+
+from reachjax.loops.flows.flow import Flow
+from reachjax.loops.flows.taylor_models import Symbols, TaylorModels
+from reachjax.numerics.rounding import Ball, gamma, namespace
+from reachjax.programs.affine import AffineForms, widest
+from reachjax.programs.initial import InitialColumns
+
+
+class Between(NamedTuple):
+    """The states in between two samples, as hulls of control points, one after the other.
+
+    Attributes:
+        points: for each step of the period four of them, forms of a state each.
+        ends: when each step ends, `(s,)`, as parts of the period.
+    """
+
+    points: tuple[tuple[AffineForms, ...], ...]
+    ends: tuple[float, ...]
+
+
+def flowed_forms(
+    flow: Flow, given: tuple[AffineForms, ...], start: InitialColumns, between: bool = False
+) -> tuple[AffineForms, Between]:
+    """The state after one period, and those in between if they are asked for.
+
+    Args:
+        flow: of the plant.
+        given: the state, the input, and disturbances if there are any.
+        start: what the first columns are.
+        between: whether the states in between are asked for.
+
+    Raises:
+        UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
+    """
+    forms = widest(given)
+    box = Ball.between(*given[0].ends(start, cut=True))
+    symbols, models = _condensed(forms, [len(each.rows) for each in given], start)
+    found = flow.followed(models, box, between)
+    points = (
+        tuple(_expanded(point, forms, symbols) for point in each.points) for each in found.controls
+    )
+    parts = [each.part for each in found.controls]
+    ends = tuple(sum(parts[: k + 1]) for k in range(len(parts)))
+    return _expanded(found.state, forms, symbols), Between(tuple(points), ends)
+
+
+def _condensed(
+    forms: AffineForms, sizes: list[int], start: InitialColumns
+) -> tuple[Symbols, list[TaylorModels]]:
+    """Forms as numbers of the initial columns, and of a symbol each for all the rest."""
+    xp, first = namespace(forms.rows), 2 + start.count
+    rest = abs(forms.rows[:, first:]).sum(axis=1) * (1 + gamma(forms.rows.shape[1]))
+    radii = (rest + forms.radii[:, 0]) * (1 + gamma(2))
+    symbols = Symbols(len(start.spread), start.curved, radii)
+    rows = xp.concatenate([forms.rows[:, :1], forms.rows[:, 2:first], xp.eye(len(radii))], axis=1)
+    whole, parts = TaylorModels(rows, xp.zeros_like(radii), symbols), list[TaylorModels]()
+    for size in sizes:
+        parts.append(whole[sum(map(len, parts)) :][:size])
+    return symbols, parts
+
+
+def _expanded(found: TaylorModels, forms: AffineForms, symbols: Symbols) -> AffineForms:
+    """Numbers of such symbols as forms over all columns."""
+    xp, count = namespace(forms.rows), symbols.count
+    first = xp.zeros((len(forms.rows), 2 + count))
+    radii = xp.stack([forms.radii[:, 0], xp.zeros_like(forms.radii[:, 0])], axis=1)
+    rest = AffineForms(xp.concatenate([first, forms.rows[:, 2 + count :]], axis=1), radii)
+    rest = found.rows[:, 1 + count :] @ rest
+    interval = found.ball
+    constants = found.rows[:, :1], interval.mid[:, None]
+    rows = xp.concatenate([*constants, found.rows[:, 1 : 1 + count], rest.rows[:, 2 + count :]], 1)
+    radii = (rest.radii[:, 0] + found.radii) * (1 + gamma(2))
+    return AffineForms(rows, xp.stack([radii, interval.rad], axis=1))

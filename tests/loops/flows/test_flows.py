@@ -1,0 +1,132 @@
+"""Flows hold the solutions of differential equations, at samples and in between."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from mpmath import mpf
+
+import reachjax as rj
+from reachjax.loops.units import UnboundedError
+from reachjax.numerics.rounding import Ball
+from reachjax.programs.affine import AffineForms
+from reachjax.programs.flows import flowed_forms
+from reachjax.programs.initial import InitialColumns
+from tests.loops.flows.fields import KINDS, field, solution
+
+STATES = 1, 2, 3, 6
+PARTS = 0.0, 0.1, 0.37, 0.5, 0.83, 1.0
+
+
+def on_host(plant):
+    """A plant of numpy arrays."""
+    return jax.device_get(plant)
+
+
+def outside(ball: Ball, exact) -> int:
+    """How many numbers are not inside of their interval, in arithmetic of 40 digits."""
+    pairs = zip(ball.mid, ball.rad, exact, strict=True)
+    return sum(abs(mpf(float(m)) - e) > mpf(float(r)) for m, r, e in pairs)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("states", STATES)
+def test_from_points_solutions_are_enclosed_and_enclosures_are_thin(kind, states):
+    rng = np.random.default_rng(states)
+    own = field(rng, kind, states)
+    plant = on_host(rj.SampledPlant(own, states, 1, period=0.3))
+    for _ in range(3):
+        x, u = rng.uniform(-0.6, 0.6, size=states), rng.uniform(-0.5, 0.5, size=1)
+        (exact,) = solution(own, x, [u], [plant.period])
+        found = plant.propagate(Ball.exact(x), Ball.exact(u))
+        assert outside(found, exact) == 0
+        assert np.all(found.rad <= 1e-9 * (abs(found.mid) + 1e-2))
+        simulated = plant.propagate(x, u)
+        np.testing.assert_allclose(simulated, [float(e) for e in exact], rtol=1e-9, atol=1e-9)
+
+
+def value(forms: AffineForms, columns) -> tuple[np.ndarray, np.ndarray]:
+    """The middles of forms at some initial columns, and how far numbers may be from them."""
+    count = len(columns)
+    rows, rest = forms.columns[:, :count], forms.columns[:, count:]
+    error = 1e-14 * (1 + abs(forms.rows).sum(axis=1))
+    return forms.rows[:, 0] + rows @ columns, abs(rest).sum(axis=1) + forms.radii[:, 0] + error
+
+
+def columns_of(start: InitialColumns, x) -> np.ndarray:
+    """The initial columns of a state."""
+    w = start.back @ (x - start.center)
+    i, j = start.pairs
+    return np.concatenate([w, np.where(i == j, 2 * w[i] * w[j] - 1, w[i] * w[j])])
+
+
+def next_forms(found: AffineForms) -> AffineForms:
+    """Forms whose radii are columns of their own, as a step of the loop has them."""
+    forms, _ = AffineForms(found.rows, found.radii * [0, 1]).with_own(found.radii[:, 0], None)
+    return forms
+
+
+def missed(own, plant, box: rj.Box, gain, rng, periods: int = 2, points: int = 3) -> int:
+    """How often a solution is outside of what forms say of it, at samples or in between."""
+    start = InitialColumns.of(box, box, curved=True)
+    center, wide = np.asarray(box.center), np.asarray(box.widths) / 2
+    signs = rng.choice([-1.0, 1.0], size=(points, own.states))
+    signs[1:] *= rng.uniform(size=(points - 1, own.states))
+    firsts = [center + wide * each * (1 - 1e-9) for each in signs]
+    states, wrong = [[mpf(a) for a in x] for x in firsts], 0
+    forms = AffineForms.beginning(start)
+    directions = np.concatenate([np.eye(own.states), -np.eye(own.states)])
+    directions = np.concatenate([directions, rng.normal(size=(2, own.states))])
+    for _ in range(periods):
+        forms, between = flowed_forms(plant.flow, (forms, gain @ forms), start, between=True)
+        hulls = [[directions @ point for point in four] for four in between.points]
+        for n, first in enumerate(firsts):
+            w = columns_of(start, first)
+            u = [sum(mpf(g) * a for g, a in zip(row, states[n], strict=True)) for row in gain]
+            times = [(k, part) for k in range(len(between.ends)) for part in PARTS]
+            ends = (0.0, *between.ends)
+            moments = [mpf(ends[k]) + part * (mpf(ends[k + 1]) - mpf(ends[k])) for k, part in times]
+            exact = solution_of(own, states[n], u, [mpf(float(plant.period)) * m for m in moments])
+            for (k, _), x in zip(times, exact, strict=True):
+                uppers = [sum(value(point, w)) for point in hulls[k]]
+                reached = directions @ np.array([float(a) for a in x])
+                wrong += np.sum(~(reached <= np.max(uppers, axis=0) + 1e-12))
+            states[n] = exact[-1]
+            middle, error = value(forms, w)
+            apart = abs(np.array([float(a) for a in exact[-1]]) - middle)
+            wrong += np.sum(~(apart <= error + 1e-12))
+            lower, upper = forms.ends(start)
+            inside = [lo - 1e-12 <= a <= up + 1e-12 for lo, a, up in zip(lower, states[n], upper)]
+            wrong += inside.count(False)
+        forms = next_forms(forms)
+    return int(wrong)
+
+
+def solution_of(own, x, u, times):
+    """States at some times from a state of 40 digits."""
+    return solution(own, x, [u], times)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("states", STATES)
+def test_from_boxes_solutions_are_enclosed_at_samples_and_in_between(kind, states):
+    rng = np.random.default_rng(10 + states)
+    own = field(rng, kind, states)
+    plant = on_host(rj.SampledPlant(own, states, 1, period=0.3))
+    center = rng.uniform(-0.4, 0.4, size=states)
+    for radius in (0.01, 0.15):
+        box = on_host(rj.Box(center - radius, center + radius))
+        gain = rng.uniform(-1, 1, size=(1, states))
+        assert missed(own, plant, box, gain, rng) == 0
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 5, 12])
+@pytest.mark.parametrize("steps", [1, 3, 20])
+def test_whatever_the_order_and_the_steps_solutions_are_enclosed(order, steps):
+    rng = np.random.default_rng(order + steps)
+    own = field(rng, KINDS[order % len(KINDS)], 2)
+    plant = rj.SampledPlant(own, 2, 1, period=0.4, order=order, steps=steps)
+    center = rng.uniform(-0.4, 0.4, size=2)
+    box = on_host(rj.Box(center - 0.1, center + 0.1))
+    assert missed(own, on_host(plant), box, rng.uniform(-1, 1, size=(1, 2)), rng, 1) == 0

@@ -158,11 +158,12 @@ class SampledPlant(AbstractPlant):
         if isinstance(x, np.ndarray | jax.Array) or hasattr(x, "values"):
             return self.flow.simulated(given, unit)
         try:
-            if type(x) is Ball:
-                return self.flow.enclosed(tuple(map(_interval, given))).state.ball
-            if isinstance(x, Limits):
-                return self._limits(given)
-            return unit(self.flow, given)  # type: ignore[arg-type]
+            with np.errstate(all="ignore"):  # what overflows has no bounds
+                if type(x) is Ball:
+                    return self.flow.enclosed(tuple(map(_interval, given))).state.ball
+                if isinstance(x, Limits):
+                    return self._limits(given)
+                return unit(self.flow, given)  # type: ignore[arg-type]
         except UnboundedError as error:
             unit_of, _, lower, upper = error.given
             raise UnboundedError(unit_of, t, lower, upper, line=error.line) from None

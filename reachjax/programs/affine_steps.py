@@ -25,7 +25,7 @@ from reachjax.loops.limits import Limits
 from reachjax.loops.units import AbstractUnit, Quadratic, SmoothUnit, UnboundedError
 from reachjax.numerics.rounding import Ball, gamma, namespace
 from reachjax.programs.affine import AffineForms, Place
-from reachjax.programs.flows import flowed_forms
+from reachjax.programs.flows import Between, flowed_forms
 from reachjax.programs.initial import Ends, InitialColumns, constant, met, settled
 from reachjax.sets import Box
 
@@ -119,6 +119,7 @@ def step_forms(
     ranges: Ranges | None = None,
     scratch: int = 0,
     before: int = 0,
+    spans: list[Between] | None = None,
 ) -> StepForms:
     """One step of the loop, whose own forward pass is run over affine forms.
 
@@ -134,6 +135,7 @@ def step_forms(
         ranges: what else bounds the inputs of a layer, or the successor, if anything does.
         scratch: where the columns begin that a step needs in between, if there is a place.
         before: how many steps there were since the initial set.
+        spans: gets what is in between the samples, of the flow of a differential equation.
     """
     found: list[UnitForms] = []
     done, width, free = 0, state.columns.shape[1], place
@@ -141,7 +143,10 @@ def step_forms(
     def apply(unit: Any, y: Any) -> AffineForms:
         nonlocal done, width, free
         if isinstance(unit, Flow):
-            return flowed_forms(unit, y, start)[0]
+            successor, between = flowed_forms(unit, y, start, spans is not None)
+            if spans is not None:
+                spans.append(between)
+            return successor
         here, done = slice(done, done + len(y.rows)), done + len(y.rows)
         slope = None if slopes is None else slopes[here]
         if place is None:  # branches that began alike must not share the columns they add

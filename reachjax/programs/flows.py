@@ -8,13 +8,15 @@ leaves out of a state is part of its radius, which gets a column.
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops.flows.flow import Flow
 from reachjax.loops.flows.taylor_models import Symbols, TaylorModels
-from reachjax.numerics.rounding import Ball, gamma, namespace
+from reachjax.numerics.rounding import Ball, gamma, larger, namespace
 from reachjax.programs.affine import AffineForms, widest
 from reachjax.programs.initial import InitialColumns
 
@@ -29,6 +31,21 @@ class Between(NamedTuple):
 
     points: tuple[tuple[AffineForms, ...], ...]
     ends: tuple[float, ...]
+
+    def values(self, directions: Float[Array | np.ndarray, "m n_x"]) -> list[AffineForms]:
+        """Forms `(m,)` of directions, one of which each direction does not exceed at any time."""
+        return [directions @ point for four in self.points for point in four]
+
+    def bounds(
+        self, directions: Float[Array | np.ndarray, "m n_x"], start: InitialColumns
+    ) -> Float[Array | np.ndarray, " m"]:
+        """Upper bounds of directions at all times from one sample to the next one.
+
+        Args:
+            directions: one row each.
+            start: what the first columns are.
+        """
+        return reduce(larger, (forms.ends(start, True)[1] for forms in self.values(directions)))
 
 
 def flowed_forms(

@@ -27,6 +27,7 @@ from reachjax.loops.units import AbstractUnit, Mark, SmoothUnit
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import ControllerColumns, UnitForms, states_facts, step_forms
+from reachjax.programs.flows import Between
 from reachjax.programs.initial import Ends, InitialColumns, met, product_facts
 from reachjax.sets import AbstractSet, Box
 
@@ -68,9 +69,11 @@ class Horizon:
         X0: the initial set, of numpy arrays.
         box: around it.
         t: the time of the initial set.
+        between: whether what is in between the samples is wanted too, of a differential equation.
 
     Attributes:
         loop: of numpy arrays.
+        spans: from each sample to the next one, what is in between, if that is wanted.
         start: what the first columns are.
         state: forms of the state after the steps so far.
         steps: the forms of the units of each step, layer by layer.
@@ -99,8 +102,11 @@ class Horizon:
         (4, [[0, 2], [1, 3]])
     """
 
-    def __init__(self, loop: ClosedLoop, X0: AbstractSet, box: Box, t: int = 0):
+    def __init__(
+        self, loop: ClosedLoop, X0: AbstractSet, box: Box, t: int = 0, between: bool = False
+    ):
         self.loop, self._t = loop, t
+        self.spans: list[Between] | None = [] if between else None
         self.start = InitialColumns.of(X0, box, loop.curved)
         self.state = AffineForms.beginning(self.start)
         self.steps: list[tuple[UnitForms, ...]] = []
@@ -192,7 +198,13 @@ class Horizon:
         self._stated, self.tightened = 0, []
         with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
             self.state, units, merged = step_forms(
-                self.loop, self.state, t, self.start, ranges=ranges, before=len(self.steps)
+                self.loop,
+                self.state,
+                t,
+                self.start,
+                ranges=ranges,
+                before=len(self.steps),
+                spans=self.spans,
             )
             self._state_facts(units)
         self.ends.append(self.state.ends_by_interval())

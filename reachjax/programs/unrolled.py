@@ -19,6 +19,7 @@ from reachjax.loops.functions import Compiled
 from reachjax.numerics.host import in_numpy
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
+from reachjax.programs.flows import Between
 from reachjax.programs.initial import InitialColumns, constant
 from reachjax.sets import AbstractSet, Box
 
@@ -33,12 +34,14 @@ class ByForms(NamedTuple):
             units and what cuts the initial set.
         drawn: for each step so far the values `(m, d)` of disturbances there; nothing of compiled
             code.
+        between: `(m,)`, upper bounds at all times since the sample before, if they are asked for.
     """
 
     offsets: Float[Array | np.ndarray, "*N m"]
     slopes: Float[Array | np.ndarray, "*N units"]
     corners: Float[Array | np.ndarray, "*N m n_x"]
     drawn: tuple[Float[np.ndarray, "m d"], ...] = ()
+    between: Float[Array | np.ndarray, "*N m"] | None = None
 
 
 def unrolled(
@@ -49,6 +52,7 @@ def unrolled(
     t: int = 0,
     slopes: Float[np.ndarray, "N units"] | None = None,
     known: Sequence[Box] | None = None,
+    between: bool = False,
 ) -> Iterator[ByForms]:
     """Bounds of directions of the states after 1, ..., N steps, one step after the other in numpy.
 
@@ -60,6 +64,7 @@ def unrolled(
         t: the time of the initial set.
         slopes: of lines for the units of each step, of which any are sound; None for good ones.
         known: boxes that surely hold the states after each step, where they are known.
+        between: whether bounds at all times are asked for, of a differential equation.
 
     Example:
         >>> from reachjax import MLP, AffinePlant
@@ -77,27 +82,29 @@ def unrolled(
         with np.errstate(all="ignore"):
             given = None if slopes is None else np.asarray(slopes[k])
             held = None if known is None else known[k]
+            spans = [] if between else None
             state, units, _ = step_forms(
-                loop, state, t + k, start, slopes=given, known=held, before=k
+                loop, state, t + k, start, slopes=given, known=held, before=k, spans=spans
             )
+            found = _bounds(rows, state, units, start, spans)
             forms = rows @ state
-            found = _bounds(forms, units, start)
         here = [layer.places for layer in units if layer.unit.free]
         free.append(np.concatenate([np.zeros(0, int), *here]))
         yield found._replace(drawn=tuple(np.sign(forms.columns[:, each]) for each in free))
 
 
-@partial(Compiled, static_argnames="t")
+@partial(Compiled, static_argnames=("t", "between"))
 def unrolled_at_once(
     loop: ClosedLoop,
     X0: AbstractSet,
     box: Box,
     directions: Float[Array, "N m n_x"],
     t: int = 0,
+    between: bool = False,
 ) -> ByForms:
     """Bounds for all steps at once, compiled and differentiable, without a call to the host.
 
-    A polytope counts as the box around it.
+    A polytope counts as the box around it. Arguments are those of `unrolled`.
     """
     start = InitialColumns.of(X0, box, loop.curved)
     (more, between), steps = step_columns(loop), len(directions)
@@ -108,8 +115,11 @@ def unrolled_at_once(
     def advance(state: AffineForms, step: tuple[Array, Array]) -> tuple[AffineForms, ByForms]:
         k, rows = step
         place = first + k * more
-        state, units, _ = step_forms(loop, state, t + k, start, place=place, scratch=end)
-        return state, _bounds(rows @ state, units, start)
+        spans = [] if between else None
+        state, units, _ = step_forms(
+            loop, state, t + k, start, place=place, scratch=end, spans=spans
+        )
+        return state, _bounds(rows, state, units, start, spans)
 
     state = AffineForms.beginning(start, end + between)
     return jax.lax.scan(advance, state, (jnp.arange(steps), directions))[1]
@@ -132,8 +142,16 @@ def unrolled_from_boxes(
     return jax.vmap(one)(lower, upper)
 
 
-def _bounds(rows: AffineForms, units: tuple[UnitForms, ...], start: InitialColumns) -> ByForms:
+def _bounds(
+    directions: Float[Array | np.ndarray, "m n_x"],
+    state: AffineForms,
+    units: tuple[UnitForms, ...],
+    start: InitialColumns,
+    spans: list[Between] | None,
+) -> ByForms:
+    rows = directions @ state
     xp = jnp if isinstance(rows.rows, jax.Array) else np
     slopes = xp.concatenate([layer.slope for layer in units] or [xp.zeros(0)])
     corners = start.farthest(constant(rows.columns[:, : len(start.spread)]))
-    return ByForms(rows.ends(start, cut=True)[1], slopes, corners)
+    found = ByForms(rows.ends(start, cut=True)[1], slopes, corners)
+    return found._replace(between=spans[0].bounds(directions, start)) if spans else found

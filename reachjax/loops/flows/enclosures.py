@@ -65,23 +65,26 @@ def enclosed(tape: Tape, X: Ball, others: list[Ball], h: Any) -> tuple[Ball, Arr
     X, h, others = constant_ball(X), constant(h), [constant_ball(each) for each in others]
 
     def image(B: Ball) -> Ball:
-        return swept(X, Series(tape).advance([B, *others]), h)
+        return swept(X, Series.value(tape, [B, *others]), h)
 
-    def grown(B: Ball) -> Ball:
-        return _inflated(X, image(B))
-
-    first = grown(X)
     if namespace(X.mid) is np:
-        B = first
+        B = _inflated(X, image(X))
         for _ in range(TRIES):
             found = image(B)
             if _holds(B, found):
                 return image(found).meeting(found), np.array(True)
             B = _inflated(X, found)
         return B, np.array(False)
-    B = jax.lax.fori_loop(0, COMPILED, lambda _, B: grown(B), first)
-    found = image(B)
-    return image(found).meeting(found), _holds(B, found)
+
+    def tried(_: int, carry: tuple[Ball, Array]) -> tuple[Ball, Array]:
+        B, proved = carry
+        found = image(B)
+        proved = proved | _holds(B, found)
+        candidate = _inflated(X, found)
+        parts = zip((found.mid, found.rad), (candidate.mid, candidate.rad), strict=True)
+        return Ball(*(jax.numpy.where(proved, *pair) for pair in parts)), proved
+
+    return jax.lax.fori_loop(0, COMPILED, tried, (X, jax.numpy.array(False)))
 
 
 def constant_ball(ball: Ball) -> Ball:

@@ -1,4 +1,4 @@
-"""Solutions of differential equations by extrapolation, as simulations want them: nothing is proved.
+"""Solutions of differential equations by extrapolation, for simulations: nothing is proved.
 
 The explicit midpoint rule has an error in even powers of its step, so the results of 2, 4, 6 and 8
 steps give one of order eight (Gragg 1965; Bulirsch, Stoer, Numerische Mathematik 1966).

@@ -1,8 +1,8 @@
 """Taylor series of functions, through what was recorded of them, over any kind of number.
 
-With `x(t) = sum_k x_k t^k` and `y = f(x)`, each recorded step has a recurrence for its coefficients:
-affine ones act on each of them, those of a product are `sum_j a_j b_{k-j}`, and a unit `z = f(y)`
-with `z' = g y'` has, for `k >= 1`,
+With `x(t) = sum_k x_k t^k` and `y = f(x)`, each recorded step has a recurrence for its
+coefficients: affine ones act on each of them, those of a product are `sum_j a_j b_{k-j}`, and a
+unit `z = f(y)` with `z' = g y'` has, for `k >= 1`,
 
     k z_k = sum_{j=1}^k j y_j g_{k-j},
 
@@ -21,7 +21,18 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from reachjax.loops.flows.taylor_models import TaylorModels, image, joined, product, straight, zeros
+from reachjax.loops.flows.taylor_models import (
+    TaylorModels,
+    arrays,
+    image,
+    joined,
+    product,
+    rebuilt,
+    settled_number,
+    straight,
+    widened,
+    zeros,
+)
 from reachjax.loops.recording import Recorder, product_of
 from reachjax.loops.units import (
     ISRU,
@@ -45,7 +56,7 @@ from reachjax.loops.units import (
     evaluate,
 )
 from reachjax.loops.values import UnsupportedError, Value
-from reachjax.numerics.rounding import UNIT, Ball
+from reachjax.numerics.rounding import UNIT, Ball, namespace
 
 
 class Node(NamedTuple):
@@ -80,6 +91,7 @@ class Tape:
 
     def __init__(self, recorder: Recorder, wanted: Value):
         self.nodes: list[Node | None] = [None] * len(recorder.inputs)
+        self.sizes = [value.size for value in recorder.inputs]
         self.slopes: dict[int, int] = {}
         self._units: dict[tuple[AbstractUnit, int], int] = {}
         found = {value.place: value.place for value in recorder.inputs}
@@ -94,20 +106,52 @@ class Tape:
                 found[place] = self.unit(step.unit, found[parent], step.apply)
             else:
                 parents = tuple(found[parent] for parent in step.parents)
-                found[place] = self._added(Node(parents, step.apply))
+                size = recorder.values[place].size
+                found[place] = self._added(Node(parents, step.apply), size)
         self.result = found[wanted.place]
+        self.needed = self._of_values()
 
-    def _added(self, node: Node) -> int:
+    def _of_values(self) -> set[int]:
+        """The numbers that values of the result rest on, its series left aside."""
+        needed, todo = set(), [self.result]
+        while todo:
+            place = todo.pop()
+            node = self.nodes[place]
+            if place not in needed:
+                needed.add(place)
+                todo += () if node is None else node.parents
+        return needed
+
+    def _added(self, node: Node, size: int) -> int:
         self.nodes.append(node)
+        self.sizes.append(size)
         return len(self.nodes) - 1
 
-    def affine(self, apply: Callable[..., Any], *parents: int) -> int:
-        """An affine function of numbers."""
-        return self._added(Node(parents, lambda unit, *given: apply(*given)))
+    def affine(self, apply: Callable[..., Any], *parents: int, size: int | None = None) -> int:
+        """An affine function of numbers, of as many as they are unless a size is given."""
+        node = Node(parents, lambda unit, *given: apply(*given))
+        return self._added(node, size or self.sizes[parents[0]])
 
     def product(self, one: int, other: int) -> int:
         """A product."""
-        return self._added(Node((one, other)))
+        return self._added(Node((one, other)), self.sizes[one])
+
+    def _wave(self, y: int) -> tuple[int, int]:
+        """The sine and the cosine, by one layer: the cosine is the sine a quarter turn on."""
+        n = self.sizes[y]
+        eye, none = np.eye(n), np.zeros((n, n))
+        twice, turn = np.vstack([eye, eye]), np.repeat([0.0, math.pi / 2], n)
+        quarter = np.block([[none, eye], [-eye, none]])
+        error = np.repeat([0.0, UNIT], n)
+
+        def turned(number: Any) -> Any:
+            return widened(twice @ number + turn, error)
+
+        angles = self.affine(turned, y, size=2 * n)
+        both = self._added(Node((angles,), lambda at, y: at(Sin(), y), Sin()), 2 * n)
+        self.slopes[both] = self.affine(lambda number: quarter @ number, both)
+        sine = self.affine(lambda number: number[:n], both, size=n)
+        return sine, self.affine(lambda number: number[n:], both, size=n)
 
     def unit(self, unit: AbstractUnit, y: int, apply: Callable[..., Any] | None = None) -> int:
         """The value of a unit, and its slope as another number, which may be made of it.
@@ -120,10 +164,13 @@ class Tape:
         Raises:
             UnsupportedError: it has no derivative that is known.
         """
-        key = unit.kind, y
+        key = (type(unit)() if type(unit) in (Sin, Cos) else unit.kind), y
         if key in self._units:
             return self._units[key]
-        z = self._added(Node((y,), apply or (lambda at, y: at(unit, y)), unit))
+        if type(unit) in (Sin, Cos):
+            self._units[Sin(), y], self._units[Cos(), y] = self._wave(y)
+            return self._units[type(unit)(), y]
+        z = self._added(Node((y,), apply or (lambda at, y: at(unit, y)), unit), self.sizes[y])
         self._units[key] = z
         if isinstance(unit, SmoothUnit) and type(unit) not in (Square, Within):
             slope = SLOPES.get(type(unit))
@@ -198,8 +245,6 @@ SLOPES: dict[type[AbstractUnit], Callable[[Tape, int, int], int]] = {
     Softplus: lambda tape, y, z: _logistic(tape, y),
     Sqrt: lambda tape, y, z: tape.affine(lambda n: 0.5 * n, tape.unit(Reciprocal(), z)),
     Reciprocal: lambda tape, y, z: _negative(tape, tape.unit(Square(), z)),
-    Sin: lambda tape, y, z: tape.unit(Cos(), y),
-    Cos: lambda tape, y, z: _negative(tape, tape.unit(Sin(), y)),
     Atan: lambda tape, y, z: _inverse_of_more(tape, y),
     Asin: lambda tape, y, z: _inverse_root(tape, _less_square(tape, 1.0, y)),
     Asinh: lambda tape, y, z: _inverse_length(tape, y),
@@ -251,15 +296,13 @@ class Series:
         tape: of a function.
     """
 
-    def __init__(self, tape: Tape):
+    def __init__(self, tape: Tape, columns: list[Any] | None = None):
         self._tape = tape
-        self._known: list[list[Any]] = [[] for _ in tape.nodes]
+        self.columns: list[Any] = [[] for _ in tape.nodes] if columns is None else columns
 
     def copy(self) -> Series:
         """The coefficients so far, which may go on in another way."""
-        found = Series(self._tape)
-        found._known = [[*each] for each in self._known]
-        return found
+        return Series(self._tape, [[*each] for each in self.columns])
 
     def advance(self, inputs: Sequence[Any]) -> Any:
         """The next coefficient of the result, from those of the inputs.
@@ -267,44 +310,67 @@ class Series:
         Raises:
             UnboundedError: a unit has no bounds, in numpy.
         """
-        tape, known = self._tape, self._known
-        k = len(known[0])
-        for place, node in enumerate(tape.nodes):
+        k = len(self.columns[0])
+        for place, node in enumerate(self._tape.nodes):
             if node is None:
-                known[place].append(inputs[place])
+                found = inputs[place]
             else:
-                known[place].append(self._first(node) if k == 0 else self._next(place, node, k))
-        return known[tape.result][k]
+                found = self._first(node) if k == 0 else self._next(place, node, k)
+            self.columns[place].append(found)
+        return self.columns[self._tape.result][k]
+
+    @classmethod
+    def value(cls, tape: Tape, inputs: Sequence[Any]) -> Any:
+        """The value of a function.
+
+        Raises:
+            UnboundedError: a unit has no bounds, in numpy.
+        """
+        series = cls(tape)
+        for place, node in enumerate(tape.nodes[: tape.result + 1]):
+            found = inputs[place] if node is None else None
+            if node is not None and place in tape.needed:
+                found = series._first(node)
+            series.columns[place].append(found)
+        return series.columns[tape.result][0]
+
+    def coefficient(self, k: Any, inputs: Sequence[Any]) -> Any:
+        """Another coefficient than the first one of the result, in compiled code."""
+        for place, node in enumerate(self._tape.nodes):
+            found = inputs[place] if node is None else settled_number(self._next(place, node, k))
+            self.columns[place] = self.columns[place].set(k, found)
+        return self.columns[self._tape.result][k]
 
     def _first(self, node: Node) -> Any:
-        given = [self._known[parent][0] for parent in node.parents]
-        return product(*given) if node.apply is None else node.apply(valued, *given)
+        given = [self.columns[parent][0] for parent in node.parents]
+        found = product(*given) if node.apply is None else node.apply(valued, *given)
+        return settled_number(found)
 
-    def _next(self, place: int, node: Node, k: int) -> Any:
-        known = self._known
-        one, *others = (known[parent] for parent in node.parents)
+    def _next(self, place: int, node: Node, k: Any) -> Any:
+        one, *others = (self.columns[parent] for parent in node.parents)
         if node.apply is None:
-            return _convolved(one, others[0][k::-1], None)
+            return _convolved(one, others[0], k, False)
         if node.unit is None:
             return node.apply(None, *(Change(each[k]) for each in (one, *others))).number
         if isinstance(node.unit, Square):
-            return _convolved(one, one[k::-1], None)
+            return _convolved(one, one, k, False)
         if isinstance(node.unit, Within):
             return one[k]
         if not isinstance(node.unit, SmoothUnit):
             return _slope(node.unit, one[0]) * one[k]
-        slopes = known[self._tape.slopes[place]]
-        return _convolved(one[1:], slopes[k - 1 :: -1], np.arange(1, k + 1) / k)
+        return _convolved(one, self.columns[self._tape.slopes[place]], k, True)
 
 
-def _convolved(ones: Sequence[Any], others: Sequence[Any], weights: np.ndarray | None) -> Any:
-    """The weighed sum of products of these numbers."""
-    pairs = [*zip(ones, others, strict=False)]
+def _convolved(ones: Any, others: Any, k: Any, slope: bool) -> Any:
+    """The sum of products of coefficients whose places add up to `k`, as `_Stack.convolved`."""
+    if isinstance(ones, _Stack):
+        return ones.convolved(others, k, slope)
+    first = 1 if slope else 0
+    pairs = [(ones[j], others[k - j]) for j in range(first, k + 1)]
     if len(pairs) == 1:
-        found = product(*pairs[0])
-        return found if weights is None or weights[0] == 1 else float(weights[0]) * found
-    size = _size(pairs[0][0])
-    matrix = np.kron(np.ones(len(pairs)) if weights is None else weights, np.eye(size))
+        return product(*pairs[0])
+    weights = np.arange(1, k + 1) / k if slope else np.ones(len(pairs))
+    matrix = np.kron(weights, np.eye(_size(pairs[0][0])))
     return matrix @ product(*(joined([*part]) for part in zip(*pairs, strict=True)))
 
 
@@ -347,14 +413,97 @@ class Solution:
         others = self._others if self._k == 0 else [zeros(each) for each in self._others]
         rate = self._series.advance([self._last, *others])
         self._k += 1
-        step = self._h if self._k == 1 else self._h * (1.0 / self._k)
-        self._last = _rounded(step, self._k) * rate
+        self._last = _part(self._h, self._k) * rate
         return self._last
 
 
-def _rounded(step: Any, k: int) -> Any:
-    """A factor that is off by roundings, which products then take to be inexact."""
-    if k & (k - 1) == 0:
-        return step
-    one = jax.numpy if isinstance(step, jax.Array) else np
-    return one.where(abs(step) == 1, step * (1 - UNIT), step)
+def _part(h: Any, k: Any) -> Any:
+    """The quotient `h / k`, moved by a rounding where products would take it to be exact."""
+    part = h / k
+    return namespace(part).where((abs(part) == 1) & (k != 1), part * (1 - UNIT), part)
+
+
+def solved(tape: Tape, x: Any, others: Sequence[Any], h: Any, order: int) -> list[Any]:
+    """Coefficients `h^k x_k` of a solution, `k = 1 .. order`.
+
+    In compiled code all but the first are computed by one `scan`: what is written once is compiled
+    once, and what a compiler fuses does not grow with the order.
+
+    Raises:
+        UnboundedError: a unit has no bounds, in numpy.
+    """
+    if namespace(*arrays(x)) is np or order == 1:
+        solution = Solution(tape, x, others, h)
+        return [solution.advance() for _ in range(order)]
+    series = Series(tape)
+    first = h * series.advance([x, *others])
+    stacks = [_Stack.of(column[0], order) for column in series.columns]
+    stacks[0] = stacks[0].set(1, first)
+    nothing = [zeros(each) for each in others]
+
+    def advance(carry: Any, k: Any) -> tuple[Any, Any]:
+        known = [stack.holding(part) for stack, part in zip(stacks, carry, strict=True)]
+        own = Series(tape, known)
+        rate = own.coefficient(k, [known[0][k], *nothing])
+        following = _part(h, k + 1) * rate
+        known = [*own.columns]
+        known[0] = known[0].set(k + 1, following)
+        return [each.parts for each in known], arrays(following)
+
+    ks = jax.numpy.arange(1, order)
+    _, rest = jax.lax.scan(advance, [stack.parts for stack in stacks], ks)
+    return [first, *(rebuilt(x, [part[k] for part in rest]) for k in range(order - 1))]
+
+
+class _Stack:
+    """Coefficients of a number in compiled code, those that are not known yet being zero.
+
+    Attributes:
+        parts: the arrays of numbers, with a leading axis of coefficients.
+    """
+
+    def __init__(self, like: Any, parts: list[Any]):
+        self._like, self.parts = like, parts
+
+    @classmethod
+    def of(cls, first: Any, order: int) -> _Stack:
+        """The first coefficient, and `order` of them to come."""
+        parts = []
+        for part in map(jax.numpy.asarray, arrays(first)):
+            empty = jax.numpy.zeros((order + 1, *part.shape))
+            parts.append(empty.at[0].set(part))
+        return cls(first, parts)
+
+    def holding(self, parts: list[Any]) -> _Stack:
+        """Other coefficients of the same number."""
+        return _Stack(self._like, parts)
+
+    def __getitem__(self, k: Any) -> Any:
+        return rebuilt(self._like, [part[k] for part in self.parts])
+
+    def set(self, k: Any, number: Any) -> _Stack:
+        """The coefficients with another one at this place."""
+        pairs = zip(self.parts, arrays(number), strict=True)
+        return _Stack(self._like, [whole.at[k].set(part) for whole, part in pairs])
+
+    def convolved(self, other: _Stack, k: Any, slope: bool) -> Any:
+        """The sum of products of coefficients whose places add up to `k`.
+
+        Args:
+            other: of the other number.
+            k: which one is wanted.
+            slope: whether those of this number count by their places over `k`.
+        """
+        count = len(self.parts[0])
+        places = k - jax.numpy.arange(count)
+        weights = jax.numpy.where(places < 0, 0.0, 1.0)
+        if slope:
+            weights = weights * jax.numpy.arange(count) / k
+
+        def flat(part: Any) -> Any:
+            return part.reshape(-1, *part.shape[2:])
+
+        ones = rebuilt(self._like, [flat(part) for part in self.parts])
+        others = [flat(part[jax.numpy.maximum(places, 0)]) for part in other.parts]
+        size = self.parts[0].shape[1]
+        return jax.numpy.kron(weights, np.eye(size)) @ product(ones, rebuilt(other._like, others))

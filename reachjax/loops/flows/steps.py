@@ -14,13 +14,13 @@ with their values and derivatives has the Bernstein points
 and `|x(s) - cubic(s)| <= h^4/384 sup |x^(4)|`: so is what is in between.
 
 **Disturbances** that may change at any time. Let `y` be the solution with the mean `v` of `w` over
-the period in place of `w`, and `e = x - y`. Then `e' = A(t) e + G(t) (w - v)`, where `A` and `G` are
-in what the derivatives of `f` are in, so that
+the period in place of `w`, and `e = x - y`. Then `e' = A(t) e + G(t) (w - v)`, where `A` and `G`
+are in what the derivatives of `f` are in, so that
 
     |e(h)| = |int (Phi(h, s) G(s) - K) (w(s) - v) ds|  <=  h (rad G + (exp(h |A|) - 1) |G|) rad W
 
-with `K = mid G`, as `w - v` has no mean, and for `w` in a box of radius `r` the mean of `|w - v|` is
-at most `r`. So what `w` does within a period is worth its mean, but for the second order in `h`.
+with `K = mid G`, as `w - v` has no mean, and for `w` in a box of radius `r` the mean of `|w - v|`
+is at most `r`. So what `w` does within a period is worth its mean, but for the second order in `h`.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops.flows.enclosures import enclosed
-from reachjax.loops.flows.series import Series, Solution, Tape
-from reachjax.loops.flows.taylor_models import Symbols, TaylorModels, zeros
+from reachjax.loops.flows.series import Series, Solution, Tape, solved
+from reachjax.loops.flows.taylor_models import Symbols, TaylorModels, joined, zeros
 from reachjax.loops.units import Origin, UnboundedError, Within
 from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
 
@@ -151,12 +151,11 @@ def flowed(
             todo, count = [*todo, part / 2, part / 2], count + 1
             continue
         proved = proved & holds
-        solution = Solution(tape, here, given, h)
-        terms = [solution.advance() for _ in range(max(piece.order, 1))]
-        found = reduce(lambda one, more: one + more, terms[: piece.order], here)
+        terms = solved(tape, here, given, h, max(piece.order, 1))
+        found = _sum([here, *terms[: piece.order]])
         found = (found + piece.remainder.mid).widened(piece.remainder.rad * (1 + gamma(4)))
         if between:
-            last = h * Series(tape).advance([found, *given])
+            last = h * Series.value(tape, [found, *given])
             inner = here + (1 / 3) * terms[0], found - (1 / 3) * last
             wide = [point.widened(piece.fourth / 16) for point in (here, *inner, found)]
             controls.append(Control(tuple(_composed(each, state) for each in wide), part))
@@ -170,6 +169,11 @@ def flowed(
         for each in controls
     ]
     return Flowed(state.widened(end + lost), tuple(controls))
+
+
+def _sum(numbers: list[TaylorModels]) -> TaylorModels:
+    matrix = np.kron(np.ones(len(numbers)), np.eye(len(numbers[0])))
+    return matrix @ joined([*numbers])
 
 
 def _refreshed(
@@ -234,11 +238,10 @@ def _remainder(
 
     If none is, of the one whose remainder is smallest.
     """
-    solution, terms = Solution(tape, B, others, h), list[Ball]()
     chosen, least = order or ORDER, 0.0
-    choosing = order is None and namespace(X.mid) is np
-    if choosing:
-        chosen, least, rate = 0, np.inf, h * Series(tape).advance([X, *others])
+    if order is None and namespace(X.mid) is np:
+        solution, terms = Solution(tape, B, others, h), list[Ball]()
+        chosen, least, rate = 0, np.inf, h * Series.value(tape, [X, *others])
         for k in range(HIGHEST + 1):
             terms.append(solution.advance())
             excess = _excess(terms[k], rate, X)
@@ -246,8 +249,10 @@ def _remainder(
                 chosen, least = k, excess
             if least <= 1 or (k > 4 and excess > 4 * least):
                 break
-    while len(terms) <= max(chosen, 3):
-        terms.append(solution.advance())
+        while len(terms) <= max(chosen, 3):
+            terms.append(solution.advance())
+    else:
+        terms = solved(tape, B, others, h, max(chosen, 3) + 1)
     fourth = larger(abs(terms[3].lower), abs(terms[3].upper))
     return _Piece(B, terms[chosen], fourth, chosen, least)
 
@@ -300,7 +305,7 @@ def _drift(
 
 
 def _slopes(tape: Tape, given: list[Ball]) -> tuple[Ball, Ball]:
-    """What the derivatives of `f` are in, in states and in the last argument: `(n, n)`, `(n, d)`."""
+    """Enclosures of the derivatives of `f`, by states `(n, n)` and by the last argument `(n, d)`."""
     base, xp = Series(tape), namespace(given[0].mid)
     base.advance(given)
     nothing, found = [zeros(each) for each in given], list[Ball]()

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops.units import AbstractUnit, SmoothUnit, UnboundedError
-from reachjax.numerics.rounding import TINY, Ball, constant, gamma, namespace
+from reachjax.numerics.rounding import TINY, Ball, constant, gamma, namespace, settled
 
 SQUARE = 0.5
 """`w^2` is half of one and of `2 w^2 - 1`."""
@@ -203,19 +203,15 @@ class TaylorModels:
             return self._bent(unit, lower, upper)
         line = unit.linear(lower, upper)
         require_bounds(unit, line.gap, lower, upper)
+        off = self - line.center
         if not self.symbols.curved:
-            return (line.slope * (self - line.center) + line.offset).widened(line.gap)
-        model = unit.quadratic(lower, upper, line)
-        off = self - model.center
-        square = off.times(off)
-        size = model.gap + abs(model.curvature) * square.radii
-        better = size <= line.gap
-        curved = model.curvature * square + (model.slope * off + model.offset)
-        straight = line.slope * (self - line.center) + line.offset
-        curved, straight = curved.widened(model.gap), straight.widened(line.gap)
-        rows = xp.where(better[:, None], curved.rows, straight.rows)
-        radii = xp.where(better, curved.radii, straight.radii)
-        return TaylorModels(rows, radii, self.symbols)
+            return (line.slope * off + line.offset).widened(line.gap)
+        model, square = unit.quadratic(lower, upper, line), off.times(off)
+        # both are about the middle of the inputs
+        better = model.gap + abs(model.curvature) * square.radii <= line.gap
+        parts = zip(model[1:], line[1:], strict=True)
+        offset, slope, curvature, gap = (xp.where(better, *pair) for pair in parts)
+        return (curvature * square + slope * off + offset).widened(gap)
 
     def _bent(self, unit: AbstractUnit, lower: Any, upper: Any) -> TaylorModels:
         """The values of units that are not smooth, where no input reaches a bend."""
@@ -284,6 +280,13 @@ def product(one: Any, other: Any) -> Any:
     return one.times(other) if hasattr(one, "times") else one * other
 
 
+def widened(number: Any, by: Any) -> Any:
+    """A number up to errors of so much more; plain numbers have none."""
+    if isinstance(number, Ball):
+        return Ball(number.mid, (number.rad + by) * (1 + gamma(2)))
+    return number.widened(by) if isinstance(number, TaylorModels) else number
+
+
 def zeros(number: Any) -> Any:
     """As many zeros of the same kind."""
     if isinstance(number, TaylorModels):
@@ -291,3 +294,22 @@ def zeros(number: Any) -> Any:
     if isinstance(number, Ball):
         return Ball.exact(namespace(number.mid).zeros_like(number.mid))
     return namespace(number).zeros_like(number)
+
+
+def arrays(number: Any) -> list[Any]:
+    """The arrays that a number is made of."""
+    if isinstance(number, TaylorModels):
+        return [number.rows, number.radii]
+    return [number.mid, number.rad] if isinstance(number, Ball) else [number]
+
+
+def rebuilt(like: Any, parts: list[Any]) -> Any:
+    """A number of the kind and the symbols of another one."""
+    if isinstance(like, TaylorModels):
+        return TaylorModels(parts[0], parts[1], like.symbols)
+    return Ball(*parts) if isinstance(like, Ball) else parts[0]
+
+
+def settled_number(number: Any) -> Any:
+    """A number that a compiler computes once, whatever is made of it."""
+    return rebuilt(number, settled(arrays(number)))

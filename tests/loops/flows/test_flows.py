@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import mpmath
 import numpy as np
 import pytest
 from mpmath import mpf
@@ -97,7 +96,10 @@ def missed(own, plant, box: rj.Box, gain, rng, periods: int = 2, points: int = 3
             apart = abs(np.array([float(a) for a in exact[-1]]) - middle)
             wrong += np.sum(~(apart <= error + 1e-12))
             lower, upper = forms.ends(start)
-            inside = [lo - 1e-12 <= a <= up + 1e-12 for lo, a, up in zip(lower, states[n], upper)]
+            inside = [
+                lo - 1e-12 <= a <= up + 1e-12
+                for lo, a, up in zip(lower, states[n], upper, strict=True)
+            ]
             wrong += inside.count(False)
         forms = next_forms(forms)
     return int(wrong)
@@ -130,3 +132,111 @@ def test_whatever_the_order_and_the_steps_solutions_are_enclosed(order, steps):
     center = rng.uniform(-0.4, 0.4, size=2)
     box = on_host(rj.Box(center - 0.1, center + 0.1))
     assert missed(own, on_host(plant), box, rng.uniform(-1, 1, size=(1, 2)), rng, 1) == 0
+
+
+def raised(plant, x, radius=0.0) -> UnboundedError:
+    """The error of a plant over a box around a state."""
+    with pytest.raises(UnboundedError) as found:
+        on_host(plant).propagate(Ball(np.array(x), np.full(len(x), radius)), Ball.exact(np.ones(1)))
+    return found.value
+
+
+def test_solutions_that_escape_end_with_an_error_that_names_the_state_and_the_time():
+    plant = rj.SampledPlant(lambda x, u: jnp.array([u[0], x[1] ** 2]), 2, 1, period=2.0)
+    error = raised(plant, [0.0, 1.0])  # x_2 = 1 / (1 - t)
+    assert "state 2" in str(error)
+    assert "t = 0" in str(error)
+
+
+def test_solutions_that_leave_a_domain_end_with_an_error_that_names_the_line():
+    plant = rj.SampledPlant(lambda x, u: jnp.array([-1 / x[0]]), 1, 1, period=1.0)
+    error = raised(plant, [1.0])  # x = sqrt(1 - 2 t)
+    assert "Reciprocal" in str(error)
+    assert "test_flows.py" in str(error)
+
+
+def test_near_a_pole_solutions_are_enclosed():
+    plant = on_host(rj.SampledPlant(lambda x, u: jnp.array([x[0] ** 2]), 1, 1, period=0.9))
+    found = plant.propagate(Ball.exact(np.ones(1)), Ball.exact(np.zeros(1)))
+    exact = 1 / (1 - mpf(float(plant.period)))
+    assert outside(found, [exact]) == 0
+    assert found.rad[0] <= 1e-9 * found.mid[0]
+
+
+@pytest.mark.parametrize("rate", [20.0, 1e3, 1e6])
+def test_stiff_plants_are_enclosed_or_end_with_an_error(rate):
+    plant = on_host(rj.SampledPlant(lambda x, u: -rate * (x - u), 1, 1, period=1.0))
+    try:
+        found = plant.propagate(Ball.exact(np.full(1, 2.0)), Ball.exact(np.ones(1)))
+    except UnboundedError as error:
+        assert "too fast" in str(error)
+        assert rate > 100
+    else:
+        assert abs(found.mid[0] - (1 + np.exp(-rate))) <= found.rad[0] + 1e-14
+
+
+def test_what_is_not_known_stays_so():
+    plant = on_host(rj.SampledPlant(lambda x, u: jnp.sin(x) + u, 1, 1, period=0.1))
+    for mid, rad in ((np.nan, 0.0), (0.0, np.inf), (np.inf, 0.0), (0.0, np.nan)):
+        found = plant.propagate(Ball(np.array([mid]), np.array([rad])), Ball.exact(np.zeros(1)))
+        assert not np.isfinite(found.mid + found.rad).any()
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_disturbances_take_states_nowhere_else_than_is_said(held):
+    def own(x, u, w):
+        return jnp.array([x[1] + 0.3 * w[0], jnp.sin(x[0]) + u[0] + w[1] * x[1]])
+
+    period, pieces, rng = 0.2, 16, np.random.default_rng(0)
+    plant = on_host(rj.SampledPlant(own, 2, 1, period, disturbances=2, held=held))
+    short = on_host(rj.SampledPlant(own, 2, 1, period / pieces, disturbances=2, held=True))
+    X, U = Ball(np.array([0.3, -0.5]), np.full(2, 0.05)), Ball.exact(np.array([0.4]))
+    W = Ball(np.zeros(2), np.array([0.5, 0.2]))
+    found = plant.propagate(X, U, w=W)
+    most = np.full(2, -np.inf)
+    for signal in range(60):
+        x = X.mid + X.rad * rng.choice([-1, 1], size=2)
+        constant = W.rad * rng.choice([-1, 1], size=2)
+        first = constant if signal % 2 else -constant
+        switch = rng.integers(pieces + 1)
+        for k in range(pieces):
+            w = constant if held or k >= switch else first
+            x = short.propagate(x, U.mid, w=w)
+        assert np.all((found.lower <= x) & (x <= found.upper))
+        most = np.maximum(most, (abs(x - found.mid)) / found.rad)
+    assert np.all(most >= 0.9)  # nor is much more said
+
+
+def test_compiled_flows_hold_what_flows_in_numpy_do():
+    rng = np.random.default_rng(5)
+    own = field(rng, "trigonometric", 2)
+    plant = rj.SampledPlant(own, 2, 1, period=0.3)
+    box = rj.Box(np.full(2, -0.1), np.full(2, 0.1))
+    gain = rng.uniform(-1, 1, size=(1, 2))
+
+    def ends(plant, box):
+        start = InitialColumns.of(box, box, curved=True)
+        forms = AffineForms.beginning(start)
+        found, between = flowed_forms(plant.flow, (forms, gain @ forms), start, between=True)
+        directions = np.concatenate([np.eye(2), -np.eye(2)])
+        return found.ends(start), between.bounds(directions, start)
+
+    (lower, upper), spans = jax.jit(ends)(plant, box)
+    (low, high), over = ends(*on_host((plant, box)))
+    np.testing.assert_allclose(lower, low, atol=1e-5)
+    np.testing.assert_allclose(upper, high, atol=1e-5)
+    np.testing.assert_allclose(spans, over, atol=1e-4)
+    simulated = np.asarray(plant.propagate(jnp.full(2, 0.1), jnp.asarray(gain @ np.full(2, 0.1))))
+    assert np.all((lower <= simulated) & (simulated <= upper))
+    assert np.all(np.concatenate([simulated, -simulated]) <= np.asarray(spans))
+
+
+def test_an_error_says_what_a_plant_was_given():
+    with pytest.raises(ValueError, match="period must be above 0"):
+        rj.SampledPlant(lambda x, u: x, 1, 1, period=0.0)
+    with pytest.raises(TypeError, match="period must be a number"):
+        rj.SampledPlant(lambda x, u: x, 1, 1)
+    with pytest.raises(TypeError, match="no Taylor series"):
+        rj.SampledPlant(lambda x, u: jnp.sinc(x) + u, 1, 1, period=0.1)
+    with pytest.raises(TypeError, match="cannot be certified"):
+        rj.SampledPlant(lambda x, u: jnp.floor(x) + u, 1, 1, period=0.1)

@@ -305,7 +305,7 @@ def _drift(
 
 
 def _slopes(tape: Tape, given: list[Ball]) -> tuple[Ball, Ball]:
-    """Enclosures of the derivatives of `f`, by states `(n, n)` and by the last argument `(n, d)`."""
+    """Bounds of the derivatives of `f` by states `(n, n)` and by the last argument `(n, d)`."""
     base, xp = Series(tape), namespace(given[0].mid)
     base.advance(given)
     nothing, found = [zeros(each) for each in given], list[Ball]()

@@ -9,46 +9,41 @@ from jaxtyping import Float
 
 from reachjax.loops.closed_loop import ClosedLoop
 from reachjax.loops.units import AbstractUnit
+from reachjax.numerics.numbers import AbstractNumber
 
 
-class Batch:
+class Batch(AbstractNumber):
     """The values of `k` numbers at `c` points, as `(c, k)`: a kind of number."""
-
-    # numpy arrays on the left leave `array @ batch` and `array - batch` to this class
-    __array_ufunc__ = None
 
     def __init__(self, values: Float[np.ndarray, "c k"]):
         self.values = values
+
+    def __len__(self) -> int:
+        return self.values.shape[1]
 
     def __rmatmul__(self, matrix: Any) -> Batch:
         return Batch(self.values @ np.asarray(matrix).T)
 
     def __add__(self, other: Any) -> Batch:
-        return Batch(self.values + getattr(other, "values", other))
-
-    __radd__ = __add__
+        return Batch(self.values + (other.values if isinstance(other, Batch) else other))
 
     def __neg__(self) -> Batch:
         return Batch(-self.values)
 
-    def __sub__(self, other: Any) -> Batch:
-        return self + (-other)
-
-    def __rsub__(self, other: Any) -> Batch:
-        return (-self) + other
-
-    def __mul__(self, factor: Any) -> Batch:
-        return Batch(self.values * getattr(factor, "values", factor))
-
-    __rmul__ = __mul__
+    def __rmul__(self, factor: Any) -> Batch:
+        return Batch(self.values * factor)
 
     def __getitem__(self, index: Any) -> Batch:
         return Batch(self.values[:, index])
 
+    def widened(self, by: Any) -> Batch:
+        """The numbers as they are: values know nothing of errors."""
+        return self
 
-def _evaluated(unit: AbstractUnit, y: Batch) -> Batch:
-    values: Any = y.values
-    return Batch(np.asarray(unit(values)))
+
+def _evaluated(unit: AbstractUnit, *y: Batch) -> Batch:
+    values: Any = (each.values for each in y)
+    return Batch(np.asarray(unit(*values)))
 
 
 def trajectories(

@@ -21,7 +21,7 @@ from reachjax.loops.functions import Compiled
 from reachjax.loops.input_polytope import InputPolytope, input_set
 from reachjax.loops.networks import AbstractNetwork
 from reachjax.loops.plants import AbstractPlant
-from reachjax.loops.units import AbstractUnit, AtUnit, SmoothUnit, clipped, evaluate, projected
+from reachjax.loops.units import AbstractUnit, AtUnit, clipped, evaluate, projected
 from reachjax.numerics.checks import (
     Numbers,
     is_concrete,
@@ -35,10 +35,11 @@ from reachjax.sets.unusable import ThinSetError
 
 
 class UnitLayer(NamedTuple):
-    """A layer of units of one kind, and how many they are."""
+    """A layer of units of one kind, how many they are, and how many inputs they have together."""
 
     unit: AbstractUnit
     size: int
+    inputs: int
 
 
 class Scenario(NamedTuple):
@@ -194,19 +195,22 @@ class ClosedLoop(Replaceable):
     def smooth_controller(self) -> bool:
         """Whether the controller has units, and all of them are smooth."""
         layers = self.controller_layers
-        return bool(layers) and all(isinstance(layer.unit, SmoothUnit) for layer in layers)
+        return bool(layers) and all(layer.unit.curved for layer in layers)
 
     @property
     def curved(self) -> bool:
-        """Whether the plant bends smoothly, or any unit is smooth."""
-        return self.plant.bends or any(
-            isinstance(layer.unit, SmoothUnit) for layer in self.unit_layers
-        )
+        """Whether the plant bends smoothly, or any unit does."""
+        return self.plant.bends or any(layer.unit.curved for layer in self.unit_layers)
 
     @property
     def units(self) -> int:
         """The number of units of one step."""
         return sum(layer.size for layer in self.unit_layers)
+
+    @property
+    def unit_inputs(self) -> int:
+        """The number of inputs of the units of one step, of which some have two."""
+        return sum(layer.inputs for layer in self.unit_layers)
 
     @property
     def steps(self) -> int | None:
@@ -386,9 +390,10 @@ def _recorded(structure: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> tuple
     """
     layers = []
 
-    def record(unit: AbstractUnit, y: Array) -> Array:
-        layers.append(UnitLayer(unit.kind, len(y)))
-        return unit(y)
+    def record(unit: AbstractUnit, *y: Array) -> Array:
+        z = unit(*y)
+        layers.append(UnitLayer(unit.kind, len(z), sum(map(len, y))))
+        return z
 
     def passed(tree: Any, x: Array) -> Array:
         return tree.step(x, 0, record) if loops else tree.propagate(x, record)

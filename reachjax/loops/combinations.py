@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from reachjax.loops.recording import Recorder
 from reachjax.loops.values import Value
+from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.rounding import TINY, UNIT
 
 LARGEST = 4096
@@ -31,7 +32,7 @@ class InexactError(Exception):
     """Rounding of factors would decide what is recorded."""
 
 
-class Combination:
+class Combination(AbstractNumber):
     """`offset + sum_p matrix_p value_p`, `k` numbers over values by their places: a kind.
 
     Attributes:
@@ -41,9 +42,6 @@ class Combination:
             that are left out are exact.
     """
 
-    # numpy arrays on the left leave `array @ combination` and `array - combination` to this class
-    __array_ufunc__ = None
-
     def __init__(
         self,
         parts: dict[int, np.ndarray],
@@ -52,6 +50,9 @@ class Combination:
     ):
         self.parts, self.offset = parts, offset
         self.errors = {place: error for place, error in (errors or {}).items() if np.any(error)}
+
+    def __len__(self) -> int:
+        return len(self.offset)
 
     @classmethod
     def of(cls, recorder: Recorder, value: Value) -> Combination:
@@ -155,16 +156,22 @@ class Combination:
             other = Combination({}, plain)
         return self._with(other, 1.0)
 
-    __radd__ = __add__
+    def __neg__(self) -> Combination:
+        return -1.0 * self
 
-    def __sub__(self, other: Combination) -> Combination:
-        return self._with(other, -1.0)
+    def __sub__(self, other: Any) -> Combination:
+        return self._with(other, -1.0) if isinstance(other, Combination) else self + (-other)
 
-    def __mul__(self, factor: Any) -> Combination:
+    def __rmul__(self, factor: Any) -> Combination:
         factor = np.broadcast_to(np.asarray(factor, float), self.offset.shape)
         return self._scaled(lambda y, by: y * by, _product_error, factor, abs(factor))
 
-    def over(self, divisor: Any) -> Combination:
+    def widened(self, by: Any) -> Combination:
+        """The numbers with an offset that is off by so much more."""
+        errors = {**self.errors, None: self.errors.get(None, 0.0) + by}
+        return Combination(self.parts, self.offset, errors)
+
+    def over(self, divisor: Any, inverse: Any = None) -> Combination:
         """Quotients by plain numbers."""
         divisor = np.broadcast_to(np.asarray(divisor, float), self.offset.shape)
         return self._scaled(lambda y, by: y / by, _quotient_error, divisor, 1 / abs(divisor))
@@ -179,8 +186,6 @@ class Combination:
             errors[place] = errors[place] + grown.reshape(len(size), -1)
         errors[None] = errors[None][:, 0]
         return Combination(parts, made(self.offset, by), errors)
-
-    __rmul__ = __mul__
 
     def __rmatmul__(self, matrix: Any) -> Combination:
         matrix = np.asarray(matrix, float)

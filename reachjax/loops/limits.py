@@ -14,10 +14,11 @@ from jaxtyping import Float
 from reachjax.loops.units import AbstractUnit, SmoothUnit
 from reachjax.loops.values import Parameter
 from reachjax.numerics.checks import is_concrete
+from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.rounding import TINY, gamma
 
 
-class Limits:
+class Limits(AbstractNumber):
     """Numbers in `[least, most]`, rounded outwards, infinite where nothing is known: a kind.
 
     Attributes:
@@ -28,12 +29,12 @@ class Limits:
 
     hidden: ClassVar[tuple[type, ...]] = ()
 
-    # numpy arrays on the left leave `array @ limits` and `array - limits` to this class
-    __array_ufunc__ = None
-
     def __init__(self, least: Float[np.ndarray, " k"], most: Float[np.ndarray, " k"]):
         self.least = np.where(np.isnan(least), -np.inf, least)
         self.most = np.where(np.isnan(most), np.inf, most)
+
+    def __len__(self) -> int:
+        return len(self.least)
 
     @classmethod
     def unknown(cls, size: int) -> Limits:
@@ -69,16 +70,14 @@ class Limits:
             off.append(np.where(_is_exact(one, another), 0.0, gamma(1) * abs(ends[-1])))
         return self._outward(*ends, *off)
 
-    __radd__ = __add__
-
     def __neg__(self) -> Limits:
         return type(self)(-self.most, -self.least)
 
-    def __sub__(self, other: Any) -> Limits:
-        return self + (-other)
-
-    def __rsub__(self, other: Any) -> Limits:
-        return (-self) + other
+    def widened(self, by: Any) -> Limits:
+        """The numbers up to an error of so much each."""
+        by = by * (1 + gamma(2))
+        off = (by + gamma(1) * (abs(end) + by) for end in (self.least, self.most))
+        return self._outward(self.least, self.most, *off)
 
     @np.errstate(invalid="ignore", over="ignore")
     def __mul__(self, other: Any) -> Limits:
@@ -137,8 +136,10 @@ class Limits:
             np.where(np.isfinite(most), most + above, most),
         )
 
-    def at(self, unit: AbstractUnit) -> Limits:
+    def at(self, unit: AbstractUnit, *others: Limits) -> Limits:
         """Limits of the values of a layer of units of these inputs."""
+        if others:  # products and sums of limits are theirs
+            return unit(self, *others)  # type: ignore[arg-type]
         found: Any = unit.limits if isinstance(unit, SmoothUnit) else unit.interval
         with np.errstate(all="ignore"):
             least, most = found(self.least, self.most)

@@ -35,6 +35,7 @@ from reachjax.loops.units import (
     XLogX,
 )
 from reachjax.numerics.checks import is_concrete
+from reachjax.numerics.numbers import AbstractNumber
 
 Rational = Fraction | None
 """A number, or None where it is not known."""
@@ -73,7 +74,7 @@ VALUES: dict[type[AbstractUnit], Callable[[Fraction], Rational]] = {
 """Rational values of units at rational points."""
 
 
-class Rationals:
+class Rationals(AbstractNumber):
     """A vector of rational numbers: a kind of number. One number stands for many that are the same.
 
     Example:
@@ -82,11 +83,14 @@ class Rationals:
         [Fraction(1, 1)]
     """
 
-    # numpy arrays on the left leave `array * rationals` to this class
-    __array_ufunc__ = None
-
     def __init__(self, numbers: list[Rational]):
         self.numbers = numbers
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, index: Any) -> Rationals:
+        return Rationals([self.numbers[k] for k in np.atleast_1d(np.arange(len(self))[index])])
 
     @classmethod
     def of(cls, plain: Any) -> Rationals:
@@ -109,8 +113,6 @@ class Rationals:
     def __add__(self, other: Any) -> Rationals:
         return self._with(other, lambda a, b: a + b)
 
-    __radd__ = __add__
-
     def __neg__(self) -> Rationals:
         return Rationals([None if each is None else -each for each in self.numbers])
 
@@ -128,20 +130,23 @@ class Rationals:
 
     __rmul__ = __mul__
 
-    def over(self, other: Any) -> Rationals:
+    def __rmatmul__(self, matrix: Any) -> Rationals:
+        return Rationals([None])
+
+    def over(self, divisor: Any, inverse: Any = None) -> Rationals:
         """Quotients; that of zero and what is not known is zero."""
         return Rationals(
             [
                 Fraction(0) if a == 0 else None if a is None or not b else a / b
-                for a, b in self._pairs(other)
+                for a, b in self._pairs(divisor)
             ]
         )
 
-    def times_unknown(self) -> Rationals:
+    def nearly_times(self, factor: Any) -> Rationals:
         """Products with a number that is not rational."""
         return Rationals([Fraction(0) if each == 0 else None for each in self.numbers])
 
-    def unknown(self) -> Rationals:
+    def widened(self, by: Any) -> Rationals:
         """Numbers of which nothing is known."""
         return Rationals([None])
 
@@ -164,7 +169,9 @@ def aligned(*columns: list[Rational]) -> Iterator[Any]:
     return zip(*(each * size if len(each) == 1 else each for each in columns), strict=True)
 
 
-def evaluated(unit: AbstractUnit, y: Rationals) -> Rationals:
+def evaluated(unit: AbstractUnit, y: Rationals, *others: Rationals) -> Rationals:
     """What is done at a unit."""
+    if others:
+        return unit(y, *others)  # type: ignore[arg-type]
     value = VALUES.get(type(unit), lambda number: None)
     return Rationals([None if each is None else value(each) for each in y.numbers])

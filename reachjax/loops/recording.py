@@ -11,13 +11,19 @@ import dataclasses
 from collections.abc import Container, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
 from reachjax.loops.limits import ConstantLimits, Limits
-from reachjax.loops.rationals import Rationals
-from reachjax.loops.units import AbstractUnit, AtUnit, ReLU, SmoothUnit, Square, UnboundedError
+from reachjax.loops.units import (
+    AbstractUnit,
+    AtUnit,
+    Bilinear,
+    ReLU,
+    SmoothUnit,
+    Square,
+    UnboundedError,
+)
 from reachjax.loops.values import (
     Fact,
     Operand,
@@ -30,6 +36,7 @@ from reachjax.loops.values import (
     is_constant,
     is_known,
 )
+from reachjax.numerics import numbers
 from reachjax.numerics.rounding import TINY, UNIT, Ball, larger, namespace
 
 NONE = Limits.of(0.0)
@@ -130,7 +137,7 @@ class Recorder:
                 known[place] = kind.unknown(value.size)
                 continue
             given = (known[parent] for parent in step.parents)
-            known[place] = step.apply(lambda unit, y: y.at(unit), *given)
+            known[place] = step.apply(lambda unit, y, *others: y.at(unit, *others), *given)
             if value.fact is not None:
                 also = value.fact(lambda operand: self.limits(operand, kind))
                 known[place] = known[place].meeting(also)
@@ -223,11 +230,8 @@ class Recorder:
         xp = namespace(divisor)
         inverse = xp.where(normal, 1.0 / xp.where(normal, divisor, 1.0), np.nan)
 
-        def apply(unit: AtUnit, y: Any) -> Any:
-            return y.over(divisor) if hasattr(y, "over") else inverse * y
-
         step = Step(
-            apply,
+            lambda unit, y: numbers.over(y, divisor, inverse),
             (value.place,),
             again=lambda y: self.divided(y, divisor),
             linear=is_constant(divisor),
@@ -243,11 +247,23 @@ class Recorder:
         factor = _flat(factor, value)
         factor = namespace(factor).where(abs(factor) == 1, factor * (1 - UNIT), factor)
 
-        def apply(unit: AtUnit, y: Any) -> Any:
-            return y.times_unknown() if isinstance(y, Rationals) else factor * y
-
-        step = Step(apply, (value.place,), again=lambda y: self.nearly_scaled(y, factor))
+        step = Step(
+            lambda unit, y: numbers.nearly_times(y, factor),
+            (value.place,),
+            again=lambda y: self.nearly_scaled(y, factor),
+        )
         return self.layer(value.shape, step, _key("nearly", value.place, factor))
+
+    def rescaled(self, value: Value, terms: Sequence[Term]) -> Value:
+        """A value with factors and divisors of terms, the last ones first."""
+        for _, factor, divisor in reversed(terms):
+            plain = np.ndim(divisor) == 0
+            value = (
+                self.scaled(value, np.reshape(factor, value.shape) if np.ndim(factor) else factor)
+                if plain
+                else self.divided(value, divisor.reshape(value.shape))
+            )
+        return value
 
     def shifted(self, value: Value, by: Any) -> Value:
         """Each entry plus a plain number."""
@@ -306,38 +322,38 @@ class Recorder:
 
     def unit(self, unit: AbstractUnit, value: Value) -> Value:
         """A layer of units, of which smooth ones are told between what numbers their inputs are."""
-        line = self.line
         if isinstance(unit, SmoothUnit) and value.size:
             limits = self.limits(value)
             ends = {"least": float(limits.least.min()), "most": float(limits.most.max())}
             unit = dataclasses.replace(unit, **ends)
+        again = lambda y: self.unit(unit, y)  # noqa: E731
+        step = Step(self._applied(unit), (value.place,), unit=unit, again=again)
+        return self.layer(value.shape, step, ("unit", unit, value.place))
 
-        def applied(at: AtUnit, y: Any) -> Any:
+    def _applied(self, unit: AbstractUnit) -> Any:
+        """What is done at a unit of this line; its errors name it."""
+        line = self.line
+
+        def applied(at: AtUnit, *y: Any) -> Any:
             try:
-                return at(unit, y)
+                return at(unit, *y)
             except UnboundedError as error:
                 raise UnboundedError(*error.given, line=line) from None
 
-        again = lambda y: self.unit(unit, y)  # noqa: E731
-        step = Step(applied, (value.place,), unit=unit, again=again)
-        return self.layer(value.shape, step, ("unit", unit, value.place))
+        return applied
 
     def rectified(self, value: Value) -> Value:
         """The rectifier `max(value, 0)`."""
         return value if self.is_nonnegative(value) else self.unit(ReLU(), value)
 
     def loosened(self, value: Value, by: np.ndarray) -> Value:
-        """A value up to an error of so much.
-
-        `0 y + c - c` is zero, which no kind of number knows: it takes the first sum to be off by
-        `gamma(1) c`, of which nothing is rounding. That is above `by` for `c = 2^51 by`.
-        """
-        large = by.reshape(-1) * 2.0**51
-
-        def apply(unit: AtUnit, y: Any) -> Any:
-            return y.unknown() if isinstance(y, Rationals) else y + ((0.0 * y + large) - large)
-
-        step = Step(apply, (value.place,), again=lambda y: self.loosened(y, by))
+        """A value up to an error of so much."""
+        flat = by.reshape(-1)
+        step = Step(
+            lambda unit, y: numbers.widened(y, flat),
+            (value.place,),
+            again=lambda y: self.loosened(y, by),
+        )
         return self.layer(value.shape, step)
 
     def absolute(self, value: Value) -> Value:
@@ -361,23 +377,28 @@ class Recorder:
             again: how the step is recorded of other values.
             **facts: of the result.
         """
-
-        def apply(unit: AtUnit, y: Any, *given: Any) -> Any:
-            known = type(y) is Ball and all(type(each) is Ball for each in given)
-            return y.meeting(held(*given)) if known else y
-
-        step = Step(apply, (value.place, *(each.place for each in others)), again=again)
+        step = Step(
+            lambda unit, y, *given: numbers.met(y, held, *given),
+            (value.place, *(each.place for each in others)),
+            again=again,
+        )
         return self.layer(value.shape, step, ("met", held, *step.parents), **facts)
 
     def product(self, one: Value, other: Value) -> Value:
-        """`one * other = ((one + other)^2 - (one - other)^2) / 4`, entry by entry."""
-        if one.place == other.place:
-            return self.unit(Square(), one)
+        """`one * other`, entry by entry: squares where both are multiples of one number."""
+        below = {value.place: terms for value, terms in other.levels()}
+        for value, terms in one.levels():
+            if value.place in below:
+                square = self.reshaped(self.unit(Square(), value), one.shape)
+                return self.rescaled(square, (*terms, *below[value.place]))
         one, other = sorted((one, other), key=lambda value: value.place)
-        parts = self.added(one, other), self.added(one, other, -1)
-        more, less = (self.unit(Square(), part) for part in parts)
-        places = more.place, less.place, one.place, other.place
-        step = Step(_multiplied, places, again=lambda _, __, y, z: self.product(y, z))
+        unit = Bilinear()
+        step = Step(
+            self._applied(unit),
+            (one.place, other.place),
+            unit=unit,
+            again=self.product,
+        )
         return self.layer(one.shape, step, ("product", one.place, other.place))
 
     def replaced(self, wanted: Value, old: Value, new: Value, passing: dict[int, bool]) -> Value:
@@ -409,26 +430,6 @@ def _key(kind: str, place: int, plain: Any) -> Any:
     if not isinstance(plain, np.ndarray):
         return None
     return kind, place, type(plain), plain.shape, str(plain.dtype), plain.tobytes()
-
-
-def _multiplied(unit: AtUnit, more: Any, less: Any, one: Any, other: Any) -> Any:
-    """Products, from the squares of sums and of differences, and from the factors.
-
-    Where factors are numbers, their product is: squares lose what is small beside them. Where they
-    are intervals, theirs is met with it: a difference of two squares forgets what that knows.
-    """
-    if isinstance(one, np.ndarray | jax.Array | Rationals) or hasattr(one, "values"):
-        return one * other
-    if isinstance(one, Limits):
-        return one * other
-    squares = 0.25 * (more - less)
-    known = type(squares) is Ball and all(type(each) is Ball for each in (one, other))
-    return squares.meeting(one.times(other)) if known else squares
-
-
-def product_of(step: Step) -> tuple[int, int] | None:
-    """The places of the factors of which a step is the product; None if it is none."""
-    return step.parents[2:] if step.apply is _multiplied else None  # type: ignore[return-value]
 
 
 def _size(y: Ball) -> Ball:

@@ -163,7 +163,7 @@ class SampledPlant(AbstractPlant):
                     return self.flow.enclosed(tuple(map(_interval, given))).state.ball
                 if isinstance(x, Limits):
                     return self._limits(given)
-                return unit(self.flow, given)  # type: ignore[arg-type]
+                return unit(self.flow, *given)
         except UnboundedError as error:
             unit_of, _, lower, upper = error.given
             raise UnboundedError(unit_of, t, lower, upper, line=error.line) from None

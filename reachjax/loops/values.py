@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,6 +53,18 @@ class Value:
     def size(self) -> int:
         """How many numbers they are."""
         return math.prod(self.shape)
+
+    def levels(self) -> Iterator[tuple[Value, list[Term]]]:
+        """The value, and each that it is a multiple of, with the factors and divisors in between.
+
+        They are multiples whatever the parameters are.
+        """
+        value, found = self, list[Term]()
+        yield value, found
+        while value.terms is not None and len(value.terms) == 1 and _is_nothing(value.offset):
+            found = [*found, *value.terms]
+            value = found[-1].value
+            yield value, found
 
 
 class Term(NamedTuple):
@@ -170,6 +182,11 @@ class Parameter(np.ndarray):
     def of(cls, plain: Any) -> Any:
         """A parameter; one that is traced as it is."""
         return np.asarray(plain).view(cls) if is_concrete(plain) else plain
+
+
+def _is_nothing(offset: Any) -> bool:
+    """Whether an offset is zero, whatever the parameters are."""
+    return is_constant(offset) and not np.any(offset)
 
 
 def is_plain(operand: Operand) -> bool:

@@ -9,12 +9,14 @@ arithmetic therefore serves two purposes: intervals of values, and rounding erro
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.pytrees import pytree
 
 UNIT = 2.0**-53
@@ -113,19 +115,27 @@ def lengths(rows) -> Any:
 
 
 @pytree
-class Ball:
+class Ball(AbstractNumber):
     """Arrays `mid` and `rad >= 0` of one shape: all `a` with `|a - mid| <= rad`."""
 
     mid: Any
     rad: Any
 
-    # numpy arrays on the left leave `array @ ball` and `array - ball` to this class
-    __array_ufunc__ = None
+    def __len__(self) -> int:
+        return self.mid.shape[0]
 
     @classmethod
     def exact(cls, mid) -> Self:
         """Numbers taken as they are: a ball of radius zero."""
         return cls(mid, namespace(mid).zeros_like(mid))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Ball]) -> Self:
+        """The numbers of several, one behind the other."""
+        if len(parts) == 1:
+            return parts[0]  # type: ignore[return-value]
+        xp = namespace(*(part.mid for part in parts))
+        return cls(*(xp.concatenate(each) for each in zip(*((y.mid, y.rad) for y in parts))))
 
     @property
     def lower(self):
@@ -183,8 +193,6 @@ class Ball:
         mid = self.mid + other.mid
         return self._rebuilt(mid, self.rad + other.rad, gamma(1) * abs(mid))
 
-    __radd__ = __add__
-
     def __neg__(self) -> Self:
         return type(self)(-self.mid, self.rad)
 
@@ -197,13 +205,15 @@ class Ball:
     def __getitem__(self, index) -> Self:
         return type(self)(self.mid[index], self.rad[index])
 
+    def widened(self, by) -> Self:
+        """The numbers up to an error of so much each."""
+        return self._rebuilt(self.mid, self.rad, by)
+
+    def met(self, held: Callable[..., Ball], *given: Ball) -> Self:
+        """What these hold and what others say of them."""
+        return self.meeting(held(*given))
+
     def meeting(self, other: Self) -> Self:
         """Numbers that both hold."""
         lower = larger(self.lower, other.lower)
         return type(self).between(lower, larger(lower, smaller(self.upper, other.upper)))
-
-    def times(self, other: Self) -> Self:
-        """Products, entry by entry: `|a b - m n| <= |m| s + |n| r + r s`."""
-        mid = self.mid * other.mid
-        spread = abs(self.mid) * other.rad + abs(other.mid) * self.rad + self.rad * other.rad
-        return self._rebuilt(mid, spread * (1 + gamma(4)), gamma(1) * abs(mid) + TINY)

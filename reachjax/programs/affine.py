@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.pytrees import pytree
 from reachjax.numerics.rounding import Ball, gamma, larger, namespace
 from reachjax.programs.initial import Ends, InitialColumns, constant, met
@@ -40,7 +41,7 @@ Place = int | Array | None
 
 
 @pytree
-class AffineForms:
+class AffineForms(AbstractNumber):
     """`k` numbers, each as a form over `n` columns and, beside it, as an interval.
 
     Attributes:
@@ -52,8 +53,8 @@ class AffineForms:
     rows: Float[Array | np.ndarray, "k n+2"]
     radii: Float[Array | np.ndarray, "k 2"]
 
-    # numpy arrays on the left leave `array @ forms` and `array - forms` to this class
-    __array_ufunc__ = None
+    def __len__(self) -> int:
+        return self.rows.shape[0]
 
     @classmethod
     def beginning(cls, start: InitialColumns, size: int | None = None) -> AffineForms:
@@ -101,26 +102,16 @@ class AffineForms:
         error = gamma(1) * abs(constant(changed)).sum(axis=1)
         return AffineForms(rows, (radii + error[:, None]) * (1 + gamma(rows.shape[1] + 4)))
 
-    __radd__ = __add__
-
     def __neg__(self) -> AffineForms:
         return AffineForms(-self.rows, self.radii)
 
-    def __mul__(self, factor) -> AffineForms:
+    def __rmul__(self, factor) -> AffineForms:
         """Each number times an exact one, or all times one."""
         xp = namespace(self.rows)
         factor = xp.broadcast_to(xp.asarray(factor, float), (len(self.rows),))
         error = gamma(1) * abs(constant(self.rows)).sum(axis=1)
         radii = abs(factor)[:, None] * (self.radii + error[:, None])
         return AffineForms(factor[:, None] * self.rows, radii * (1 + gamma(self.rows.shape[1] + 4)))
-
-    __rmul__ = __mul__
-
-    def __sub__(self, other) -> AffineForms:
-        return self + (-other)
-
-    def __rsub__(self, other) -> AffineForms:
-        return (-self) + other
 
     def __getitem__(self, index) -> AffineForms:
         return AffineForms(self.rows[index], self.radii[index])
@@ -151,7 +142,11 @@ class AffineForms:
         reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(constant(middle))
         return middle - reach, middle + reach
 
-    def widened(self, width: int) -> AffineForms:
+    def widened(self, by) -> AffineForms:
+        """The numbers up to an error of so much each."""
+        return AffineForms(self.rows, (self.radii + by[..., None]) * (1 + gamma(4)))
+
+    def padded(self, width: int) -> AffineForms:
         """The forms over at least so many columns, the new ones empty (numpy)."""
         more = width - self.rows.shape[1] + 2
         if more <= 0:
@@ -164,7 +159,7 @@ class AffineForms:
         """Each number with so much of a column of its own, and where that is, -1 where none is.
 
         Without a place they come after the columns of these forms, which have to be over all the
-        columns there are: see `widened`.
+        columns there are: see `padded`.
         """
         k, n = self.rows.shape
         if place is not None:
@@ -179,11 +174,13 @@ class AffineForms:
         return AffineForms(rows, self.radii), places
 
 
-def widest(parts: Sequence[AffineForms]) -> AffineForms:
-    """All of these forms, over the columns of the widest."""
-    xp, width = namespace(*(part.rows for part in parts)), max(len(p.rows[0]) for p in parts) - 2
-    rows = [part.rows if xp is not np else part.widened(width).rows for part in parts]
-    return AffineForms(xp.concatenate(rows), xp.concatenate([part.radii for part in parts]))
+def joined(parts: Sequence[AffineForms]) -> AffineForms:
+    """All of these forms, which are over the same columns."""
+    if len(parts) == 1:
+        return parts[0]
+    xp = namespace(parts[0].rows)
+    rows, radii = zip(*((part.rows, part.radii) for part in parts), strict=True)
+    return AffineForms(xp.concatenate(rows), xp.concatenate(radii))
 
 
 def _sum(one: Any, other: Any) -> Any:

@@ -22,9 +22,9 @@ from jaxtyping import Array, Float, Int
 from reachjax.loops import ClosedLoop
 from reachjax.loops.flows.flow import Flow
 from reachjax.loops.limits import Limits
-from reachjax.loops.units import AbstractUnit, Quadratic, SmoothUnit, UnboundedError
-from reachjax.numerics.rounding import Ball, gamma, namespace
-from reachjax.programs.affine import AffineForms, Place
+from reachjax.loops.units import AbstractUnit, Bilinear, Quadratic, SmoothUnit, UnboundedError
+from reachjax.numerics.rounding import TINY, Ball, gamma, namespace
+from reachjax.programs.affine import AffineForms, Place, joined
 from reachjax.programs.flows import Between, flowed_forms
 from reachjax.programs.initial import Ends, InitialColumns, constant, met, settled
 from reachjax.sets import Box
@@ -39,9 +39,9 @@ class UnitForms(NamedTuple):
 
     Attributes:
         unit: which one.
-        inputs: forms of the inputs.
-        lower: `(k,)`, bounds of the inputs.
-        upper: `(k,)`.
+        inputs: forms of the inputs, of several for each unit one behind the other.
+        lower: bounds of the inputs.
+        upper: the same.
         slope: `(k,)`, with `slope y + offset - gap <= z <= slope y + offset + gap` in between.
         offset: `(k,)`.
         gap: `(k,)`, zero where the unit is affine there.
@@ -51,8 +51,8 @@ class UnitForms(NamedTuple):
 
     unit: AbstractUnit
     inputs: AffineForms
-    lower: Float[Array | np.ndarray, " k"]
-    upper: Float[Array | np.ndarray, " k"]
+    lower: Float[Array | np.ndarray, " inputs"]
+    upper: Float[Array | np.ndarray, " inputs"]
     slope: Float[Array | np.ndarray, " k"]
     offset: Float[Array | np.ndarray, " k"]
     gap: Float[Array | np.ndarray, " k"]
@@ -97,7 +97,7 @@ of the state after the step."""
 
 def states_facts(unit: AbstractUnit) -> bool:
     """Whether facts of a unit say more than its form; columns of free units say all theirs do."""
-    return not (unit.free or isinstance(unit, SmoothUnit))
+    return not (unit.free or unit.curved)
 
 
 def step_columns(loop: ClosedLoop) -> tuple[int, int]:
@@ -140,32 +140,35 @@ def step_forms(
     found: list[UnitForms] = []
     done, width, free = 0, state.columns.shape[1], place
 
-    def apply(unit: Any, y: Any) -> AffineForms:
+    def apply(unit: Any, *given: AffineForms) -> AffineForms:
         nonlocal done, width, free
+        if place is None:  # branches that began alike must not share the columns they add
+            given = tuple(y.padded(width) for y in given)
         if isinstance(unit, Flow):
-            successor, between = flowed_forms(unit, y, start, spans is not None)
+            successor, between = flowed_forms(unit, given, start, spans is not None)
             if spans is not None:
                 spans.append(between)
             return successor
-        here, done = slice(done, done + len(y.rows)), done + len(y.rows)
-        slope = None if slopes is None else slopes[here]
-        if place is None:  # branches that began alike must not share the columns they add
-            y = y.widened(width)
+        y = joined(given)
         ends = _cut(unit, y, start)
         if ranges is not None:
             ends = ranges(unit, y, ends, found)
-        if isinstance(unit, SmoothUnit):
+        if isinstance(unit, Bilinear):
+            z, forms = _bilinear(unit, y, ends, free, start)
+        elif isinstance(unit, SmoothUnit):
             line = unit.linear(*ends)
             if place is None and _is_lost(line, ends):
                 ends = met(ends, _ends_by_intervals(loop, start, int(t), before, len(found)))
                 line = unit.linear(*ends)
             z, forms = _smooth(unit, y, ends, line, free, start)
-            if place is None:
-                _require_bounds(forms, int(t))
         else:
-            z, forms = _unit(unit, y, ends, free, slope)
+            here = slice(done, done + len(y))
+            z, forms = _unit(unit, y, ends, free, None if slopes is None else slopes[here])
+        if place is None and unit.curved:
+            _require_bounds(forms, int(t))
+        done = done + len(z)
         if free is not None:
-            free = free + len(y.rows)
+            free = free + len(z)
         width = z.columns.shape[1]
         found.append(forms)
         return z
@@ -183,7 +186,7 @@ def step_forms(
         u = loop.controller.propagate(measured, apply)
     successor = loop.moved(state, loop.projected(u, t, apply), t, apply)
     if place is None:
-        successor = successor.widened(width)
+        successor = successor.padded(width)
     successor = _spilled(successor, free)
     ends = successor.ends(start)
     if known is not None:
@@ -211,9 +214,9 @@ def _ends_by_intervals(
         return -np.inf, np.inf
     state, found = Limits(*map(np.asarray, (start.box.lower, start.box.upper))), []
 
-    def apply(unit: AbstractUnit, y: Limits) -> Limits:
+    def apply(unit: AbstractUnit, y: Limits, *others: Limits) -> Limits:
         found.append((y.least, y.most))
-        return y.at(unit)
+        return y.at(unit, *others)
 
     for k in range(before + 1):
         found.clear()
@@ -227,7 +230,8 @@ def _require_bounds(forms: UnitForms, t: int) -> None:
     Raises:
         UnboundedError: that is so.
     """
-    lost = ~np.isfinite(forms.gap) & np.isfinite(forms.lower) & np.isfinite(forms.upper)
+    unknown = ~(np.isfinite(forms.lower) & np.isfinite(forms.upper))
+    lost = ~np.isfinite(forms.gap) & (forms.unit.combined(1.0 * unknown) == 0)
     if lost.any():
         (k, *_) = np.flatnonzero(lost)
         raise UnboundedError(forms.unit, t, float(forms.lower[k]), float(forms.upper[k]))
@@ -286,6 +290,59 @@ def _smooth(
     return z, UnitForms(unit, y, lower, upper, slope, offset, gap, places, z)
 
 
+def _bilinear(
+    unit: Bilinear, y: AffineForms, ends: Ends, place: Place, start: InitialColumns
+) -> tuple[AffineForms, UnitForms]:
+    """What a layer of products, or of sums of them, makes of its factors, whose bounds are known.
+
+    With forms `c + g w + h`, of which `|g w| <= S` and `|h| <= R`, products are
+
+        a b  =  c_a c_b + c_a (g_b w + h_b) + c_b (g_a w + h_a) + (g_a w) (g_b w) + e,
+        |e|  <=  sum_j |g_a h_bj + g_b h_aj| + R_a R_b,
+
+    the norm being that of the columns `w` and `j` a column of `h`; or the plane in the middle,
+    where that leaves less out.
+    """
+    xp, (lower, upper), w = namespace(y.rows), ends, start.spread.shape[1]
+    count, values = unit.terms, Ball.between(*unit.interval(lower, upper))
+    center, rows, size = y.rows[:, 0], y.rows[:, 2:], y.rows.shape[1]
+    plane, offset, gap = unit.plane(lower, upper)
+    rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(size)) + y.radii[:, 0]
+    own, half = start.norms(rows[:, :w]), len(center) // 2
+    (S, S_other), (R, R_other), (r, r_other) = map(unit.halves, (own, rest, y.radii[:, 0]))
+    one, other = rows[:half], rows[half:]
+    lost = start.mixed_norms(one, other) + S * r_other + S_other * r + R * R_other
+    lost = lost + constant(gamma(w + 8) * (S * R_other + S_other * R))
+    lost = _folded(lost, count) * (1 + gamma(size + count + 16))
+    better = lost <= gap
+    slope = xp.where(xp.concatenate([better] * (2 * count)), unit.derivative(center), plane)
+    offset = xp.where(better, -_folded(center[:half] * center[half:], count), offset)
+    slope, offset = settled((slope, offset))
+    gap = settled(xp.where(better, lost, gap) * (1 + gamma(8)))
+    level, products = (
+        xp.where(better.reshape(-1, *[1] * (part.ndim - 1)), _folded(part, count), 0.0)
+        for part in start.multiplied(one[:, :w], other[:, :w])
+    )
+    linear = _folded(slope[:, None] * rows, 2 * count)
+    middle = _folded(slope * center, 2 * count) + offset + level
+    parts = linear[:, :w], linear[:, w : start.count] + products, linear[:, start.count :]
+    form = xp.concatenate([xp.stack([middle, values.mid], axis=1), *parts], axis=1)
+    sizes = _folded(abs(slope) * (abs(center) + own + rest), 2 * count) + abs(offset)
+    sizes = sizes + _folded(S * S_other, count)
+    error = gamma(size + 2 * count + 16) * sizes + (size + 8) * (w + 1) * count * TINY
+    radius = _folded(abs(slope) * y.radii[:, 0], 2 * count) * (1 + gamma(2 * count + 4))
+    z = AffineForms(form, xp.stack([constant(radius + error), values.rad], axis=1))
+    z, places = z.with_own(gap, place)
+    return z, UnitForms(unit, y, lower, upper, xp.zeros_like(gap), offset, gap, places, z)
+
+
+def _folded(parts: Any, count: int) -> Any:
+    """Sums of so many parts of equal length that stand one behind the other."""
+    if count == 1:
+        return parts
+    return parts.reshape(count, len(parts) // count, *parts.shape[1:]).sum(axis=0)
+
+
 def _unit(
     unit: AbstractUnit, y: AffineForms, ends: Ends, place: Place, slope: Any
 ) -> tuple[AffineForms, UnitForms]:
@@ -323,7 +380,8 @@ def _cut(unit: AbstractUnit, y: AffineForms, start: InitialColumns) -> Ends:
         return lower, upper
     if not start.cut.needs_programs:
         return y.ends(start, cut=True)
-    switching = np.flatnonzero(~unit.lines(lower, upper).affine)
+    switching = ~unit.lines(lower, upper).affine
+    switching = np.flatnonzero(np.tile(switching, unit.inputs))
     if len(switching):
         lower, upper = lower.copy(), upper.copy()
         lower[switching], upper[switching] = y[switching].ends(start, cut=True)

@@ -47,6 +47,10 @@ class Rows(Ball):
         """Rows whose values may be off by so much."""
         return Rows(self.mid, self.rad.at[:, -1].add(by))
 
+    def met(self, held: Any, *given: Any) -> Rows:
+        """The rows: what numbers are between is no matter of theirs."""
+        return self
+
     def where(self, mask: Array) -> Rows:
         """Keep the rows in which the mask is true; the others are zero."""
         keep = jnp.asarray(mask, self.mid.dtype)[:, None]
@@ -59,7 +63,7 @@ class LoopRows:
 
     Attributes:
         state: `(n_x, n)`.
-        preactivation: `(k, n)`, inputs `y` of the units.
+        preactivation: inputs `y` of the units, one or two of each.
         output: `(k, n)`, outputs `z` of the units.
         facts: what holds of the units, those of one kind together, in the order in which the loop
             meets the kinds.
@@ -101,24 +105,28 @@ def loop_rows(
         bounds: of this step's units.
         prune: whether units that the bounds prove to be affine leave their columns empty.
     """
-    size, done = state.mid.shape[1], 0
+    size, done, seen = state.mid.shape[1], 0, 0
     none = columns(0, 0, size)
     inputs, outputs = [none], [none]
     facts: dict[AbstractUnit, list[Facts]] = {}
 
-    def unit(unit: AbstractUnit, y: Rows) -> Rows:
-        nonlocal done
-        here, done = slice(done, done + y.mid.shape[0]), done + y.mid.shape[0]
+    def unit(unit: AbstractUnit, *given: Rows) -> Rows:
+        nonlocal done, seen
+        y = Rows.joined(given)
+        of_inputs, seen = slice(seen, seen + len(y)), seen + len(y)
+        here, done = slice(done, done + len(y) // unit.inputs), done + len(y) // unit.inputs
         z = picking(places[here], size)
         gone = bounds.affine[here] & prune
         if prune:
-            slope, offset = (jnp.where(gone, part[here], 0.0) for part in bounds.lines.above)
+            slope = jnp.where(jnp.tile(gone, unit.inputs), bounds.lines.above.slope[of_inputs], 0.0)
+            offset = jnp.where(gone, bounds.lines.above.offset[here], 0.0)
             kept = z.where(~gone)  # zero where offsets are not, so that they are added exactly
-            line = Rows.exact(kept.mid.at[:, -1].add(offset)) + slope * y
+            line = Rows.exact(kept.mid.at[:, -1].add(offset)) + unit.combined(slope * y)
             z = line.widened(bounds.excess[here])
-        interval = bounds.preactivation[here]
+        interval = bounds.preactivation[of_inputs]
         stated = unit.facts(y, z, interval.lower, interval.upper)
         telling = interval.rad > STEADY * abs(interval.mid)
+        telling = unit.combined(1.0 * ~telling) == 0
         facts.setdefault(unit, []).append(stated.map(partial(_said, gone=gone, telling=telling)))
         inputs.append(y)
         outputs.append(z)
@@ -196,9 +204,10 @@ def change_of_basis(loop: ClosedLoop, t: int = 0) -> ChangeOfBasis:
 def _change_of_basis(loop: ClosedLoop, t: int) -> ChangeOfBasis:
     n, k = loop.states, loop.units
     size = n + k + 1
-    none = jnp.zeros(k)
-    any_ball, line = Ball(none, none), Line(none, none)
-    bounds = LoopBounds(any_ball, any_ball, any_ball, Lines(line, line), none > 0, none, any_ball)
+    none, nothing = jnp.zeros(k), jnp.zeros(loop.unit_inputs)
+    any_ball, line = Ball(none, none), Line(nothing, none)
+    inputs = Ball(nothing, nothing)
+    bounds = LoopBounds(any_ball, inputs, any_ball, Lines(line, line), none > 0, none, any_ball)
     rows = loop_rows(loop, columns(0, n, size), n + jnp.arange(k), t, bounds, prune=False)
     one = columns(size - 1, 1, size).mid
     # the paper keeps x^{l+1} = z + u_low and x^{l+2} = u_high - z in place of the last outputs

@@ -31,9 +31,9 @@ class LoopBounds:
 
     Attributes:
         state: `(n_x,)`, the box of states it started from.
-        preactivation: `(k,)`, inputs `y` of the units.
+        preactivation: inputs `y` of the units, one or two of each.
         output: `(k,)`, outputs `z` of the units.
-        lines: `(k,)`, below and above outputs, up to `excess`.
+        lines: `(k,)`, below and above outputs, up to `excess`; a slope for each input.
         affine: `(k,)`, units of which both lines are the same.
         excess: `(k,)`, by how much those may be off at most; zero where they surely are affine.
         successor: `(n_x,)`, states one step later.
@@ -62,14 +62,15 @@ def loop_bounds(
         loop: the closed loop.
         box: of states.
         t: the time.
-        known: `(k,)`, other bounds of the units' inputs, if there are any.
+        known: other bounds of the units' inputs, if there are any.
         w: `(n_w,)`, the disturbances, where they are known.
         v: `(n_x,)`, the noise, where it is known.
     """
     drawn = (None if part is None else Ball.exact(part) for part in (w, v))
     units: list[tuple[Ball, Ball, Lines, Array, Array]] = []
 
-    def unit(unit: AbstractUnit, y: Ball) -> Ball:
+    def unit(unit: AbstractUnit, *given: Ball) -> Ball:
+        y = Ball.joined(given)
         if known is not None:
             done = sum(len(each[0].mid) for each in units)
             also = known[done : done + len(y.mid)]
@@ -77,7 +78,7 @@ def loop_bounds(
             y = Ball.between(lower, jnp.maximum(lower, jnp.minimum(y.upper, also.upper)))
         y, z = _image(unit, y)
         lines = unit.lines(y.lower, y.upper)
-        constant = lines.affine & (lines.above.slope == 0)
+        constant = lines.affine & (unit.combined(abs(lines.above.slope)) == 0)
         mid = jnp.where(constant, lines.above.offset, z.mid)
         z = Ball(mid, jnp.where(constant, 0.0, z.rad))
         units.append((y, z, *_settled(unit, y, z, lines)))
@@ -104,6 +105,11 @@ def _image(unit: AbstractUnit, y: Ball) -> tuple[Ball, Ball]:
     return y, Ball(z.mid, z.rad + rounding)
 
 
+def _value(unit: AbstractUnit, *given: Ball) -> Ball:
+    """What a unit makes of inputs, in numpy."""
+    return _image(unit, Ball.joined(given))[1]
+
+
 def _settled(unit: AbstractUnit, y: Ball, z: Ball, lines: Lines) -> tuple[Lines, Array, Array]:
     """Lines, which units are affine, and by how much the lines of these may be off.
 
@@ -114,7 +120,7 @@ def _settled(unit: AbstractUnit, y: Ball, z: Ball, lines: Lines) -> tuple[Lines,
     That is said of one input alone, and of no layer that is not separable.
     """
     if not unit.separable:
-        return lines, lines.affine, jnp.zeros_like(y.mid)
+        return lines, lines.affine, jnp.zeros_like(z.mid)
     spare, surely = MARGINAL * (abs(y.mid) + y.rad), lines.affine
     from_above = unit.lines(y.lower + spare, jnp.maximum(y.upper, y.lower + spare))
     from_below = unit.lines(jnp.minimum(y.lower, y.upper - spare), y.upper - spare)
@@ -152,7 +158,7 @@ def successor_box(loop: ClosedLoop, box: Box, t: int, w: Any = None, v: Any = No
     drawn = (None if part is None else Ball.exact(np.asarray(part)) for part in (w, v))
     with np.errstate(all="ignore"):
         state = Ball.between(lower, upper)
-        successor = loop.step(state, t, lambda unit, y: _image(unit, y)[1], *drawn)
+        successor = loop.step(state, t, _value, *drawn)
         return unchecked(Box, lower=successor.lower, upper=successor.upper)
 
 

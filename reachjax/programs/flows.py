@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from reachjax.loops.flows.flow import Flow
 from reachjax.loops.flows.taylor_models import Symbols, TaylorModels
 from reachjax.numerics.rounding import Ball, gamma, larger, namespace
-from reachjax.programs.affine import AffineForms, widest
+from reachjax.programs.affine import AffineForms, joined
 from reachjax.programs.initial import InitialColumns
 
 
@@ -55,16 +55,16 @@ def flowed_forms(
 
     Args:
         flow: of the plant.
-        given: the state, the input, and disturbances if there are any.
+        given: the state, the input, and disturbances if there are any, over the same columns.
         start: what the first columns are.
         between: whether the states in between are asked for.
 
     Raises:
         UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
     """
-    forms = widest(given)
+    forms = joined(given)
     box = Ball.between(*given[0].ends(start, cut=True))
-    symbols, models = _condensed(forms, [len(each.rows) for each in given], start)
+    symbols, models = _condensed(forms, [len(each) for each in given], start)
     found = flow.followed(models, box, between)
     points = (
         tuple(_expanded(point, forms, symbols) for point in each.points) for each in found.controls

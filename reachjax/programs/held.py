@@ -63,7 +63,7 @@ class _Layer(NamedTuple):
     Attributes:
         step: of the horizon.
         number: of the layer.
-        before: how many units of the step come before it.
+        before: how many inputs of units of the step come before its own.
         forms: of its units.
         places: `(n,)`, where compiled forms have the columns so far; -1 where they have none.
     """
@@ -90,12 +90,14 @@ def held_bounds(
     if own and start.cut is not None:
         facets = start.cut.facets
     layers, places = _layers(horizon, steps)
-    units = sum(len(layer.forms.places) for layer in layers if layer.step == 0)
-    ranges, states = np.zeros((steps, 2, units)), np.zeros((steps, 2, len(start.center)))
+    first = [layer.forms for layer in layers if layer.step == 0]
+    inputs = sum(len(forms.lower) for forms in first)
+    units = sum(len(forms.gap) for forms in first)
+    ranges, states = np.zeros((steps, 2, inputs)), np.zeros((steps, 2, len(start.center)))
     of_ranges, of_states = (np.full(part.shape, INTERVAL) for part in (ranges, states))
     found = list[_Bound]()
     for layer in layers:
-        here = slice(layer.before, layer.before + len(layer.forms.places))
+        here = slice(layer.before, layer.before + len(layer.forms.lower))
         ranges[layer.step, :, here] = layer.forms.lower, layer.forms.upper
         given = _of_layer(horizon, layer, facets)
         found += _told(given, layer.places, of_ranges[layer.step, :, here])
@@ -118,7 +120,7 @@ def held_bounds(
     weighed = len(bounds) + sum(_weighed(bound.source) for bound in found[len(bounds) :])
     more, between = step_columns(horizon.loop)
     shape = steps, horizon.kinds, units
-    every = len(bounds) + 2 * steps * (units + len(start.center))  # few shapes: each is compiled
+    every = len(bounds) + 2 * steps * (inputs + len(start.center))  # few shapes: each is compiled
     some = every if every * np.prod(shape) < LARGE else 1 << (weighed - 1).bit_length()
     columns = np.zeros((max(every, some), start.count + steps * more + between))
     multipliers = np.zeros((some, len(horizon.facts.rows)))
@@ -174,7 +176,7 @@ def attained(
     """
     start, facts = horizon.start, horizon.facts[: len(multipliers)]
     width = max(row.columns.shape[1], facts.columns.shape[1])
-    own, others = row.widened(width).columns[0], facts.widened(width).columns
+    own, others = row.padded(width).columns[0], facts.padded(width).columns
     weighed = own + multipliers @ others
     first, rest = np.split(weighed, [start.count])
     there = np.sign(weighed)
@@ -262,7 +264,7 @@ def _layers(horizon: Horizon, steps: int) -> tuple[list[_Layer], list[Int[np.nda
         summed = range(0) if merged is None else merged.layers
         for number, layer in enumerate(layers):
             found.append(_Layer(step, number, before, layer, places.copy()))
-            here, before = np.flatnonzero(layer.places >= 0), before + len(layer.places)
+            here, before = np.flatnonzero(layer.places >= 0), before + len(layer.lower)
             if number not in summed:
                 places[layer.places[here]] = place + here
                 place += len(layer.places)

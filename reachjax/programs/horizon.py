@@ -23,9 +23,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.units import AbstractUnit, Mark, SmoothUnit
+from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.rounding import Ball
-from reachjax.programs.affine import AffineForms
+from reachjax.programs.affine import AffineForms, joined
 from reachjax.programs.affine_steps import ControllerColumns, UnitForms, states_facts, step_forms
 from reachjax.programs.flows import Between
 from reachjax.programs.initial import Ends, InitialColumns, met, product_facts
@@ -136,7 +136,7 @@ class Horizon:
         width = self._width = max(self._width, *widths)
         if len(self._facts) != 1 or self._facts[0].columns.shape[1] != width:
             none = AffineForms(np.zeros((0, width + 2)), np.zeros((0, 2)))
-            self._facts = [joined([none, *(part.widened(width) for part in self._facts)])]
+            self._facts = [joined([none, *(part.padded(width) for part in self._facts)])]
         return self._facts[0]
 
     @property
@@ -169,7 +169,7 @@ class Horizon:
                 self.states.append(y)
                 return ends
             self._width = max(self._width, y.columns.shape[1])
-            if isinstance(unit, SmoothUnit):  # its range is that of its form, but for little
+            if unit.curved:  # its range is that of its form, but for little
                 return ends
             switching = np.flatnonzero(~unit.lines(*ends).affine)
             if multipliers is None or unit.free or not (len(switching) and self._count):
@@ -252,10 +252,10 @@ class Horizon:
         summed = range(0) if merged is None else merged.layers
         numbers = itertools.count()
 
-        def apply(unit: AbstractUnit, y: Any) -> Any:
-            number, z = next(numbers), unit(y)
+        def apply(unit: AbstractUnit, *y: Any) -> Any:
+            number, z = next(numbers), unit(*y)
             if unit.free:
-                z = z + np.array([next(values, 0.0) for _ in range(len(y))])
+                z = z + np.array([next(values, 0.0) for _ in range(len(z))])
             if number not in summed:
                 layer = layers[number]
                 _fill(found, layer.outputs, layer.gap, layer.places, z)
@@ -328,7 +328,7 @@ class Horizon:
         width = layer.outputs.columns.shape[1]
         # a layer that is not separable states its facts as a whole
         stated = switching if layer.unit.separable else np.arange(len(layer.places))
-        y, z = layer.inputs[stated].widened(width), layer.outputs[stated]
+        y, z = layer.inputs[stated].padded(width), layer.outputs[stated]
         ends: Any = layer.lower[stated], layer.upper[stated]
         kept = np.searchsorted(stated, switching)
         facts = layer.unit.facts(y, z, *ends).map(lambda block: block.rows[kept])
@@ -354,7 +354,7 @@ class Horizon:
 
 def _left_out(each: UnitForms | ControllerColumns) -> bool:
     """Whether columns are of what smooth units leave out."""
-    return isinstance(each, ControllerColumns) or isinstance(each.unit, SmoothUnit)
+    return isinstance(each, ControllerColumns) or each.unit.curved
 
 
 def _fill(
@@ -371,12 +371,6 @@ def _fill(
     found[places[here]] = rest / gap[here]
 
 
-def joined(parts: Sequence[AffineForms]) -> AffineForms:
-    """All of these forms, which are over the same columns."""
-    rows, radii = zip(*((part.rows, part.radii) for part in parts), strict=True)
-    return AffineForms(np.concatenate(rows), np.concatenate(radii))
-
-
 def upper_bounds(
     forms: AffineForms,
     facts: AffineForms,
@@ -387,5 +381,5 @@ def upper_bounds(
     width = max(forms.columns.shape[1], facts.columns.shape[1])
     with np.errstate(all="ignore"):
         used = np.flatnonzero(np.any(multipliers != 0, axis=0))  # few are, of wide networks
-        weighed = forms.widened(width) + multipliers[:, used] @ facts[used].widened(width)
+        weighed = forms.padded(width) + multipliers[:, used] @ facts[used].padded(width)
         return weighed.ends(start)[1]

@@ -95,6 +95,13 @@ class InitialColumns(Replaceable):
         products = rows[:, i] * rows[:, j] * np.where(i == j, 0.5, 2.0)
         return (rows**2).sum(axis=1) / 2, products
 
+    def multiplied(self, one: Rows, other: Rows) -> tuple[Any, Rows]:
+        """`(r . w) (s . w)` for each pair of rows, as `squared`."""
+        i, j = self.pairs
+        mixed = one[:, i] * other[:, j] + one[:, j] * other[:, i]
+        products = mixed * np.where(i == j, 0.25, 1.0)
+        return (one * other).sum(axis=1) / 2, products
+
     def curved_ends(self, rows: Rows) -> Ends:
         """Bounds of each row over all columns, products among them, by the formulas above."""
         n, error = self.spread.shape[1], gamma(4 * rows.shape[1] + 16)
@@ -144,6 +151,22 @@ class InitialColumns(Replaceable):
         unit = xp.where(some, constant(largest), 1.0)
         squares = xp.where(some, ((rows / unit[:, None]) ** 2).sum(axis=1), 1.0)
         return xp.where(some, unit * xp.sqrt(squares) * (1 + gamma(rows.shape[1] + 8)), 0.0)
+
+    def mixed_norms(self, one: Rows, other: Rows) -> Any:
+        """What `(g . w) (h' . v) + (g' . w) (h . v)` does not exceed for each pair of rows.
+
+        With rows `[g, h]` over the `w` and all other columns `v` that is the sum of the norms of
+        `h'_j g + h_j g'`, but for rounding.
+        """
+        xp, n = namespace(one, other), self.spread.shape[1]
+        (g, h), (also, rest) = ((rows[:, :n], rows[:, n:]) for rows in (one, other))
+        if xp is not np and not self.round:  # it is one loop where it is compiled
+            return abs(g[:, None] * rest[..., None] + also[:, None] * h[..., None]).sum((1, 2))
+        total = xp.zeros_like(h)
+        for i in range(n):
+            entry = g[:, i, None] * rest + also[:, i, None] * h
+            total = total + (entry * entry if self.round else abs(entry))
+        return (xp.sqrt(total) if self.round else total).sum(axis=1)
 
     def farthest(self, rows: Rows) -> Rows:
         """Initial states at which `r . w` is largest for each row, whatever the cut; rounded."""

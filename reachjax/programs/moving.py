@@ -46,8 +46,8 @@ class HeldBounds(NamedTuple):
             of the first bounds; all others have none.
         of_set: `(P, r)`, of the facets of the initial set.
         by_interval: `(f,)`, whether directions are bounded by intervals instead.
-        ranges: `(N, 2, units)`, lower and upper bounds of the units' inputs, as they were known.
-        of_ranges: `(N, 2, units)`, which of the bounds they are, or `INTERVAL`.
+        ranges: `(N, 2, inputs)`, lower and upper bounds of the units' inputs, as they were known.
+        of_ranges: `(N, 2, inputs)`, which of the bounds they are, or `INTERVAL`.
         states: `(N, 2, n_x)`, those of states.
         of_states: `(N, 2, n_x)`, which of the bounds they are, or `INTERVAL`, or `KNOWN`.
     """
@@ -56,8 +56,8 @@ class HeldBounds(NamedTuple):
     of_units: Float[Array | np.ndarray, "P N b units"]
     of_set: Float[Array | np.ndarray, "P r"]
     by_interval: Bool[Array | np.ndarray, " f"]
-    ranges: Float[Array | np.ndarray, "N 2 units"]
-    of_ranges: Int[Array | np.ndarray, "N 2 units"]
+    ranges: Float[Array | np.ndarray, "N 2 inputs"]
+    of_ranges: Int[Array | np.ndarray, "N 2 inputs"]
     states: Float[Array | np.ndarray, "N 2 n_x"]
     of_states: Int[Array | np.ndarray, "N 2 n_x"]
 
@@ -188,7 +188,8 @@ def _values(
             unit: AbstractUnit | None, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
         ) -> Ends:
             tell(found)
-            here = slice(done, done + len(y.rows))
+            first = sum(len(layer.lower) for layer in found)
+            here = slice(first, first + len(y))
             values, which, besides = of_state if unit is None else (ranges_known, of_ranges, None)
             moved = []
             sides = zip((-y, y), (-1, 1), values, which, y.ends_by_interval(), strict=True)

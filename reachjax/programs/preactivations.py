@@ -21,22 +21,22 @@ from jaxtyping import Array, Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.closed_loop import UnitLayer
 from reachjax.loops.functions import Compiled
-from reachjax.loops.units import AbstractUnit
+from reachjax.loops.units import AbstractUnit, Line
 from reachjax.numerics.rounding import Ball, gamma
 from reachjax.programs.basis import Rows, columns, loop_rows
 from reachjax.programs.bounds import LoopBounds, loop_bounds
 from reachjax.sets import AbstractSet, Box
 
 
-@partial(jax.jit, static_argnames="units")
-def known_inputs(units: int, known: Ball | None) -> Ball:
+@partial(jax.jit, static_argnames="inputs")
+def known_inputs(inputs: int, known: Ball | None) -> Ball:
     """Bounds of every unit's input, of infinite radius but for those known, the first ones.
 
     Args:
-        units: how many there are.
+        inputs: how many there are.
         known: bounds of the first ones, if there are any.
     """
-    mid, rad = jnp.zeros(units), jnp.full(units, jnp.inf)
+    mid, rad = jnp.zeros(inputs), jnp.full(inputs, jnp.inf)
     if known is None:
         return Ball(mid, rad)
     here = slice(0, len(known.mid))
@@ -57,7 +57,7 @@ def bounds_over(
         X: the set of states at time `t`, in closed form: a polytope needs linear programs.
         box: a box around it.
         t: the time.
-        known: `(k,)`, other bounds of the units' inputs, from `known_inputs`.
+        known: other bounds of the units' inputs, from `known_inputs`.
     """
     if loop.units == 0:
         return loop_bounds(loop, box, t)
@@ -103,10 +103,10 @@ def _relaxed(rows: Rows, inputs: Rows, bounds: LoopBounds, layers: tuple[UnitLay
         bounds: of the units.
         layers: of units.
     """
+    below, above = (_lines(line, inputs, layers) for line in bounds.lines)
     sizes = np.array([layer.size for layer in layers])
     ends, width = jnp.asarray(np.cumsum(sizes)), int(sizes.max())
-    k = len(inputs.mid)
-    n = inputs.mid.shape[1] - 1 - k
+    n = inputs.mid.shape[1] - 1 - int(sizes.sum())
 
     def replaced(i, rows: Rows) -> Rows:
         end, size = ends[len(layers) - 1 - i], jnp.asarray(sizes)[len(layers) - 1 - i]
@@ -116,12 +116,20 @@ def _relaxed(rows: Rows, inputs: Rows, bounds: LoopBounds, layers: tuple[UnitLay
         place = (0, n + first)
         weights = jax.lax.dynamic_slice(rows.mid, place, (len(rows.mid), width))
         left = jax.lax.dynamic_update_slice(rows.mid, jnp.where(known, weights, 0.0), place)
-        weights, y = jnp.where(known, 0.0, weights), inputs[unit]
-        below, above = (line.slope[unit] * y + line.offset[unit] for line in bounds.lines)
+        weights = jnp.where(known, 0.0, weights)
         over, under = jnp.maximum(weights, 0.0), jnp.minimum(weights, 0.0)
-        return Rows(left, rows.rad) + over @ above + under @ below
+        return Rows(left, rows.rad) + over @ above[unit] + under @ below[unit]
 
     return jax.lax.fori_loop(0, len(layers), replaced, rows)
+
+
+def _lines(line: Line, inputs: Rows, layers: tuple[UnitLayer, ...]) -> Rows:
+    """Lines of all units as rows, of the rows of their inputs."""
+    found, first = [], 0
+    for unit, _, count in layers:
+        here, first = slice(first, first + count), first + count
+        found.append(unit.combined(line.slope[here] * inputs[here]))
+    return Rows.joined(found) + line.offset
 
 
 def _upper(rows: Rows, X: AbstractSet, bounds: LoopBounds) -> Float[Array, " k"]:
@@ -147,9 +155,9 @@ def first_rows(loop: ClosedLoop) -> Rows | None:
     if loop.noise is not None:
         return None
 
-    def stop(_: AbstractUnit, y: Rows) -> Rows:
-        found.append(y)
-        return y
+    def stop(unit: AbstractUnit, *y: Rows) -> Rows:
+        found.append(Rows.joined(y))
+        return unit.combined(found[-1])
 
     loop.controller.propagate(columns(0, n, n + 1), stop)
     return found[0] if found else None

@@ -127,7 +127,7 @@ class Window(Replaceable):
         _, ball = X.parts
         supports = self.prune and (self.linear or ball is not None)
         around = X.closed_form(box) if supports else None
-        bounds = _bounds(loop, around, box, t, known_inputs(self.units, known))
+        bounds = _bounds(loop, around, box, t, known_inputs(loop.unit_inputs, known))
         places, taken = self._places(bounds)
         grown = self._padded(taken + 1)
         units, state, T = _extended(

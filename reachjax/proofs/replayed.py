@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.functions import Compiled
-from reachjax.loops.units import AbstractUnit, Mark
+from reachjax.loops.units import AbstractUnit, Bilinear, Mark
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.affine_steps import UnitForms
 from reachjax.programs.horizon import Horizon
@@ -41,14 +41,14 @@ class Replay(Replaceable):
 
     Attributes:
         initial: `(f, n_w)`, the columns of the initial state.
-        slopes: `(f, N, units)`.
+        slopes: `(f, N, inputs)`, of each input of a unit.
         offsets: `(f, N, units)`.
         multipliers: `(f, N, b, units)`, of the facts of each unit, of which there are `b`.
         of_set: `(f, r)`, those of the facets of the initial set.
     """
 
     initial: Float[Array | np.ndarray, "f n_w"]
-    slopes: Float[Array | np.ndarray, "f N units"]
+    slopes: Float[Array | np.ndarray, "f N inputs"]
     offsets: Float[Array | np.ndarray, "f N units"]
     multipliers: Float[Array | np.ndarray, "f N b units"]
     of_set: Float[Array | np.ndarray, "f r"]
@@ -69,14 +69,15 @@ class Replay(Replaceable):
             multipliers: of the facts.
             steps: `N`, those of the horizon and more.
         """
-        facets, units = len(columns), sum(len(layer.places) for layer in horizon.steps[0])
-        slopes, offsets = (np.zeros((facets, steps, units)) for _ in range(2))
+        first, shape = horizon.steps[0], (len(columns), steps)
+        slopes = np.zeros((*shape, sum(len(layer.lower) for layer in first)))
+        offsets = np.zeros((*shape, sum(len(layer.gap) for layer in first)))
         for step, layers in enumerate(horizon.steps):
             parts = [_lines(layer, columns) for layer in layers]
-            slopes[:, step], offsets[:, step] = (
-                np.concatenate([part[which] for part in parts] or [np.zeros((facets, 0))], axis=1)
-                for which in range(2)
-            )
+            if parts:
+                slopes[:, step], offsets[:, step] = (
+                    np.concatenate(each, axis=1) for each in zip(*parts, strict=True)
+                )
         of_units, of_set = (
             horizon.of_units(multipliers, steps),
             horizon.of_set(multipliers),
@@ -87,12 +88,17 @@ class Replay(Replaceable):
 
 def _lines(
     layer: UnitForms, columns: Float[np.ndarray, "f n"]
-) -> tuple[Float[np.ndarray, "f k"], Float[np.ndarray, "f k"]]:
+) -> tuple[Float[np.ndarray, "f inputs"], Float[np.ndarray, "f k"]]:
     """Slopes and offsets of units at these columns."""
     width, unit = layer.inputs.columns.shape[1], cast(Any, layer.unit)
     y = columns[:, :width] @ layer.inputs.columns.T + layer.inputs.rows[:, 0]
     switching = layer.places >= 0
     own = np.where(switching, columns[:, np.maximum(layer.places, 0)], 0.0)
+    if isinstance(unit, Bilinear):
+        width = layer.outputs.columns.shape[1]
+        z = columns[:, :width] @ layer.outputs.columns.T + layer.outputs.rows[:, 0]
+        slope = unit.derivative(y)
+        return slope, np.asarray(z - unit.combined(slope * y))
     z = layer.slope * y + layer.offset + layer.gap * own
     near = NEAR * (layer.upper - layer.lower)
     lines = unit.lines(y - near, y + near)
@@ -128,12 +134,15 @@ def replayed(
         def advance(carry, given):
             x, total = carry
             t, slope, offset, weights = given
-            done, facts = 0, jnp.zeros(())
+            done, seen, facts = 0, 0, jnp.zeros(())
 
-            def unit(unit: AbstractUnit, y: Array) -> Array:
-                nonlocal done, facts
-                here, done = slice(done, done + len(y)), done + len(y)
-                z = slope[here] * y + offset[here]
+            def unit(unit: AbstractUnit, *given: Array) -> Array:
+                nonlocal done, seen, facts
+                y = jnp.concatenate(given)
+                slopes, seen = slope[seen : seen + len(y)], seen + len(y)
+                sums = unit.combined(slopes * y)
+                here, done = slice(done, done + len(sums)), done + len(sums)
+                z = sums + offset[here]
                 blocks = unit.facts(y, z, y, y).blocks
                 sectors = (block.rows for block in blocks if block.mark is Mark.SECTOR)
                 for rows, weight in zip(sectors, weights, strict=False):

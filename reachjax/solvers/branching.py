@@ -71,7 +71,7 @@ def affine_leaf(forms: AffineForms, horizon: Horizon) -> Found:
     """
     start, facts = horizon.start, horizon.facts
     best = forms.ends(start)[1].argmin()
-    row = forms.widened(facts.columns.shape[1]).columns[best]
+    row = forms.padded(facts.columns.shape[1]).columns[best]
     columns = np.sign(row)
     if start.round:
         first = row[: start.spread.shape[1]]
@@ -109,7 +109,7 @@ class Tree:
         enough: Callable[[float, float], bool],
         budget: Budget = ENDLESS,
     ):
-        forms = forms.widened(horizon.facts.columns.shape[1])
+        forms = forms.padded(horizon.facts.columns.shape[1])
         self._rows, self._constants = np.asarray(forms.columns), np.asarray(forms.rows[:, 0])
         self._horizon, self._programs = horizon, programs
         self._attained, self._enough, self._budget = attained, enough, budget

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
-from reachjax.loops.units import SmoothUnit, UnboundedError
+from reachjax.loops.units import UnboundedError
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet, Box
@@ -52,7 +52,7 @@ class CellTask(NamedTuple):
     def by_programs(self) -> bool:
         """Whether linear programs may prove what forms do not."""
         layers = self.loop.unit_layers
-        return self.nodes > 0 and not all(isinstance(each.unit, SmoothUnit) for each in layers)
+        return self.nodes > 0 and not all(each.unit.curved for each in layers)
 
 
 class Unbounded(NamedTuple):
@@ -186,8 +186,8 @@ def _axis(ladder: Ladder, item: Requirement) -> int:
     n = len(horizon.start.center)
     size = np.zeros(n)
     for layer in horizon.steps[0] if horizon.steps else ():
-        bent = isinstance(layer.unit, SmoothUnit) | (layer.places >= 0)
-        size += abs(layer.inputs.columns[:, :n])[np.broadcast_to(bent, layer.places.shape)].sum(0)
+        bent = slice(None) if layer.unit.curved else layer.places >= 0
+        size += abs(layer.inputs.columns[:, :n])[bent].sum(axis=0)
     if not size.any():
         C = np.asarray(item.region.facets[0])
         size = abs(C @ horizon.start.spread).sum(axis=0)

@@ -202,7 +202,7 @@ class Ladder:
 
     def about(self, forms: AffineForms) -> HorizonFacts:
         """What branches are about that bound these forms."""
-        horizon, rows = self.horizon, forms.widened(self.width)
+        horizon, rows = self.horizon, forms.padded(self.width)
         return HorizonFacts(horizon.start, horizon.facts, horizon.zero, rows)
 
     @property
@@ -352,7 +352,7 @@ class Ladder:
             multipliers=multipliers,
             weights=np.asarray(block_diag(*(each.weights for each in found))),
         )
-        about = self.about(joined([forms.widened(width) for forms in target.forms]))
+        about = self.about(joined([forms.padded(width) for forms in target.forms]))
         each = leaf_bounds(about, leaves)
         uppers = [forms.ends(horizon.start)[1].min() for forms in target.forms]
         mine = (np.flatnonzero(owner == number) for number in range(count))

@@ -62,7 +62,7 @@ def test_one_rectifier_is_enough():
 def test_a_learned_slope_has_a_derivative():
     net = rj.Network(Partial(lambda s, x: jax.nn.leaky_relu(x, s), 0.3), 2, 2)
     x = jnp.array([-1.0, 2.0])
-    slope = jax.grad(lambda net: net.propagate(x, lambda unit, y: unit(y)).sum())(net)
+    slope = jax.grad(lambda net: net.propagate(x, lambda unit, *y: unit(*y)).sum())(net)
     np.testing.assert_allclose(jax.tree.leaves(slope), [-1.0])
 
 

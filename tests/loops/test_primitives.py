@@ -114,7 +114,7 @@ def test_tight_bounds_of_what_is_never_negative():
 def test_a_product_of_numbers_far_apart_is_their_product():
     net = jax.device_get(network(lambda x: x[:1] * x[1:]))
     x = np.array([2.81153617e08, 3.01778787e-08])
-    assert net.propagate(x, lambda unit, y: unit(y))[0] == x[0] * x[1]
+    assert net.propagate(x, lambda unit, *y: unit(*y))[0] == x[0] * x[1]
 
 
 def dropping(x):

@@ -76,9 +76,11 @@ def test_every_kind_of_number_has_the_values_of_the_function(traced):
     x = points()
     expected = jax.vmap(function)(x)
     np.testing.assert_allclose(jax.vmap(net)(x), expected, atol=1e-15)
-    seen = jax.vmap(lambda x: net.propagate(x, lambda unit, y: unit(y)))(x)
+    seen = jax.vmap(lambda x: net.propagate(x, lambda unit, *y: unit(*y)))(x)
     np.testing.assert_allclose(seen, expected, atol=1e-14)
-    on_host = jax.device_get(net).propagate(Batch(x), lambda unit, y: Batch(unit(y.values)))
+    on_host = jax.device_get(net).propagate(
+        Batch(x), lambda unit, *y: Batch(unit(*(each.values for each in y)))
+    )
     assert isinstance(on_host.values, np.ndarray)
     np.testing.assert_allclose(
         np.broadcast_to(on_host.values, expected.shape), expected, atol=1e-14
@@ -90,7 +92,8 @@ def test_intervals_hold_the_values(traced):
     function, net = traced
     middle, radius = np.array([0.2, -0.3]), np.array([0.3, 0.2])
 
-    def unit(unit, y):
+    def unit(unit, *given):
+        y = Ball.joined(given)
         return Ball.between(*unit.interval(y.lower, y.upper))
 
     found = net.propagate(Ball(jnp.asarray(middle), jnp.asarray(radius)), unit)
@@ -139,7 +142,7 @@ def test_a_bend_with_traced_parameters_is_one_of_a_rectifier():
     )
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.ones((2, 3))), net)
     assert [(layer.unit, layer.size) for layer in loop.unit_layers] == [(ReLU(), 3)]
-    jax.grad(lambda net: net.propagate(jnp.ones(2), lambda unit, y: unit(y)).sum())(net)
+    jax.grad(lambda net: net.propagate(jnp.ones(2), lambda unit, *y: unit(*y)).sum())(net)
 
 
 def branching(x):
@@ -207,7 +210,7 @@ def test_a_plant_is_a_function_of_state_and_input():
     plant = rj.NonlinearPlant(lambda x, u: x + u[0] * jnp.sin(x), states=2, inputs=1)
     x, u = jnp.array([0.3, -0.4]), jnp.array([0.5])
     np.testing.assert_allclose(plant.propagate(x, u), x + 0.5 * jnp.sin(x))
-    seen = plant.propagate(x, u, 0, lambda unit, y: unit(y))
+    seen = plant.propagate(x, u, 0, lambda unit, *y: unit(*y))
     np.testing.assert_allclose(seen, x + 0.5 * jnp.sin(x), atol=1e-15)
     assert (plant.states, plant.inputs, plant.steps) == (2, 1, None)
     assert repr(plant) == "NonlinearPlant(states=2, inputs=1)"
@@ -227,6 +230,6 @@ def test_functions_are_traced_when_they_are_given_and_differ_in_parameters():
     nets = [rj.Network(jax.tree_util.Partial(function, p), 2, 2) for p in (1.0, 2.0, 3.0)]
     before = len(calls)
     for net in nets:
-        net.propagate(np.ones(2), lambda unit, y: unit(y))
+        net.propagate(np.ones(2), lambda unit, *y: unit(*y))
     assert len(calls) == before == 3
     assert nets[1].replace().propagate(np.ones(2), evaluate)[0] == 2.0

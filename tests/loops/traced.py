@@ -17,8 +17,9 @@ def network(function, inputs=2):
     return rj.Network(function, inputs, shape[0])
 
 
-def by_interval(unit, y):
+def by_interval(unit, *given):
     """Units by the intervals of their inputs, which are rounded."""
+    y = Ball.joined(given)
     slack = 1e-14 * (abs(y.mid) + y.rad)
     return Ball.between(*unit.interval(y.lower - slack, y.upper + slack))
 
@@ -40,9 +41,11 @@ def assert_sound(function, lower=LOWER, upper=UPPER):
     net, x = network(function, len(lower)), points(lower, upper)
     expected = np.asarray(jax.vmap(function)(x))
     np.testing.assert_allclose(jax.vmap(net)(x), expected, rtol=1e-13, atol=1e-14)
-    steps = jax.vmap(lambda x: net.propagate(x, lambda unit, y: unit(y)))(x)
+    steps = jax.vmap(lambda x: net.propagate(x, lambda unit, *y: unit(*y)))(x)
     np.testing.assert_allclose(steps, expected, rtol=1e-12, atol=1e-13)
-    at_once = jax.device_get(net).propagate(Batch(x), lambda unit, y: Batch(unit(y.values)))
+    at_once = jax.device_get(net).propagate(
+        Batch(x), lambda unit, *y: Batch(unit(*(each.values for each in y)))
+    )
     found = np.broadcast_to(at_once.values, expected.shape)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13)
     low, high = interval(net, lower, upper)

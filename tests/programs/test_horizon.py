@@ -64,9 +64,9 @@ def inputs_of_units(loop, X0, states, start):
     """Inputs `(c, units)` of each layer of each step, by the loop itself."""
     on_the_way = []
 
-    def unit(unit, y):
-        on_the_way.append(np.asarray(y))
-        return unit(y)
+    def unit(unit, *y):
+        on_the_way.append(np.concatenate(y))
+        return unit(*y)
 
     loop, *_ = on_host(loop, X0)
     for state in states:

@@ -219,7 +219,7 @@ def nothing_attained(columns):
 def bound_by(horizon, forms, leaves):
     """What the leaves prove of the least of the forms."""
     width = horizon.facts.columns.shape[1]
-    about = HorizonFacts(horizon.start, horizon.facts, horizon.zero, forms.widened(width))
+    about = HorizonFacts(horizon.start, horizon.facts, horizon.zero, forms.padded(width))
     owner = np.zeros(len(leaves.phases), dtype=int)
     branches = Branches(owner, leaves.phases, leaves.multipliers, leaves.weights)
     (found,) = bounds_of(branches, leaf_bounds(about, branches), 1)
@@ -427,7 +427,7 @@ def test_multipliers_bound_what_is_attained(case):
         assert multipliers is not None
         facts = horizon.facts.rows[:, 0] + horizon.facts.columns @ at
         assert multipliers @ facts == pytest.approx(0.0, abs=1e-6)
-        weighed = row.widened(horizon.facts.columns.shape[1]).columns[0]
+        weighed = row.padded(horizon.facts.columns.shape[1]).columns[0]
         weighed = weighed + multipliers @ horizon.facts.columns
         bound = row.rows[0, 0] + multipliers @ horizon.facts.rows[:, 0] + weighed @ at
         assert bound == pytest.approx(value, abs=1e-6)

@@ -40,8 +40,8 @@ def basis_points(loop, x):
     def of(x):
         outputs = []
 
-        def unit(unit, y):
-            outputs.append(unit(y))
+        def unit(unit, *y):
+            outputs.append(unit(*y))
             return outputs[-1]
 
         loop.step(x, 0, unit)
@@ -89,7 +89,7 @@ def test_the_units_of_a_loop_are_those_that_its_forward_pass_meets(options):
     assert loop.units == 7 * columns + 4
     assert {type(layer.unit) for layer in loop.unit_layers[-2:]} == {rj.ReLU}
     seen = []
-    loop.step(jnp.zeros(3), 0, lambda unit, y: seen.append((unit, len(y))) or unit(y))
+    loop.step(jnp.zeros(3), 0, lambda unit, y: seen.append((unit, len(y), len(y))) or unit(y))
     assert list(loop.unit_layers) == seen
 
 

@@ -30,16 +30,16 @@ from reachjax.loops.flows.taylor_models import (
     rebuilt,
     settled_number,
     straight,
-    widened,
     zeros,
 )
-from reachjax.loops.recording import Recorder, product_of
+from reachjax.loops.recording import Recorder
 from reachjax.loops.units import (
     ISRU,
     AbstractUnit,
     Asin,
     Asinh,
     Atan,
+    Bilinear,
     Cos,
     Erf,
     Exp,
@@ -56,6 +56,7 @@ from reachjax.loops.units import (
     evaluate,
 )
 from reachjax.loops.values import UnsupportedError, Value
+from reachjax.numerics.numbers import AbstractNumber, size, widened
 from reachjax.numerics.rounding import UNIT, Ball, namespace
 
 
@@ -95,12 +96,13 @@ class Tape:
         self.slopes: dict[int, int] = {}
         self._units: dict[tuple[AbstractUnit, int], int] = {}
         found = {value.place: value.place for value in recorder.inputs}
-        for place in _needed(recorder, wanted):
+        for place in recorder.between(wanted):
             step = recorder.steps[place]
-            assert step is not None  # inputs are there
-            factors = product_of(step)
-            if factors is not None:
-                found[place] = self.product(*(found[parent] for parent in factors))
+            if step is None:
+                continue
+            if isinstance(step.unit, Bilinear):
+                factors = (found[parent] for parent in step.parents)
+                found[place] = self.product(*factors, terms=step.unit.terms)
             elif step.unit is not None:
                 (parent,) = step.parents
                 found[place] = self.unit(step.unit, found[parent], step.apply)
@@ -132,9 +134,14 @@ class Tape:
         node = Node(parents, lambda unit, *given: apply(*given))
         return self._added(node, size or self.sizes[parents[0]])
 
-    def product(self, one: int, other: int) -> int:
-        """A product."""
-        return self._added(Node((one, other)), self.sizes[one])
+    def product(self, one: int, other: int, terms: int = 1) -> int:
+        """A product, or the sum of so many, which stand one behind the other."""
+        found = self._added(Node((one, other)), self.sizes[one])
+        if terms == 1:
+            return found
+        size = self.sizes[one] // terms
+        matrix = np.kron(np.ones(terms), np.eye(size))
+        return self.affine(lambda number: matrix @ number, found, size=size)
 
     def _wave(self, y: int) -> tuple[int, int]:
         """The sine and the cosine, by one layer: the cosine is the sine a quarter turn on."""
@@ -183,18 +190,6 @@ class Tape:
         elif not unit.separable or unit.free:
             raise UnsupportedError(f"{type(unit).__name__} has no derivatives")
         return z
-
-
-def _needed(recorder: Recorder, wanted: Value) -> list[int]:
-    """Places of the steps that a value rests on, factors of products in place of their squares."""
-    needed, todo = set(), [wanted.place]
-    while todo:
-        place = todo.pop()
-        step = recorder.steps[place]
-        if place not in needed and step is not None:
-            needed.add(place)
-            todo += product_of(step) or step.parents
-    return sorted(needed)
 
 
 def _less_square(tape: Tape, one: float, y: int) -> int:
@@ -254,11 +249,8 @@ SLOPES: dict[type[AbstractUnit], Callable[[Tape, int, int], int]] = {
 """Derivatives of units, from their inputs and values."""
 
 
-class Change:
+class Change(AbstractNumber):
     """A coefficient after the first: affine functions add nothing constant to it."""
-
-    # numpy arrays on the left leave `array @ change` and `array - change` to this class
-    __array_ufunc__ = None
 
     def __init__(self, number: Any):
         self.number = number
@@ -266,24 +258,21 @@ class Change:
     def __rmatmul__(self, matrix: Any) -> Change:
         return Change(matrix @ self.number)
 
-    def __mul__(self, factor: Any) -> Change:
-        return Change(factor * self.number)
+    def __len__(self) -> int:
+        return size(self.number)
 
-    __rmul__ = __mul__
+    def __rmul__(self, factor: Any) -> Change:
+        return Change(factor * self.number)
 
     def __add__(self, other: Any) -> Change:
         return Change(self.number + other.number) if isinstance(other, Change) else self
 
-    __radd__ = __add__
-
     def __neg__(self) -> Change:
         return Change(-1.0 * self.number)
 
-    def __sub__(self, other: Any) -> Change:
-        return Change(self.number - other.number) if isinstance(other, Change) else self
-
-    def __rsub__(self, other: Any) -> Change:
-        return -self
+    def widened(self, by: Any) -> Change:
+        """The coefficient itself: what constants are off by does not vary."""
+        return self
 
     def __getitem__(self, index: Any) -> Change:
         return Change(self.number[index])
@@ -370,12 +359,8 @@ def _convolved(ones: Any, others: Any, k: Any, slope: bool) -> Any:
     if len(pairs) == 1:
         return product(*pairs[0])
     weights = np.arange(1, k + 1) / k if slope else np.ones(len(pairs))
-    matrix = np.kron(weights, np.eye(_size(pairs[0][0])))
+    matrix = np.kron(weights, np.eye(size(pairs[0][0])))
     return matrix @ product(*(joined([*part]) for part in zip(*pairs, strict=True)))
-
-
-def _size(number: Any) -> int:
-    return len(number.mid) if isinstance(number, Ball) else len(number)
 
 
 def _slope(unit: AbstractUnit, y: Any) -> Any:

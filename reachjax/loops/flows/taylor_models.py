@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops.units import AbstractUnit, SmoothUnit, UnboundedError
+from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.rounding import TINY, Ball, constant, gamma, namespace, settled
 
 SQUARE = 0.5
@@ -56,7 +57,7 @@ class Symbols(NamedTuple):
         return self.initial + len(self.pairs[0])
 
 
-class TaylorModels:
+class TaylorModels(AbstractNumber):
     """A vector of such numbers.
 
     Attributes:
@@ -64,9 +65,6 @@ class TaylorModels:
         radii: `(k,)`, by how much numbers may be off, rounding included.
         symbols: what they are of.
     """
-
-    # numpy arrays on the left leave `array @ models` and `array - models` to this class
-    __array_ufunc__ = None
 
     def __init__(self, rows: Any, radii: Any, symbols: Symbols):
         self.rows, self.radii, self.symbols = rows, radii, symbols
@@ -147,24 +145,14 @@ class TaylorModels:
         rows = xp.concatenate([first, self.rows[:, 1:]], axis=1)
         return self._with(rows, self.radii, gamma(1) * abs(first[:, 0]))
 
-    __radd__ = __add__
-
     def __neg__(self) -> TaylorModels:
         return TaylorModels(-self.rows, self.radii, self.symbols)
 
-    def __sub__(self, other: Any) -> TaylorModels:
-        return self + (-other)
-
-    def __rsub__(self, other: Any) -> TaylorModels:
-        return (-self) + other
-
-    def __mul__(self, factor: Any) -> TaylorModels:
+    def __rmul__(self, factor: Any) -> TaylorModels:
         """Each number times an exact one, or all times one."""
         factor = namespace(self.rows).broadcast_to(factor, (len(self.rows),))
         size = gamma(1) * abs(factor) * self._size + TINY
         return self._with(factor[:, None] * self.rows, abs(factor) * self.radii, size)
-
-    __rmul__ = __mul__
 
     def times(self, other: TaylorModels) -> TaylorModels:
         """Products, entry by entry, without what is of degree three."""
@@ -278,13 +266,6 @@ def joined(numbers: list[Any]) -> Any:
 def product(one: Any, other: Any) -> Any:
     """Products, entry by entry, of numbers of one kind."""
     return one.times(other) if hasattr(one, "times") else one * other
-
-
-def widened(number: Any, by: Any) -> Any:
-    """A number up to errors of so much more; plain numbers have none."""
-    if isinstance(number, Ball):
-        return Ball(number.mid, (number.rad + by) * (1 + gamma(2)))
-    return number.widened(by) if isinstance(number, TaylorModels) else number
 
 
 def zeros(number: Any) -> Any:

@@ -11,7 +11,7 @@ What a recording is made of rests on its steps and on constants, never on number
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,33 +74,6 @@ def _entries(value: Value) -> Entries:
     return Entries(*value.source) if value.source else Entries(value, np.arange(value.size))
 
 
-def _levels(value: Value) -> Iterator[tuple[Value, list[Term]]]:
-    """A value, and each that it is a multiple of, with the factors and divisors in between."""
-    found: list[Term] = []
-    yield value, found
-    while value.terms is not None and len(value.terms) == 1 and _is_nothing(value.offset):
-        found = [*found, *value.terms]
-        value = found[-1].value
-        yield value, found
-
-
-def _is_nothing(offset: Any) -> bool:
-    """Whether an offset is zero, whatever the parameters are."""
-    return is_constant(offset) and not np.any(offset)
-
-
-def _scaled(recorder: Recorder, value: Value, terms: Sequence[Term]) -> Value:
-    """A value with these factors and divisors again."""
-    for _, factor, divisor in reversed(terms):
-        plain = np.ndim(divisor) == 0
-        value = (
-            recorder.scaled(value, np.reshape(factor, value.shape) if np.ndim(factor) else factor)
-            if plain
-            else recorder.divided(value, divisor.reshape(value.shape))
-        )
-    return value
-
-
 def _inputs(recorder: Recorder, entries: Entries, kind: type) -> Entries | None:
     """The inputs of the units that these entries are values of; None if these are of others."""
     step = recorder.steps[entries.value.place]
@@ -113,19 +86,19 @@ def _inputs(recorder: Recorder, entries: Entries, kind: type) -> Entries | None:
 @_unless_inexact
 def over_norm(recorder: Recorder, one: Value, other: Value) -> Value | None:
     """The product of a number and the inverse of its norm with others; None if it is none."""
-    for inverse, scales in _levels(other):
+    for inverse, scales in other.levels():
         root = _inputs(recorder, _entries(inverse), Reciprocal)
         inner = root and _inputs(recorder, root, Sqrt)
         if not inner or one.size * inner.value.size > LARGEST**2:
             continue
         squares = Combination.of(recorder, inner.value)[inner.numbers]
-        for number, more in _levels(one):
+        for number, more in one.levels():
             found = _without_own(recorder, squares, _entries(number))
             if found is not None:
                 number = recorder.reshaped(number, one.shape)
                 inverse = recorder.reshaped(inverse, one.shape)
                 unit = _normalised(recorder, number, inverse, *found)
-                return _scaled(recorder, unit, [*more, *scales])
+                return recorder.rescaled(unit, [*more, *scales])
     return None
 
 
@@ -198,7 +171,7 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
         is_one = is_constant(one) and bool(np.all(one == 1))
         mine = Combination({}, np.zeros(other.size)) if is_one else None
     else:
-        for number, factors in _levels(one):
+        for number, factors in one.levels():
             own = _inputs(recorder, _entries(number), Exp)
             if own is not None:
                 mine, more = Combination.of(recorder, own.value)[own.numbers], factors
@@ -222,7 +195,7 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
         return None
     inputs = recorder.scaled(recorder.added(difference, logarithm, -1), np.array(0.5))
     half = recorder.scaled(recorder.unit(Tanh(), inputs), np.array(0.5))
-    return _scaled(recorder, recorder.shifted(half, np.array(0.5)), more)
+    return recorder.rescaled(recorder.shifted(half, np.array(0.5)), more)
 
 
 @_unless_inexact

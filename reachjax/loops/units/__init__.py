@@ -12,6 +12,7 @@ from reachjax.loops.units.base import (
     Product,
     evaluate,
 )
+from reachjax.loops.units.bilinear import Bilinear
 from reachjax.loops.units.clip import clipped
 from reachjax.loops.units.disturbance import Constraint, Disturbance
 from reachjax.loops.units.exponential import Exp, Log, XLogX
@@ -34,6 +35,7 @@ __all__ = [
     "Asinh",
     "AtUnit",
     "Atan",
+    "Bilinear",
     "Block",
     "Constraint",
     "Cos",

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
+from reachjax.numerics.numbers import summed
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.numerics.rounding import gamma, namespace
 
@@ -84,7 +85,10 @@ class Facts(Replaceable):
 
 
 class Line(NamedTuple):
-    """Affine functions `slope y + offset` `(k,)`, one for each unit."""
+    """Affine functions `slope y + offset` `(k,)`, one for each unit.
+
+    Of units of several inputs there is a slope for each of these, in the order of the inputs.
+    """
 
     slope: Array
     offset: Array
@@ -100,7 +104,10 @@ class Lines(NamedTuple):
     def affine(self) -> Bool[Array, " k"]:
         """Where the unit is affine, so that it need not stay in a basis."""
         (slope, offset), above = self.below, self.above
-        return (slope == above.slope) & (offset == above.offset)
+        same = slope == above.slope
+        if same.shape != offset.shape:  # one row for each input of a unit
+            same = same.reshape(-1, offset.shape[-1]).all(axis=0)
+        return same & (offset == above.offset)
 
 
 class AbstractActivation(abc.ABC):
@@ -121,8 +128,13 @@ class AbstractUnit(AbstractActivation):
     A layer whose values depend on all of its inputs is no row of such relations: it is not
     `separable`, is given whole, and sees to rounded ends of its inputs by itself.
 
+    Units of several inputs are given as many vectors. Where these are one vector, as interval,
+    lines and facts have them, they stand one behind the other.
+
     Attributes:
         separable: whether each value is of its own input alone.
+        inputs: how many each unit has.
+        curved: whether forms hold it by a model of degree two, and say all there is to know of it.
         nonexpansive: whether `|f(y) - f(y')| <= |y - y'|`. Where inputs are rounded, `loop_bounds`
             adds that to the values of such units, and widens the inputs of others.
         free: whether any value between its two lines, which are parallel, is possible, whatever
@@ -132,6 +144,8 @@ class AbstractUnit(AbstractActivation):
     """
 
     separable: ClassVar[bool] = True
+    curved: ClassVar[bool] = False
+    inputs: ClassVar[int] = 1
     nonexpansive: ClassVar[bool] = True
     free: ClassVar[bool] = False
     stated: ClassVar[bool] = False
@@ -143,8 +157,12 @@ class AbstractUnit(AbstractActivation):
         return self
 
     @abc.abstractmethod
-    def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+    def __call__(self, *y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """The value `f(y)`."""
+
+    def combined(self, y: Any) -> Any:
+        """What the inputs of each unit add up to, for any kind of number: of one, itself."""
+        return summed(y, self.inputs)
 
     @abc.abstractmethod
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
@@ -165,7 +183,7 @@ class AbstractUnit(AbstractActivation):
         they come from the two lines; a unit that knows where it bends can do better.
 
         Args:
-            slope: `(k,)`, finite.
+            slope: `(k,)`, finite; of several inputs one for each.
             lower: `(k,)`.
             upper: `(k,)`.
         """
@@ -174,9 +192,12 @@ class AbstractUnit(AbstractActivation):
         for extreme, (its, offset) in zip(
             (xp.minimum, xp.maximum), self.lines(lower, upper), strict=True
         ):
-            end = extreme((its - slope) * lower, (its - slope) * upper) + offset
-            rounding = gamma(4) * (abs(its - slope) * size + abs(end))
-            ends.append((end, xp.where(its == slope, 0.0, rounding)))
+            parts = extreme((its - slope) * lower, (its - slope) * upper)
+            end = self.combined(parts) + offset
+            error = gamma(2 + 2 * self.inputs)
+            rounding = error * (self.combined(abs(its - slope) * size) + abs(end))
+            other = self.combined(xp.where(its == slope, 0.0, 1.0))
+            ends.append((end, xp.where(other == 0, 0.0, rounding)))
         (low, under), (high, over) = ends
         return low - under, high + over
 
@@ -196,10 +217,10 @@ class AbstractUnit(AbstractActivation):
         return unit(self, y)
 
 
-AtUnit = Callable[[AbstractUnit, Any], Any]
-"""What is done at a layer of units: `(unit, inputs) -> values`."""
+AtUnit = Callable[..., Any]
+"""What is done at a layer of units: `(unit, *inputs) -> values`."""
 
 
-def evaluate(unit: AbstractUnit, y: Float[Array, " k"]) -> Float[Array, " k"]:
+def evaluate(unit: AbstractUnit, *y: Float[Array, " k"]) -> Float[Array, " k"]:
     """Apply a unit to numbers: what a loop does with its units when it is simulated."""
-    return unit(y)
+    return unit(*y)

@@ -148,6 +148,7 @@ class SmoothUnit(AbstractUnit):
     most: float = dataclasses.field(default=math.inf, repr=False, kw_only=True)
     origin: Origin | None = dataclasses.field(default=None, repr=False, kw_only=True)
 
+    curved = True
     image: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
     flushed: ClassVar[float] = 1024 * TINY
     rises: ClassVar[bool] = False

@@ -1,0 +1,153 @@
+"""Products of two numbers, and sums of such products: units of two inputs.
+
+On a box, with middles `c` and half widths `r` of both factors,
+
+    a b  =  c_b a + c_a b - c_a c_b  +  (a - c_a) (b - c_b),    |(a - c_a) (b - c_b)| <= r_a r_b,
+
+and the four products of distances from ends are the facts of McCormick (Computability of global
+solutions to factorable nonconvex programs, Mathematical Programming 1976), such as
+
+    (a - l_a) (b - l_b) = a b - l_b a - l_a b + l_a l_b >= 0.
+
+Nothing here changes if one factor is scaled up by what the other one is scaled down.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import operator
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark, Product
+from reachjax.numerics.numbers import summed
+from reachjax.numerics.rounding import TINY, constant, gamma, larger, namespace, smaller
+
+CORNERS = ("least, least", "most, most"), ("least, most", "most, least")
+"""Names of facts: those that bound products from below, and from above."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Bilinear(AbstractUnit):
+    """`z_i = sum_j a_ij b_ij`, of two vectors of factors.
+
+    Args:
+        terms: how many products each value is a sum of. Of `k` values the factors of their first
+            products come first, `k` of them, then those of their second products, and so on.
+
+    Example:
+        >>> import numpy as np
+        >>> Bilinear(2)(np.array([1.0, 2.0]), np.array([3.0, 5.0])).tolist()
+        [13.0]
+        >>> lower, upper = np.array([-1.0, 2.0]), np.array([1.0, 3.0])
+        >>> [end.round(3).tolist() for end in Bilinear().interval(lower, upper)]
+        [[-3.0], [3.0]]
+    """
+
+    terms: int = 1
+
+    separable = False
+    curved = True
+    nonexpansive = False
+    advice = "keep its factors bounded"
+
+    def __call__(self, *y: Any) -> Any:
+        """The value, for any kind of number that multiplies two of its own."""
+        one, other = y
+        return summed(one * other, self.terms)
+
+    @property
+    def inputs(self) -> int:  # type: ignore[override]
+        """How many factors each value is made of."""
+        return 2 * self.terms
+
+    def halves(self, y: Any) -> tuple[Any, Any]:
+        """The two vectors of factors, of one vector of both."""
+        half = y.shape[-1] // 2
+        return y[..., :half], y[..., half:]
+
+    def derivative(self, y: Float[Array, "*c k"]) -> Float[Array, "*c k"]:
+        """The derivative by each factor, which is the other one."""
+        one, other = self.halves(y)
+        return namespace(y).concatenate([other, one], axis=-1)
+
+    @np.errstate(all="ignore")
+    def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """The least and the largest product of ends."""
+        xp = namespace(lower, upper)
+        (low, least), (high, most) = self.halves(lower), self.halves(upper)
+        corners = xp.stack([low * least, low * most, high * least, high * most])
+        ends = functools.reduce(smaller, corners), functools.reduce(larger, corners)
+        unknown = functools.reduce(operator.or_, xp.isnan(corners))
+        rounded = self._rounded(abs(corners).max(axis=0), (low, high), (least, most))
+        error = constant(xp.where(unknown, math.inf, rounded))
+        below, above = (summed(xp.where(unknown, 0.0, end), self.terms) for end in ends)
+        error = summed(error, self.terms)
+        return below - error, above + error
+
+    @np.errstate(all="ignore")
+    def lines(self, lower: Array, upper: Array) -> Lines:
+        """Two planes of the slopes in the middle: never the same.
+
+        Where bounds of a factor are not finite, they are infinitely far from each other.
+        """
+        slope, offset, gap = self.plane(lower, upper)
+        error = gamma(self.terms + 4) * constant(abs(offset) + gap) + TINY
+        return Lines(Line(slope, offset - gap - error), Line(slope, offset + gap + error))
+
+    @np.errstate(all="ignore")
+    def plane(self, lower: Array, upper: Array) -> tuple[Array, Array, Array]:
+        """Slopes, offsets and gaps: values are as far from the planes as gaps say, at most.
+
+        Offsets are those of these slopes but for a few roundings, `terms + 2` at most, which gaps
+        leave out, as `lines` does not.
+        """
+        xp = namespace(lower, upper)
+        known = (abs(lower) < math.inf) & (abs(upper) < math.inf)
+        lower, upper = (xp.where(known, end, 0.0) for end in (lower, upper))
+        middle = lower / 2 + upper / 2
+        radius = larger(upper - middle, middle - lower) * (1 + gamma(2))
+        radius = xp.where(known, xp.where(radius > 0, radius + TINY, radius), math.inf)
+        (one, other), (near, far) = self.halves(middle), self.halves(radius)
+        fixed = (near == 0) | (far == 0)
+        products = xp.where(fixed, 0.0, xp.where(fixed, 0.0, near) * far * (1 + gamma(2)) + TINY)
+        products = xp.where((near < math.inf) & (far < math.inf), products, math.inf)
+        gap = summed(products, self.terms) * (1 + gamma(self.terms))
+        known = (gap < math.inf) & (abs(summed(one * other, self.terms)) < math.inf)
+        offset = xp.where(known, -summed(one * other, self.terms), 0.0)
+        whole = xp.concatenate([known] * (2 * self.terms))
+        slope = xp.where(whole, xp.concatenate([other, one]), 0.0)
+        return slope, offset, xp.where(known, gap, math.inf)
+
+    @np.errstate(all="ignore")
+    def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:
+        """Products of distances of the factors from their ends are not negative."""
+        xp, half = namespace(lower, upper), lower.shape[-1] // 2
+        one, other = y[:half], y[half:]
+        known = (abs(lower) < math.inf) & (abs(upper) < math.inf)
+        known = summed(xp.where(known, 0.0, 1.0), 2 * self.terms) == 0
+        whole = xp.concatenate([known] * self.terms)
+        (low, least), (high, most) = self.halves(lower), self.halves(upper)
+        blocks = []
+        pairs = ((low, least), (high, most)), ((low, most), (high, least))
+        for names, corners, sign in zip(CORNERS, pairs, (1.0, -1.0), strict=True):
+            for name, (a, b) in zip(names, corners, strict=True):
+                a, b = (xp.where(whole, end, 0.0) for end in (a, b))
+                plane = summed(b * one + a * other, self.terms)
+                spare = gamma(self.terms + 4) * summed(abs(a * b), self.terms)
+                spare = xp.where(known, spare + TINY * self.terms, math.inf)
+                row = sign * (z - plane) + (sign * summed(a * b, self.terms) + spare)
+                blocks.append(Block(row, name, Mark.BOUND))
+        below, above = CORNERS
+        products = (Product(left, right, Mark.BOUND) for left in below for right in above)
+        return Facts(tuple(blocks), (), tuple(products))
+
+    def _rounded(self, size: Any, one: Any, other: Any) -> Any:
+        """What products of ends of this size are off by, and sums of them."""
+        xp = namespace(size)
+        some = [xp.where((low == 0) & (high == 0), 0.0, 1.0) for low, high in (one, other)]
+        return gamma(self.terms) * size + TINY * some[0] * some[1]

@@ -183,6 +183,7 @@ class _Decisions(AbstractSearch):
     def _halve(self, node: Node, axis: int) -> None:
         halves = self._cells.halved(node, axis)
         self._cells.replace(node, halves, axis)
+        node.found = None
         self._open.extend(halves)
 
     def _hopeless(self, node: Node) -> int | None:

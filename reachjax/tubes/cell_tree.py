@@ -108,13 +108,15 @@ class CellTree:
         most: how many there may be; None for any number.
 
     Attributes:
+        roots: as given.
+        most: as given.
         count: how many there are.
         sides: `(n,)`, of the box around the set, by which those of cells are measured; 1 where it
             is flat.
     """
 
     def __init__(self, X: AbstractSet, roots: Sequence[Node], most: int | None = None):
-        self._X, self.roots, self._most = X, roots, most
+        self._X, self.roots, self.most = X, roots, most
         self.count = len(roots)
         box = X if isinstance(X, Box) else boxed(X, "X0")
         sides = np.asarray(box.upper) - np.asarray(box.lower)
@@ -135,7 +137,7 @@ class CellTree:
         """
         if isinstance(cells, np.ndarray | jax.Array) and cells.ndim < 2:
             cells = cells.tolist()
-        if isinstance(cells, int | np.integer) and not isinstance(cells, bool):
+        if isinstance(cells, int | np.integer):
             return cls.whole(X, whole_number("cells", cells, 1))
         if isinstance(cells, Sequence) and not isinstance(cells, str):
             return cls(X, [Node.of(cell) for cell in grid(X, cells)])
@@ -152,7 +154,7 @@ class CellTree:
     @property
     def is_full(self) -> bool:
         """Whether there may be no more cells."""
-        return self._most is not None and self.count >= self._most
+        return self.most is not None and self.count >= self.most
 
     def longest(self, node: Node) -> int:
         """The coordinate along which a cell is longest, in parts of the set's sides."""
@@ -186,5 +188,4 @@ class CellTree:
         """Let halves stand in the place of a cell."""
         node.axis = axis
         node.halves = halves  # from here on they stand there
-        node.found = None
         self.count += len(halves) - 1

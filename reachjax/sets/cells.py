@@ -81,24 +81,14 @@ def grid_ends(
     return ends(index), ends(index + 1)
 
 
-def halves(X: AbstractSet, box: Box, scale: Float[np.ndarray, " n"]) -> list[Cell]:
-    """The parts of a set in a box on either side of the middle of its longest side.
-
-    Args:
-        X: the set.
-        box: the cell that is cut.
-        scale: the unit in which each coordinate is measured.
+def halves_along(X: AbstractSet, box: Box, axis: int) -> list[Cell]:
+    """The parts of a set in a box on either side of its middle along one coordinate.
 
     Example:
         >>> X = Box([0.0, 0.0], [1.0, 2.0])
-        >>> [cell.part.upper.tolist() for cell in halves(X, X, np.ones(2))]
+        >>> [cell.part.upper.tolist() for cell in halves_along(X, X, 1)]
         [[1.0, 1.0], [1.0, 2.0]]
     """
-    return halves_along(X, box, int(np.argmax(np.asarray(box.widths) / scale)))
-
-
-def halves_along(X: AbstractSet, box: Box, axis: int) -> list[Cell]:
-    """The parts of a set in a box on either side of its middle along one coordinate."""
     middle = box.center[axis]
     below = Box(box.lower, box.upper.at[axis].set(middle))
     above = Box(box.lower.at[axis].set(middle), box.upper)

@@ -49,7 +49,8 @@ class Budget:
     """
 
     def __init__(self, seconds: float = math.inf, work: float = math.inf):
-        self._end, self._purse = time.monotonic() + seconds, [work]
+        self._begun = time.monotonic()
+        self._end, self._purse = self._begun + seconds, [work]
         self._stopped = [False]
 
     @classmethod
@@ -75,12 +76,23 @@ class Budget:
 
     def __setstate__(self, state: tuple[float, list[float], list[bool]]) -> None:
         end, self._purse, self._stopped = state
-        self._end = time.monotonic() + end - time.time()
+        self._begun = time.monotonic()
+        self._end = self._begun + end - time.time()
 
     @property
     def left(self) -> float:
         """The seconds that are left; zero when the time is over."""
         return 0.0 if self.stopped else max(self._end - time.monotonic(), 0.0)
+
+    @property
+    def overrun(self) -> float:
+        """The seconds that have passed since the time was over; zero before."""
+        return max(time.monotonic() - self._end, 0.0)
+
+    @property
+    def elapsed(self) -> float:
+        """The seconds since the budget, or this share of one, began."""
+        return time.monotonic() - self._begun
 
     @property
     def late(self) -> bool:
@@ -128,8 +140,8 @@ class Budget:
         Work is spent from the same purse.
         """
         found = Budget()
-        now = time.monotonic()
-        found._end, found._purse = now + part * (self._end - now), self._purse
+        found._end = found._begun + part * (self._end - found._begun)
+        found._purse = self._purse
         found._stopped = self._stopped
         return found
 

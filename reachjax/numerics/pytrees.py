@@ -17,6 +17,9 @@ from reachjax.numerics.flags import made_lenient
 
 T = TypeVar("T")
 
+INNER = "reachjax.programs."
+"""The room whose objects are asked by thousands within a call that has opened its scope."""
+
 
 def static(**kwargs: Any) -> Any:
     """A field that is part of the tree's structure: hashable, and a new value compiles anew."""
@@ -70,12 +73,14 @@ def unchecked(cls: type[T], **values: Any) -> T:
 class Replaceable:
     """Copies with some fields changed, checked as a new object is.
 
-    Public methods of what inherits from it heed none of JAX's strict flags (`flags`).
+    Public methods of what inherits from it heed none of JAX's strict flags (`flags`), but for
+    forms and programs, which nobody holds who is not called by something public.
     """
 
     def __init_subclass__(cls, **given: Any):
         super().__init_subclass__(**given)
-        made_lenient(cls)
+        if not cls.__module__.startswith(INNER):
+            made_lenient(cls)
 
     def replace(self, **changes: Any) -> Self:
         """A copy in which the named fields are replaced."""

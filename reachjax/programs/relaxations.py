@@ -56,12 +56,10 @@ class AbstractRelaxation(abc.ABC):
     Attributes:
         linear_bounds: whether the pre-activation bounds are those of supports and linear
             relaxations, where they are better than those of intervals.
-        by_forms: whether there are no programs at all, and sets are bounded by affine forms.
     """
 
     remove_stable: bool
     linear_bounds: ClassVar[bool] = False
-    by_forms: ClassVar[bool] = False
 
     def __post_init__(self):
         for name in ("repeated", "remove_stable", "programs"):
@@ -181,7 +179,6 @@ class LinearBounds(AbstractRelaxation):
     remove_stable: bool = dataclasses.field(default=True, init=False, repr=False)
 
     linear_bounds: ClassVar[bool] = True
-    by_forms: ClassVar[bool] = True
 
     def groups(self, facts: FactLayout) -> Groups:
         """No products of facts."""

@@ -17,10 +17,11 @@ from reachjax.sets.cells import from_tree
 
 @pytree
 class CellCertificate(AbstractProof):
-    """Proof of the offsets of one step, `directions x[t] <= bounds`, by forms over cells of `X0`.
+    """Proof of the offsets of one step, `directions x[t] <= bounds`, over cells of `X0`.
 
     The cells are what halving the box around the initial set again and again leaves, so that they
-    cover it whatever they are; of each, forms are made of nothing but the loop.
+    cover it whatever they are. Of each, forms are made of nothing but the loop; what proves more of
+    some cells is kept.
 
     Attributes:
         loop: the closed loop.
@@ -30,6 +31,8 @@ class CellCertificate(AbstractProof):
             half with all of its own before the next; -1 where it is a cell.
         k: how many steps after the initial set.
         start: the time of the initial set.
+        proofs: for each cell what proves more than forms; None where nothing does, and none at all
+            if that is so of all.
     """
 
     loop: ClosedLoop
@@ -38,6 +41,7 @@ class CellCertificate(AbstractProof):
     axes: Int[Array | np.ndarray, " nodes"]
     k: int = static()
     start: int = static()
+    proofs: tuple[AbstractProof | None, ...] = ()
 
     def __repr__(self) -> str:
         return (
@@ -51,7 +55,7 @@ class CellCertificate(AbstractProof):
         return int(np.sum(np.asarray(self.axes) < 0))
 
     def recheck(self, axes: Int[np.ndarray, " nodes"] | None = None) -> Float[np.ndarray, " f"]:
-        """Prove the offsets anew, cell by cell, with these or other cells.
+        """Prove the offsets anew, cell by cell, or by forms over other cells.
 
         Infinite where numbers overflow.
 
@@ -72,8 +76,12 @@ class CellCertificate(AbstractProof):
         require_double_precision(certificate=floats_of(self))
         given = np.asarray(self.axes if axes is None else axes).tolist()
         directions = np.broadcast_to(self.directions, (self.k, *self.directions.shape))
+        cells, proofs = from_tree(jax.device_put(self.X0), given), self.proofs
+        if axes is not None or not proofs:
+            proofs = (None,) * len(cells)
         found = []
-        for cell in from_tree(jax.device_put(self.X0), given):
+        for cell, proof in zip(cells, proofs, strict=True):
             *_, last = unrolled(self.loop, cell.part, cell.box, directions, self.start)
-            found.append(np.where(np.isnan(last.offsets), np.inf, last.offsets))
+            bounds = np.where(np.isnan(last.offsets), np.inf, last.offsets)
+            found.append(bounds if proof is None else np.fmin(bounds, proof.recheck()))
         return np.max(found, axis=0)

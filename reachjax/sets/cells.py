@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from reachjax.numerics.checks import whole_number
 from reachjax.sets.base import AbstractSet
@@ -49,40 +49,46 @@ def grid(X: AbstractSet, counts: Sequence[int]) -> list[Cell]:
         >>> [cell.part.lower.tolist() for cell in grid(Box([0.0, 0.0], [1.0, 2.0]), (1, 2))]
         [[0.0, 0.0], [0.0, 1.0]]
     """
-    if len(counts) != X.dimension:
-        raise ValueError(
-            f"cells must be a number for each of {X.dimension} coordinates, but {counts} arrived"
-        )
-    box, ends = X.bounding_box(), []
-    for i, count in enumerate(counts):
-        parts = whole_number(f"cells[{i}]", count, 1) + 1
-        ends.append(np.linspace(box.lower[i], box.upper[i], parts))
-    boxes = []
-    for index in np.ndindex(*counts):
-        lower = [end[i] for end, i in zip(ends, index, strict=True)]
-        upper = [end[i + 1] for end, i in zip(ends, index, strict=True)]
-        boxes.append(Box(lower, upper))
-    return _reached(X, boxes)
+    lower, upper = grid_ends(X.bounding_box(), counts)
+    return _reached(X, [Box(*ends) for ends in zip(lower, upper, strict=True)])
 
 
-def halves(X: AbstractSet, box: Box, scale: Float[np.ndarray, " n"]) -> list[Cell]:
-    """The parts of a set in a box on either side of the middle of its longest side.
+def grid_ends(
+    box: Box, counts: Sequence[int]
+) -> tuple[Float[Array, "cells n"], Float[Array, "cells n"]]:
+    """Lower and upper corners of equal parts of a box, which move with it.
 
     Args:
-        X: the set.
-        box: the cell that is cut.
-        scale: the unit in which each coordinate is measured.
+        box: the box.
+        counts: how many parts each coordinate is cut into.
 
-    Example:
-        >>> X = Box([0.0, 0.0], [1.0, 2.0])
-        >>> [cell.part.upper.tolist() for cell in halves(X, X, np.ones(2))]
-        [[1.0, 1.0], [1.0, 2.0]]
+    Raises:
+        TypeError: a count is no whole number.
+        ValueError: there is not a positive number for each coordinate.
     """
-    return halves_along(X, box, int(np.argmax(np.asarray(box.widths) / scale)))
+    if not isinstance(counts, Sequence) or len(counts) != box.dimension:
+        raise ValueError(
+            f"cells must be a number for each of {box.dimension} coordinates, but {counts} arrived"
+        )
+    numbers = [whole_number(f"cells[{i}]", count, 1) for i, count in enumerate(counts)]
+    index = np.stack(np.meshgrid(*map(np.arange, numbers), indexing="ij"), axis=-1)
+    index, many = index.reshape(-1, len(numbers)), np.asarray(numbers)
+
+    def ends(index: np.ndarray) -> Float[Array, "cells n"]:
+        within = index * (box.widths / many) + box.lower
+        return jnp.where(index == many, box.upper, within)  # exactly, and so nothing is left out
+
+    return ends(index), ends(index + 1)
 
 
 def halves_along(X: AbstractSet, box: Box, axis: int) -> list[Cell]:
-    """The parts of a set in a box on either side of its middle along one coordinate."""
+    """The parts of a set in a box on either side of its middle along one coordinate.
+
+    Example:
+        >>> X = Box([0.0, 0.0], [1.0, 2.0])
+        >>> [cell.part.upper.tolist() for cell in halves_along(X, X, 1)]
+        [[1.0, 1.0], [1.0, 2.0]]
+    """
     middle = box.center[axis]
     below = Box(box.lower, box.upper.at[axis].set(middle))
     above = Box(box.lower.at[axis].set(middle), box.upper)

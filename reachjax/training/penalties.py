@@ -7,6 +7,7 @@ Two penalties on one tube need not solve for it twice: with `tube = reach(...)`,
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import singledispatch
 from typing import Any
 
 import jax
@@ -19,6 +20,8 @@ from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import unlogged
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds, LocalBounds
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
+from reachjax.sets.cells import grid_ends
+from reachjax.tubes.methods import AbstractMethod
 from reachjax.tubes.propagation import require_kinds
 from reachjax.tubes.reach import ReachTube, reach
 from reachjax.tubes.requirements import (
@@ -170,7 +173,9 @@ def _penalised(
 
     if cells is None:
         return of(X0)
-    lower, upper = _grid(X0, cells)
+    if not isinstance(X0, Box):
+        raise TypeError(f"cells are of an X0 of type Box, but {described(X0)} arrived")
+    lower, upper = grid_ends(X0, cells)
     if options["window"] is None:  # on the host, one by one
         each = [of(Box(*ends)) for ends in zip(lower, upper, strict=True)]
         return sum(each, start=jnp.zeros(())) / len(each)
@@ -184,33 +189,21 @@ def _completed(
     by_programs = not isinstance(template, Template) or "solver" in options or "window" in options
     relaxation = options.get("relaxation", LocalBounds() if by_programs else LinearBounds())
     of_numbers = is_concrete(jax.lax.stop_gradient((loop, X0, template)))
-    if isinstance(relaxation, LinearBounds):  # with programs it would change when it is compiled
-        relaxation = LinearBounds(programs=False)
-    window = None if isinstance(relaxation, BranchAndCut) and of_numbers else 1
+    relaxation, window = _in_penalties(relaxation, of_numbers)
     return {"window": window} | options | {"relaxation": relaxation}
 
 
-def _grid(
-    X0: AbstractSet, counts: Sequence[int]
-) -> tuple[Float[Array, "cells n_x"], Float[Array, "cells n_x"]]:
-    """Lower and upper ends of the cells of a box.
+@singledispatch
+def _in_penalties(relaxation: Any, of_numbers: bool) -> tuple[Any, int | None]:
+    """The relaxation and the window of a penalty, the same function compiled or not."""
+    return relaxation, None if isinstance(relaxation, AbstractMethod) else 1
 
-    Raises:
-        TypeError: it is no box, or a count no whole number.
-        ValueError: there is not a positive number for each coordinate.
-    """
-    if not isinstance(X0, Box):
-        raise TypeError(f"cells are of an X0 of type Box, but {described(X0)} arrived")
-    if not isinstance(counts, Sequence) or len(counts) != X0.dimension:
-        raise ValueError(
-            f"cells must be a number for each of {X0.dimension} coordinates, but {counts} arrived"
-        )
-    numbers = [whole_number(f"cells[{i}]", count, 1) for i, count in enumerate(counts)]
-    index = jnp.stack(jnp.meshgrid(*map(jnp.arange, numbers), indexing="ij"), axis=-1)
-    index, many = index.reshape(-1, len(numbers)), jnp.asarray(numbers)
 
-    def ends(index: Array) -> Float[Array, "cells n_x"]:
-        within = X0.lower + X0.widths * (index / many)
-        return jnp.where(index == many, X0.upper, within)  # exactly, and so nothing is left out
+@_in_penalties.register
+def _(relaxation: LinearBounds, of_numbers: bool) -> tuple[Any, int | None]:
+    return LinearBounds(programs=False), 1  # compiled code has none
 
-    return ends(index), ends(index + 1)
+
+@_in_penalties.register
+def _(relaxation: BranchAndCut, of_numbers: bool) -> tuple[Any, int | None]:
+    return relaxation, None if of_numbers else 1

@@ -1,18 +1,22 @@
-"""Sets of a template around the states of smooth loops, by affine forms over cells of `X0`.
+"""Sets of a template around the states of loops, over cells of `X0` that any method bounds.
 
 What forms leave out of smooth functions falls with the third power of a cell's width. So the cell
 that decides the facet with the widest gap is halved, all steps being looked at together, until each
 bound is attained by a trajectory up to the gap that may stay open. Cells that have no bounds at all
 are halved first: the initial set is treated like any part of it.
+
+What forms leave out of units that switch falls slowly, and another method costs as much as many
+forms. It is tried on the whole set. Where it closes most of what forms leave open, the set is cut
+into as many cells as there is work for, the largest first, and each that decides a facet is bounded
+by it.
 """
 
 from __future__ import annotations
 
-import itertools
+import dataclasses
 import math
-import time
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,17 +33,26 @@ from reachjax.programs.affine_steps import step_columns
 from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.proofs.cells import CellCertificate
 from reachjax.proofs.proposal import SolverStatus
-from reachjax.sets import AbstractSet, Box, Polytope, Template
-from reachjax.sets.cells import Cell, halves_along
-from reachjax.tubes.cell_slopes import moving_offsets
-from reachjax.tubes.ladder import LEAST_RANGE, ROUNDED
-from reachjax.tubes.steps import Reached, Setting, overflow
+from reachjax.sets import Polytope
+from reachjax.tubes.by_forms import AffineForms
+from reachjax.tubes.cell_slopes import moving_cell, moving_offsets
+from reachjax.tubes.cell_tree import CellTree, Node
+from reachjax.tubes.ladder import LEAST_RANGE, ROUNDED, WORK
+from reachjax.tubes.methods import AbstractMethod, Problem, ReachSet, at
+from reachjax.tubes.searches import AbstractSearch, Question
+from reachjax.tubes.steps import overflow
 
 MULTIPLICATIONS = 1.5e11
 """Products of all cells together, of which one core does some ten to the tenth in a second."""
 
 OVERHEAD = 2.5e7
 """The products that a step costs beside those of its matrices."""
+
+PER_WORK = 300.0
+"""The products that take as long as a unit of the work of linear programs."""
+
+HORIZONS = 4
+"""A method that goes through the horizon with facts costs so many forms, its programs aside."""
 
 LOOKED = 8
 """After so many halvings, where cells say that facets are largest is simulated."""
@@ -52,189 +65,190 @@ GENERATIONS, FALL = 8, 0.1
 what is open, or the facet is done: what disturbances leave open, no halving closes. What smooth
 functions leave open falls by a factor of 64 meanwhile."""
 
+CLOSED = 0.5
+"""A method is used on cells if it closes this part of what forms leave open of the whole set."""
+
+TRIAL = 0.25
+"""The part of the work that this may take."""
 
 SEARCHING = 0.9
 """The part of the time in which cells are halved: sets, proofs and witnesses take the rest, 0.7 s
 of two hundred steps where measured."""
 
 
-class _Node:
-    """A part of the initial set, with its halves or what forms over it say.
+@dataclasses.dataclass(frozen=True)
+class Cells(AbstractMethod):
+    """Cells of the initial set, each bounded by forms, or by another method where that pays.
 
-    Args:
-        cell: the part.
-        steps: for each step what forms say, as far as they say anything.
-        shape: of the offsets of all steps.
-        parent: what it is a half of; None of the initial set.
-        lost: what has no bounds over it after these steps, if anything has not.
+    Attributes:
+        inner: what bounds a cell where forms leave more open.
+        most: how many cells there may be.
     """
 
-    def __init__(
-        self,
-        cell: Cell,
-        steps: list[ByForms],
-        shape: tuple[int, ...],
-        parent: _Node | None = None,
-        lost: UnboundedError | None = None,
-    ):
-        self.cell, self.steps, self.lost, self._parent = cell, steps, lost, parent
-        self.offsets = np.full(shape, np.inf)
-        for row, step in zip(self.offsets, steps, strict=False):
-            row[:] = np.where(np.isnan(step.offsets), np.inf, step.offsets)
-        self.axis, self.halves = -1, list[_Node]()
+    inner: AbstractMethod = AffineForms()  # noqa: RUF009  (immutable)
+    most: int = 1000
 
-    @property
-    def axes(self) -> list[int]:
-        """Along which coordinates it and its parts are halved, as `from_tree` takes them."""
-        found, left = list[int](), [self]
-        while left:
-            node = left.pop()
-            found.append(node.axis)
-            left += node.halves[::-1]
-        return found
+    def sets(self, problem: Problem, known: Sequence[ReachSet] = ()) -> Iterator[ReachSet]:
+        """The smallest sets that are proved within the problem's gap and budget.
+
+        Raises:
+            KeyboardInterrupt: somebody stopped the search for cells, after all sets but the last.
+            UnboundedError: a unit has no bounds over a cell of the smallest size.
+            ValueError: states overflow.
+        """
+        problem.require_numbers()
+        search, interrupted = _Search(self, problem, len(known)), False
+        search.enclose()
+        try:
+            search.run()
+        except KeyboardInterrupt:
+            interrupted, search.end = True, SolverStatus.INTERRUPTED
+        search.finish()
+        directions, slopes = problem.directions, _Slopes(self.inner, problem, search)
+        for k in range(len(known), problem.horizon):
+            if interrupted and k == problem.horizon - 1:
+                raise KeyboardInterrupt
+            bounds = owned(search.bounds[k])
+            if not is_concrete(problem.loop, problem.X0, directions):
+                bounds = moved_by(bounds, slopes.of(k))
+            facets, leaves = len(bounds), search.leaves
+            proofs = tuple(leaf.found.proof(k) for leaf in leaves)
+            proof = CellCertificate(
+                loop=problem.loop,
+                X0=problem.X0,
+                directions=directions[k],
+                axes=np.array(search.cells.roots[0].axes),
+                proofs=proofs if any(proofs) else (),
+                codes=search.codes(k),
+                bounds=bounds,
+                witnesses=np.full(facets, np.nan),
+                witness_states=np.full((facets, 0), np.nan),
+                seconds=np.full(facets, search.seconds / facets / (problem.horizon - len(known))),
+                k=k + 1,
+                start=problem.start,
+            )
+            yield ReachSet(Polytope(directions[k], bounds), proof, at(k + 1), search.farthest(k))
+
+
+class _Bounds(NamedTuple):
+    """What is known over a cell.
+
+    Attributes:
+        steps: for each step what forms say, as far as they say anything.
+        offsets: `(N, f)`, upper bounds; infinite where there is none.
+        lost: what has no bounds over it after these steps, if anything has not.
+        sets: what another method says; nothing if that was not asked.
+    """
+
+    steps: Sequence[ByForms]
+    offsets: Float[np.ndarray, "N f"]
+    lost: UnboundedError | None = None
+    sets: Sequence[ReachSet] = ()
 
     @property
     def is_bounded(self) -> bool:
-        """Whether all facets have bounds over it."""
+        """Whether all facets have bounds."""
         return bool(np.isfinite(self.offsets).all())
 
-    @property
-    def depth(self) -> int:
-        """How many halvings it is away from the initial set."""
-        return 0 if self._parent is None else 1 + self._parent.depth
+    def proof(self, k: int) -> Any:
+        """The other method's proof of what holds after `k + 1` steps; None if it was not asked."""
+        return self.sets[k].proof if self.sets else None
 
-    def before(self, generations: int) -> _Node | None:
-        """What it is left of after so many halvings; None if there were fewer."""
-        node: _Node | None = self
-        for _ in range(generations):
-            node = node and node._parent
-        return node
+    def met(self, sets: Sequence[ReachSet]) -> _Bounds:
+        """What both forms and another method say."""
+        offsets = np.array([np.asarray(each.region.facets[1]) for each in sets])
+        return self._replace(offsets=np.fmin(self.offsets, offsets), sets=sets)
 
 
-def sets_by_cells(
-    setting: Setting,
-    most: int,
-    X0: AbstractSet,
-    box: Box,
-    template: Template,
-    horizon: int,
-    known: int = 0,
-) -> Iterator[Reached]:
-    """The smallest sets that are proved within the setting's gap and time, and so many cells.
-
-    Args:
-        setting: what all steps have in common.
-        most: how many cells there may be.
-        X0: the initial set.
-        box: around it.
-        template: what the sets look like.
-        horizon: how many steps there are.
-        known: how many of them are known.
-
-    Raises:
-        KeyboardInterrupt: somebody stopped the search for cells, after all sets but the last.
-        UnboundedError: a unit has no bounds over a cell of the smallest size.
-        ValueError: states overflow.
-    """
-    began, interrupted = time.perf_counter(), False
-    directions = jnp.stack([template.at(k).directions for k in range(1, horizon + 1)])
-    fixed = jax.lax.stop_gradient((setting.loop, X0, directions))
-    search = _Search(setting, *fixed, most, known)
-    search.enclose()
-    try:
-        search.run()
-    except KeyboardInterrupt:
-        interrupted, search.ended = True, SolverStatus.INTERRUPTED
-    seconds = time.perf_counter() - began
-    for k in range(known, horizon):
-        if interrupted and k == horizon - 1:
-            raise KeyboardInterrupt
-        offsets, deciding = search.bounds[k], search.deciding[k]
-        bounds = owned(offsets)
-        if not is_concrete(setting.loop, X0, directions):
-            cells = [search.leaves[i].cell for i in deciding]
-            bounds = moved_by(bounds, moving_offsets(setting, X0, box, directions, cells, k))
-        facets = len(offsets)
-        proof = CellCertificate(
-            loop=setting.loop,
-            X0=X0,
-            directions=directions[k],
-            axes=np.array(search.axes),
-            codes=search.codes(k),
-            bounds=bounds,
-            witnesses=np.full(facets, np.nan),
-            witness_states=np.full((facets, 0), np.nan),
-            seconds=np.full(facets, seconds / facets / (horizon - known)),
-            k=k + 1,
-            start=setting.start,
-        )
-        yield Reached(Polytope(directions[k], bounds), proof, search.farthest(k), climb=False)
-
-
-class _Search:
+class _Search(AbstractSearch):
     """Cells so far, and what they prove.
 
     Args:
-        setting: what all steps have in common.
-        loop: of numbers.
-        X0: the initial set.
-        directions: `(N, f, n_x)`.
-        most: how many cells there may be.
+        method: how many cells there may be, and what bounds them.
+        problem: the problem.
         known: of how many steps nothing is asked.
 
     Attributes:
-        ended: how the search ended for facets that leave more open than was asked for.
+        cells: their tree; leaves have `_Bounds`.
+        bounds: `(N, f)`, what all cells prove.
+        end: how the search ended for facets that leave more open than was asked for.
     """
 
-    def __init__(
-        self,
-        setting: Setting,
-        loop: ClosedLoop,
-        X0: AbstractSet,
-        directions: Float[Array, "N f n_x"],
-        most: int,
-        known: int,
-    ):
-        self._setting, self._X0, self._known = setting, X0, known
-        self._budget = setting.budget.share(SEARCHING)
-        self._loop, self._directions = jax.device_get((loop, directions))
-        self._scenarios = Scenarios.of(loop, X0, len(directions), setting.start)
-        cell = Cell(X0.bounding_box(), X0)
-        sides = np.asarray(cell.box.widths)
-        self._sides = np.where(sides > 0, sides, 1.0)  # a side without length is not halved
-        self._generations = max(GENERATIONS, 2 * int(np.sum(sides > 0)))
-        self._deepest = 2 * math.ceil(math.log2(most))
-        self._longest = 0.0
-        self._root = self._made(cell)
-        self.leaves = [self._root]
-        self._note()
-        self._left = min(2 * most - 2, affordable(self._loop, len(directions), setting.budget))
-        self.ended = SolverStatus.UNKNOWN_GAP
+    def __init__(self, method: Cells, problem: Problem, known: int):
+        self._problem, self._known, self._method = problem, known, method
+        self._budget = problem.budget.share(SEARCHING)
+        loop, self._X0, _ = problem.fixed
+        fixed = loop, jax.lax.stop_gradient(problem.directions)
+        self._loop, self._directions = jax.device_get(fixed)
+        self._scenarios = Scenarios.of(loop, self._X0, problem.horizon, problem.start)
+        self.cells = CellTree.whole(self._X0, method.most)
+        root = self.cells.roots[0]
+        wide = int(np.sum(root.upper > root.lower))
+        self._generations = max(GENERATIONS, 2 * wide)
+        self._deepest = 2 * math.ceil(math.log2(method.most))
+        self._longest = self._slowest = 0.0
+        root.found = self._by_forms(root)
+        self._left = affordable(self._loop, problem.horizon, problem.budget)
+        self._form = MULTIPLICATIONS / affordable(self._loop, problem.horizon, Budget())
+        self._asks, self._price = method.inner.adds_to_forms(loop), 0.0
+        self._planned, self._wanted, self._halvings, self._looked = False, 1, 0, -1
+        self.end = SolverStatus.UNKNOWN_GAP
         self._open_parts: np.ndarray | None = None
+        self._note()
 
-    def _made(self, cell: Cell, parent: _Node | None = None) -> _Node:
-        given = self._loop, cell.part, cell.box, self._directions, self._setting.start
-        began, steps, lost = time.monotonic(), list[ByForms](), None
+    @property
+    def seconds(self) -> float:
+        """What the search took so far."""
+        return self._budget.elapsed
+
+    def _by_forms(self, node: Node) -> _Bounds:
+        given = self._loop, node.part, node.box, self._directions, self._problem.start
+        began, steps, lost = self._budget.elapsed, list[ByForms](), None
         try:
             steps.extend(unrolled(*given))
         except UnboundedError as error:  # of halves there may be bounds
             lost = error
-        self._longest = max(self._longest, time.monotonic() - began)
-        return _Node(cell, steps, self._directions.shape[:2], parent, lost)
+        self._longest = max(self._longest, self._budget.elapsed - began)
+        offsets = np.full(self._directions.shape[:2], np.inf)
+        for row, step in zip(offsets, steps, strict=False):
+            row[:] = np.where(np.isnan(step.offsets), np.inf, step.offsets)
+        return _Bounds(steps, offsets, lost)
+
+    def _by_method(self, node: Node, part: float = 1.0) -> _Bounds:
+        """What forms and the other method say over a cell, within a part of the work."""
+        work = min(WORK, part * self._left * self._form / PER_WORK)
+        budget, began = self._budget.with_work(work), self._budget.elapsed
+        problem = dataclasses.replace(self._problem, loop=self._problem.fixed[0])
+        inner = self._method.inner.sets(problem.over(node.part, self._levels, budget))
+        found = node.found.met(list(inner))
+        self._slowest = max(self._slowest, self._budget.elapsed - began)
+        self._price = HORIZONS + (work - budget.work) * PER_WORK / self._form
+        self._left -= self._price
+        return found
+
+    def _halves(self, node: Node, by_method: bool = False) -> list[Node]:
+        """The halves of a cell along its longest side, and what is said over them."""
+        halves = self.cells.halved(node, self.cells.longest(node))
+        for half in halves:
+            half.found = self._by_forms(half)
+            if by_method and half.found.is_bounded:
+                half.found = self._by_method(half)
+        return halves
 
     def _note(self) -> None:
-        every = np.array([leaf.offsets for leaf in self.leaves])
+        self.leaves = self.cells.leaves
+        every = np.array([leaf.found.offsets for leaf in self.leaves])
         self.deciding, self.bounds = every.argmax(axis=0), every.max(axis=0)
-
-    @property
-    def axes(self) -> list[int]:
-        """The tree of all cells."""
-        return self._root.axes
 
     @property
     def _late(self) -> bool:
         """Whether no time is left for two halves of a cell, as long as one took at most."""
         return self._budget.left < 2 * self._longest
+
+    @property
+    def _spent(self) -> bool:
+        """Whether there may be no more cells, or no work is left for two halves of one."""
+        return self.cells.is_full or self._left < 2
 
     def enclose(self) -> None:
         """Halve cells that have no bounds until all have.
@@ -243,117 +257,219 @@ class _Search:
             UnboundedError: a unit has none over a cell of the smallest size.
             ValueError: states overflow.
         """
-        while True:
-            open_cells = [i for i, leaf in enumerate(self.leaves) if not leaf.is_bounded]
-            if not open_cells:
-                return self._note()
-            number = max(open_cells, key=lambda i: self.leaves[i].depth)  # soon the smallest
-            leaf = self.leaves[number]
-            spent = self._left < 2 or self._late or leaf.depth >= self._deepest
-            if spent or not self._halve(number):
-                break
-            self._setting.note(f"{len(self.leaves)} cells, {len(open_cells)} without bounds")
-        if leaf.lost is not None:
-            raise leaf.lost.after(len(self.leaves), leaf.cell.box.widths.tolist())
-        k = int(np.argmin(np.isfinite(leaf.offsets).all(axis=1))) + 1
-        raise overflow(self._setting.start + k, halved=True)
+        while open_cells := [leaf for leaf in self.leaves if not leaf.found.is_bounded]:
+            leaf = max(open_cells, key=lambda leaf: leaf.depth)  # soon the smallest
+            spent = self._spent or self._late or leaf.depth >= self._deepest
+            if spent or not (self._can_halve(leaf) and self._halved(leaf, self._halves(leaf))):
+                found = leaf.found
+                if found.lost is not None:
+                    raise found.lost.after(len(self.leaves), leaf.widths.tolist())
+                k = int(np.argmin(np.isfinite(found.offsets).all(axis=1))) + 1
+                raise overflow(self._problem.start + k, halved=True)
+            self._problem.note(f"{len(self.leaves)} cells, {len(open_cells)} without bounds")
 
-    def run(self) -> None:
-        """Halve cells until gaps are closed, or nothing is left."""
-        simulations = self._setting.simulations
-        if simulations is None:
-            return
-        least, most = self._simulated()
-        for count in itertools.count():
-            if count % LOOKED == 0:
-                simulations.include(*(self.farthest(k) for k in range(len(self.bounds))))
-                least, most = self._simulated()
-            # of the bounds so far: those of a wide set say nothing of a range
-            excess, open_parts = self._open(least, most, self._floor(least, most))
-            if self._left < 2 or self._late:
-                self.ended = SolverStatus.TIME if self._late else SolverStatus.BUDGET
-                return
-            self.ended = SolverStatus.STALLED
-            number = self._widest(open_parts, excess)
-            if number is None or not self._halve(number):
-                return
+    def question(self, asked: int, workers: int) -> Question | None:
+        """Which gap is closed next: by halves of a cell, or by another method over it."""
+        if self._problem.simulations is None or asked:
+            return None
+        self._look()
+        if self._late or (not (self._planned and self._asks) and self._spent):
+            self.end = SolverStatus.TIME if self._late else SolverStatus.BUDGET
+            return None
+        self.end = SolverStatus.STALLED
+        node = self._widest()
+        if node is None:
+            return None
+        if self._asks:
+            return self._with_method(node)
+        return Question([node], self._halves, (node,)) if self._can_halve(node) else None
+
+    def _with_method(self, node: Node) -> Question | None:
+        """The question about the cell that decides most, where another method may be asked."""
+        if not self._planned:
+            return Question([node], self._by_method, (node, TRIAL))
+        if self.cells.count < self._wanted and not self._spent:
+            matter = [leaf for leaf in self.leaves if (leaf.found.offsets > self._levels).any()]
+            largest = max(filter(self._can_halve, matter), key=self.cells.volume, default=None)
+            if largest is not None:
+                return Question([largest], self._halves, (largest,))
+        programs = self._slowest + self._longest
+        if not node.found.sets:
+            self.end = SolverStatus.TIME if self._budget.left < programs else SolverStatus.BUDGET
+            enough = self._left >= self._price and self._budget.left >= programs
+            return Question([node], self._by_method, (node,)) if enough else None
+        if not self._can_halve(node):
+            return None
+        self.end = SolverStatus.TIME if self._budget.left < 2 * programs else SolverStatus.BUDGET
+        enough = self._left >= 2 + 2 * self._price and self._budget.left >= 2 * programs
+        return Question([node], self._halves, (node, True)) if enough else None
+
+    def answered(self, question: Question, answer: Any) -> int:
+        """How many cells there are."""
+        (node,) = question.nodes
+        if isinstance(answer, _Bounds):
+            if not self._planned:
+                self._plan(node, answer)
+            if self._asks:
+                node.found = answer
             self._note()
+        elif not self._halved(node, answer):
+            self.ended = True
+        return self.cells.count
 
-    def _open(self, least: np.ndarray, most: np.ndarray, floor: np.ndarray) -> tuple[Any, Any]:
+    def _plan(self, node: Node, tried: _Bounds) -> None:
+        """Ask the other method of cells if it closes most of what forms leave open; of how many."""
+        before, after = (
+            np.fmax(found.offsets - self._levels, 0.0) / self._ranges
+            for found in (node.found, tried)
+        )
+        before, after = before[self._known :], after[self._known :]
+        self._planned = True
+        self._asks = bool(after.sum() <= (1 - CLOSED) * before.sum())
+        if self._asks:
+            most = self._left / (2 + self._price)
+            seconds = 2 * self._longest + self._slowest
+            if self._budget.timed and seconds:
+                most = min(most, self._budget.left / seconds)
+            gap = max(self._problem.gap, ROUNDED)
+            self._wanted = int(min(most, 1 + float(after.max()) / gap))
+
+    def finish(self) -> None:
+        """Take stock, also where somebody stopped the search."""
+        self._note()
+        if self._problem.simulations is not None and self._looked >= 0:
+            self._open()
+
+    def _look(self) -> None:
+        """Simulate where cells say that facets are largest, now and then, and see what is open."""
+        simulations = self._problem.simulations
+        assert simulations is not None  # else nothing is looked at
+        if self._looked < 0:
+            self._least, self._most = self._simulated()
+        often = self._asks and self._planned
+        if often or (self._halvings % LOOKED == 0 and self._looked != self._halvings):
+            simulations.include(*(self.farthest(k) for k in range(len(self.bounds))))
+            self._least, self._most = self._simulated()
+            self._looked = self._halvings
+        self._open()
+
+    def _open(self) -> None:
         """What is open of each facet, in the units of the states and in parts of its range."""
-        excess, half = self.bounds - most, np.fmax((most - least) / 2, floor)
-        open_parts = np.divide(excess, half, out=np.zeros_like(excess), where=excess > 0)
+        least, most = self._least, self._most
+        # of the bounds so far: those of a wide set say nothing of a range
+        self._excess, half = self.bounds - most, np.fmax((most - least) / 2, self._floor())
+        zero = np.zeros_like(half)
+        open_parts = np.divide(self._excess, half, out=zero, where=self._excess > 0)
         open_parts[: self._known] = 0.0
-        self._open_parts = open_parts
-        return excess, open_parts
+        self._open_parts, self._ranges = open_parts, np.where(half > 0, half, 1.0)
+        self._levels = most + self._problem.gap * half
+        self._levels[: self._known] = np.inf
 
     def codes(self, k: int) -> Int[np.ndarray, " f"]:
         """How the search ended for each facet after `k + 1` steps, as values of `SolverStatus`."""
         if self._open_parts is None:
-            return np.full(len(self.bounds[k]), int(self.ended))
-        shut = self._open_parts[k] <= self._setting.gap
-        return np.where(shut, int(SolverStatus.SOLVED), int(self.ended))
+            return np.full(len(self.bounds[k]), int(self.end))
+        shut = self._open_parts[k] <= self._problem.gap
+        return np.where(shut, int(SolverStatus.SOLVED), int(self.end))
 
-    def _widest(
-        self, open_parts: Float[np.ndarray, "N f"], excess: Float[np.ndarray, "N f"]
-    ) -> int | None:
+    def _widest(self) -> Node | None:
         """The leaf that decides the facet of the widest gap, of those that halving still closes."""
+        open_parts = self._open_parts
+        assert open_parts is not None  # it was looked
         for place in np.argsort(-open_parts, axis=None, kind="stable"):
             worst = np.unravel_index(place, open_parts.shape)
-            if not open_parts[worst] > self._setting.gap:
+            if not open_parts[worst] > self._problem.gap:
                 return None
-            number = int(self.deciding[worst])
-            leaf = self.leaves[number]
+            leaf = self.leaves[int(self.deciding[worst])]
             before = leaf.before(self._generations)
-            if before and before.offsets[worst] - leaf.offsets[worst] < FALL * excess[worst]:
-                continue
-            self._setting.note(f"{len(self.leaves)} cells, largest gap {open_parts[worst]:.1e}")
-            return number
+            if before:
+                fall = before.found.offsets[worst] - leaf.found.offsets[worst]
+                if fall < FALL * self._excess[worst]:
+                    continue
+            number, gap = len(self.leaves), open_parts[worst]
+            self._problem.note(f"{number} cells, largest gap {gap:.1e}")
+            return leaf
         return None
 
-    def _floor(
-        self, least: Float[np.ndarray, "N f"], most: Float[np.ndarray, "N f"]
-    ) -> Float[np.ndarray, "N f"]:
+    def _floor(self) -> Float[np.ndarray, "N f"]:
         """What half a facet's range counts as, at least: of one that is flat, by states' sizes."""
-        gap, simulations = self._setting.gap, self._setting.simulations
-        floor = LEAST_RANGE * (self.bounds - least) / 2
+        gap, simulations = self._problem.gap, self._problem.simulations
+        floor = LEAST_RANGE * (self.bounds - self._least) / 2
         if not gap or simulations is None:
             return floor
         largest = np.maximum.accumulate(abs(simulations.runs.states).max(axis=0, initial=0.0))
         sizes = np.einsum("kfn,kn->kf", abs(self._directions), largest[1:])
-        flat = most - least <= CONSTANT * sizes
+        flat = self._most - self._least <= CONSTANT * sizes
         return np.fmax(floor, ROUNDED / gap * np.where(flat, sizes, abs(self.bounds)))
 
     def _simulated(self) -> tuple[np.ndarray, np.ndarray]:
         """The least and largest simulated values of all facets."""
-        simulations = self._setting.simulations
+        simulations = self._problem.simulations
         assert simulations is not None  # else nothing is looked at
         found = [simulations.values(k, rows) for k, rows in enumerate(self._directions, start=1)]
         return np.array([each.least for each in found]), np.array([each.most for each in found])
 
-    def _halve(self, number: int) -> bool:
-        """Whether a leaf could be halved, along the side of which most is left."""
-        leaf = self.leaves[number]
-        widths = np.asarray(leaf.cell.box.widths) / self._sides
-        axis = int(widths.argmax())
-        if not widths[axis] > 0:
+    def _can_halve(self, node: Node) -> bool:
+        return self.cells.can_halve(node, self.cells.longest(node))
+
+    def _halved(self, node: Node, halves: list[Node]) -> bool:
+        """Whether halves stand in the place of a cell, which have bounds if it has."""
+        if node.found.is_bounded and not all(half.found.is_bounded for half in halves):
             return False
-        halves = [self._made(half, leaf) for half in halves_along(self._X0, leaf.cell.box, axis)]
-        if leaf.is_bounded and not all(half.is_bounded for half in halves):
-            return False
-        leaf.axis, leaf.halves, leaf.steps = axis, halves, []
-        self.leaves[number : number + 1] = halves
+        self.cells.replace(node, halves, self.cells.longest(node))
+        node.found = node.found._replace(steps=(), sets=())
         self._left -= len(halves)
+        self._halvings += 1
+        self._note()
         return True
 
     def farthest(self, k: int) -> Float[np.ndarray, "f s"]:
         """Scenarios at which the deciding cells say that facets are largest after `k + 1` steps."""
         found = []
         for facet, number in enumerate(self.deciding[k]):
-            step, one = self.leaves[number].steps[k], slice(facet, facet + 1)
+            known, one = self.leaves[number].found, slice(facet, facet + 1)
+            if known.sets and len(known.sets[k].worst) == len(self.deciding[k]):
+                found.append(known.sets[k].worst[one])
+                continue
+            step = known.steps[k]
             drawn = [values[one] for values in step.drawn]
             found.append(self._scenarios.of_units(np.asarray(step.corners)[one], drawn))
         return np.concatenate(found)
+
+
+class _Slopes:
+    """Numbers with the derivatives of what cells prove, each by what decides it.
+
+    Args:
+        inner: what bounds cells where forms leave more open.
+        problem: the problem, with derivatives.
+        search: what was proved.
+    """
+
+    def __init__(self, inner: AbstractMethod, problem: Problem, search: _Search):
+        self._inner, self._problem, self._search = inner, problem, search
+        self._by_method: dict[int, list[Array]] = {}
+
+    def of(self, k: int) -> Float[Array, " f"]:
+        """The numbers of the facets after `k + 1` steps."""
+        search, problem = self._search, self._problem
+        nodes = [search.leaves[i] for i in search.deciding[k]]
+        found = moving_offsets(problem, nodes, k)
+        for facet, node in enumerate(nodes):
+            if node.found.sets:
+                offset = np.asarray(node.found.sets[k].region.facets[1])[facet]
+                if offset < node.found.steps[k].offsets[facet]:
+                    found[facet] = self._moving(node)[k][facet]
+        return jnp.stack(found)
+
+    def _moving(self, node: Node) -> list[Array]:
+        """The offsets that the other method proves over a cell, with their derivatives."""
+        if id(node) not in self._by_method:
+            part, _ = moving_cell(self._problem, node)
+            levels = np.full(self._search.bounds.shape, -np.inf)
+            given = self._problem.over(part, levels, self._problem.budget.with_work(WORK))
+            self._by_method[id(node)] = [each.region.facets[1] for each in self._inner.sets(given)]
+        return self._by_method[id(node)]
 
 
 def affordable(loop: ClosedLoop, horizon: int, budget: Budget) -> float:

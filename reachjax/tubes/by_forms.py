@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -18,83 +20,87 @@ from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
 from reachjax.proofs.linear import LinearCertificate
 from reachjax.proofs.proposal import SolverStatus
-from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
+from reachjax.sets import Template
 from reachjax.tubes.cell_slopes import moving_forms
-from reachjax.tubes.steps import Reached, overflow
+from reachjax.tubes.methods import AbstractMethod, Problem, ReachSet, at
+from reachjax.tubes.steps import overflow
 
 ENDS = SolverStatus.AFFINE_FORM, SolverStatus.FAILED
 """How a form ends that has a bound, and one that has none."""
 
 
-def sets_by_forms(
-    loop: ClosedLoop,
-    X0: AbstractSet,
-    held: AbstractSet,
-    box: Box,
-    template: AbstractTemplate,
-    horizon: int,
-    start: int,
-) -> Iterator[Reached]:
-    """The smallest sets that affine forms show to hold the states, one step after the other.
+@dataclasses.dataclass(frozen=True)
+class AffineForms(AbstractMethod):
+    """Affine forms over the whole horizon (`programs.affine`): `LinearBounds`, as a method.
 
     Concrete numbers are propagated in numpy as the sets are asked for, traced ones all at once.
 
-    Args:
-        loop: the closed loop.
-        X0: the initial set.
-        held: what forms begin from: the initial set, or a larger one.
-        box: around it.
-        template: the directions.
-        horizon: the number of steps.
-        start: the time of the initial set.
-
-    Raises:
-        TypeError: the template has no facets.
-        ValueError: states overflow.
+    Attributes:
+        programs: whether linear programs over the facets of a polytope make bounds tighter.
     """
-    if not isinstance(template, Template):
-        raise TypeError(
-            f"LinearBounds() bounds facets, but the template is of kind {type(template).__name__}: "
-            "give a Template, or for ellipsoids another relaxation, such as CuttingPlanes() or "
-            "LocalBounds()"
-        )
-    directions, scenarios = template.directions, None
-    if loop.is_disturbed and is_concrete(loop, X0):
-        scenarios = Scenarios.of(loop, X0, horizon, start)
-    if template.steps is None:
-        directions = jnp.broadcast_to(directions, (horizon, *directions.shape))
-    given = loop, held, box, directions[:horizon]
-    fixed: tuple[Any, Any, Any, Any] = jax.lax.stop_gradient(given)
-    cut = held.parts[0]
-    if is_concrete(given):
-        steps = _timed(unrolled(*fixed, start), start)
-    elif (
-        cut is not None and cut.needs_programs and is_concrete(fixed)
-    ):  # compiled code would have none
-        steps = _moved(_timed(unrolled(*fixed, start), start), moving_forms(*given, start))
-    else:
-        steps = _at_once(unrolled_at_once(*given, start))
-    for k, (step, seconds) in enumerate(steps, start=1):
-        shaped, facets = template.at(k), len(template)
-        proof = LinearCertificate(
-            loop=loop,
-            X0=X0,
-            directions=shaped.directions,
-            slopes=step.slopes,
-            corners=step.corners,
-            codes=jnp.where(jnp.isfinite(step.offsets), *ENDS),
-            bounds=step.offsets,
-            witnesses=np.full(facets, np.nan),
-            witness_states=np.full((facets, 0), np.nan),
-            seconds=np.full(facets, seconds / facets),
-            k=k,
-            start=start,
-        )
-        region = shaped.polytope(owned(step.offsets))
-        states = np.asarray(step.corners) if is_concrete(step.corners) else np.zeros((0, 0))
-        if scenarios is not None:
-            states = scenarios.of_units(states, step.drawn)
-        yield Reached(region, proof, states, climb=False)
+
+    programs: bool = True
+
+    def sets(self, problem: Problem, known: Sequence[ReachSet] = ()) -> Iterator[ReachSet]:
+        """The smallest sets that affine forms show to hold the states.
+
+        Raises:
+            TypeError: the template has no facets.
+            ValueError: states overflow.
+        """
+        return itertools.islice(self._from_the_first(problem), len(known), None)
+
+    def adds_to_forms(self, loop: ClosedLoop) -> bool:
+        """They are forms themselves."""
+        return False
+
+    def _from_the_first(self, problem: Problem) -> Iterator[ReachSet]:
+        (loop, X0, template), horizon, start = problem.parts, problem.horizon, problem.start
+        box = problem.box
+        held = X0 if self.programs else X0.closed_form(box)
+        if not isinstance(template, Template):
+            raise TypeError(
+                "LinearBounds() bounds facets, but the template is of kind "
+                f"{type(template).__name__}: give a Template, or for ellipsoids another "
+                "relaxation, such as CuttingPlanes() or LocalBounds()"
+            )
+        directions, scenarios = template.directions, None
+        if loop.is_disturbed and is_concrete(loop, X0):
+            scenarios = Scenarios.of(loop, X0, horizon, start)
+        if template.steps is None:
+            directions = jnp.broadcast_to(directions, (horizon, *directions.shape))
+        given = loop, held, box, directions[:horizon]
+        fixed: tuple[Any, Any, Any, Any] = jax.lax.stop_gradient(given)
+        cut = held.parts[0]
+        if is_concrete(given):
+            steps = _timed(unrolled(*fixed, start), start)
+        elif (
+            cut is not None and cut.needs_programs and is_concrete(fixed)
+        ):  # compiled code would have none
+            steps = _moved(_timed(unrolled(*fixed, start), start), moving_forms(*given, start))
+        else:
+            steps = _at_once(unrolled_at_once(*given, start))
+        for k, (step, seconds) in enumerate(steps, start=1):
+            shaped, facets = template.at(k), len(template)
+            proof = LinearCertificate(
+                loop=loop,
+                X0=X0,
+                directions=shaped.directions,
+                slopes=step.slopes,
+                corners=step.corners,
+                codes=jnp.where(jnp.isfinite(step.offsets), *ENDS),
+                bounds=step.offsets,
+                witnesses=np.full(facets, np.nan),
+                witness_states=np.full((facets, 0), np.nan),
+                seconds=np.full(facets, seconds / facets),
+                k=k,
+                start=start,
+            )
+            region = shaped.polytope(owned(step.offsets))
+            states = np.asarray(step.corners) if is_concrete(step.corners) else np.zeros((0, 0))
+            if scenarios is not None:
+                states = scenarios.of_units(states, step.drawn)
+            yield ReachSet(region, proof, at(k), states)
 
 
 def _timed(steps: Iterator[ByForms], start: int) -> Iterator[tuple[ByForms, float]]:

@@ -18,49 +18,43 @@ from reachjax.programs.held import Facets, held_bounds, sources
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.moving import HeldBounds, Moving, moving
 from reachjax.sets import AbstractSet, Box, Polytope
-from reachjax.sets.cells import Cell
-from reachjax.tubes.steps import Setting
+from reachjax.tubes.cell_tree import Node
+from reachjax.tubes.methods import Problem
 
 LOOSE = 1e-6
 """By which part of its longest side a cell is larger for the programs of its multipliers."""
 
 
-def moving_offsets(
-    setting: Setting,
-    X0: AbstractSet,
-    box: Box,
-    directions: Float[Array, "N f n_x"],
-    deciding: Sequence[Cell],
-    k: int,
-) -> Float[Array, " f"]:
-    """Numbers with the derivatives of what the deciding cells prove after `k + 1` steps.
-
-    Args:
-        setting: what all steps have in common.
-        X0: the initial set, a box or a polytope.
-        box: around it.
-        directions: of the facets of all steps.
-        deciding: for each facet of the step, the cell in which its bound is largest.
-        k: the number of the step.
-    """
-    offsets: list[Array] = []
-    known: dict[int, Array] = {}
+def moving_cell(problem: Problem, node: Node) -> tuple[AbstractSet, Box]:
+    """A cell that moves with the box around the initial set, and the box that it lies in."""
+    X0, box = problem.X0, problem.box
     lower, upper = (np.asarray(jax.lax.stop_gradient(end)) for end in (box.lower, box.upper))
     sides = np.where(upper > lower, upper - lower, 1.0)
-    fixed = jax.lax.stop_gradient((setting.loop, X0, directions))
+    shares = ((end - lower) / sides for end in node.ends)
+    around = Box(*(box.lower + share * (box.upper - box.lower) for share in shares))
+    return X0.cut(around) if isinstance(X0, Polytope) else around, around
+
+
+def moving_offsets(problem: Problem, deciding: Sequence[Node], k: int) -> list[Float[Array, ""]]:
+    """Numbers with the derivatives of what forms over the deciding cells prove.
+
+    Args:
+        problem: the problem, of a box or a polytope.
+        deciding: for each facet after `k + 1` steps, the cell in which its bound is largest.
+        k: the number of the step.
+    """
+    offsets, known, directions = list[Array](), dict[int, Array](), problem.directions
+    fixed = jax.lax.stop_gradient((problem.loop, problem.X0, directions))
     loop, region, rows = jax.device_get(fixed)
-    everywhere = jnp.zeros((len(rows), 2, len(sides)))
-    for facet, cell in enumerate(deciding):
-        if id(cell) not in known:
-            ends = (np.asarray(end) for end in (cell.box.lower, cell.box.upper))
-            shares = ((end - lower) / sides for end in ends)
-            around = Box(*(box.lower + share * (box.upper - box.lower) for share in shares))
-            part = X0.cut(around) if isinstance(X0, Polytope) else around
-            held = _held(loop, region, rows, cell, k, setting.start)
-            parts = Moving(setting.loop, part, around, directions[k], everywhere)
-            known[id(cell)] = moving(parts, held, k + 1, setting.start)
-        offsets.append(known[id(cell)][facet])
-    return jnp.stack(offsets)
+    everywhere = jnp.zeros((len(rows), 2, rows.shape[2]))
+    for facet, node in enumerate(deciding):
+        if id(node) not in known:
+            held = _held(loop, region, rows, node, k, problem.start)
+            part, around = moving_cell(problem, node)
+            parts = Moving(problem.loop, part, around, directions[k], everywhere)
+            known[id(node)] = moving(parts, held, k + 1, problem.start)
+        offsets.append(known[id(node)][facet])
+    return offsets
 
 
 def moving_forms(
@@ -90,7 +84,7 @@ def _held(
     loop: ClosedLoop,
     X0: AbstractSet,
     directions: Float[np.ndarray, "N f n_x"],
-    cell: Cell,
+    cell: Node,
     k: int,
     start: int,
 ) -> HeldBounds:

@@ -8,7 +8,7 @@ over negative numbers, is not proved; its halves may be.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -23,12 +23,9 @@ from reachjax.sets import AbstractSet, Box
 from reachjax.sets.balance import balanced
 from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.requirements import Requirement
-from reachjax.tubes.sieve import Margins, no_margins, smallest
+from reachjax.tubes.sieve import Margins, Outcome, Unbounded, no_margins
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.targets import target_of, values_of
-
-PROGRAMS = 50
-"""Linear programs that a bound may take in a cell: halving it is the other way."""
 
 
 class CellTask(NamedTuple):
@@ -55,50 +52,13 @@ class CellTask(NamedTuple):
         return self.nodes > 0 and not all(each.unit.curved for each in layers)
 
 
-class Unbounded(NamedTuple):
-    """An `UnboundedError` as other processes can send it.
-
-    Attributes:
-        given: what it was made of.
-    """
-
-    given: tuple[Any, ...]
-
-    @classmethod
-    def of(cls, error: UnboundedError) -> Unbounded:
-        """The record of an error."""
-        return cls((*error.given, error.line))
-
-    @property
-    def error(self) -> UnboundedError:
-        """The error, to be raised."""
-        return UnboundedError(*self.given)
-
-
-class Outcome(NamedTuple):
-    """How a task ended for a cell.
-
-    Attributes:
-        proved: whether all requirements are.
-        margins: of those that were looked at; NaN of the others.
-        axis: along which it should be halved; -1 where nothing says that.
-        unbounded: the unit that has no bounds over it, if there is one.
-    """
-
-    proved: bool
-    margins: Margins
-    axis: int
-    unbounded: Unbounded | None = None
-
-    @property
-    def margin(self) -> float:
-        """The smallest known margin."""
-        return smallest(self.margins)
-
-
 @lenient
 def outcome_of(
-    task: CellTask, part: AbstractSet, budget: Budget, known: Margins | None = None
+    task: CellTask,
+    part: AbstractSet,
+    budget: Budget,
+    known: Margins | None = None,
+    broken: Sequence[bool] = (),
 ) -> Outcome:
     """What is found of one cell, wherever it runs.
 
@@ -107,18 +67,25 @@ def outcome_of(
         part: of the initial set, of numpy arrays.
         budget: of the call.
         known: the margins by forms over the cell's box, which do not prove all; None if unknown.
+        broken: which requirements all simulated trajectories from it break, so that one may fail
+            from every state; none if not given.
     """
     begun = known or no_margins(task.required, task.horizon)
     margins = {name: row.copy() for name, row in begun.items()}
     with jax.enable_x64(True):
         try:
-            return _climbed(task, part, budget, margins, known is not None)
+            return _climbed(task, part, budget, margins, known is not None, broken)
         except UnboundedError as error:
-            return Outcome(False, margins, -1, Unbounded.of(error))
+            return Outcome(False, margins, unbounded=Unbounded.of(error))
 
 
 def _climbed(
-    task: CellTask, part: AbstractSet, budget: Budget, margins: Margins, by_forms: bool
+    task: CellTask,
+    part: AbstractSet,
+    budget: Budget,
+    margins: Margins,
+    by_forms: bool,
+    broken: Sequence[bool],
 ) -> Outcome:
     """What is found of a cell, step after step; margins are noted as they are found.
 
@@ -127,24 +94,31 @@ def _climbed(
     """
     around = jax.device_get(boxed(jax.device_put(part), "X0"))
     scenarios = Scenarios.of(task.loop, part, task.horizon, task.start)
-    limits = min(PROGRAMS, task.nodes), budget.with_work(WORK)
+    limits = task.nodes, budget.with_work(WORK)
     ladder = Ladder(task.loop, part, around, scenarios, task.start, *limits)
     if by_forms and isinstance(part, Box) and not task.by_programs:
         ladder.advance(tighten=False)  # nothing but forms could be tried again
-        return Outcome(False, margins, _axis(ladder, _first_open(task.required, margins)))
-    middle = scenarios.middle(np.asarray(around.center))
+        axis = _axis(ladder, _first_open(task.required, margins))
+        return Outcome(False, margins, axis=axis)
+    middle, failing = scenarios.middle(np.asarray(around.center)), any(broken)
+    proved, axis = not failing, 0
     for k in range(task.horizon + 1):
         if k:
             ladder.advance(tighten=False)
         if budget.overdue:
-            return Outcome(False, margins, -1)
-        for item in task.required:
-            if item.time == k:
+            return Outcome(False, margins)
+        for number, item in enumerate(task.required):
+            if item.time != k:
+                continue
+            if failing and broken[number] and fails_everywhere(item, ladder):
+                return Outcome(False, margins, refuted=True)
+            if proved:
                 proved, margin = bounded(item, ladder, part, middle)
                 margins[item.name][k] = np.fmax(margins[item.name][k], margin)
-                if not proved:
-                    return Outcome(False, margins, _axis(ladder, item))
-    return Outcome(True, margins, 0)
+                axis = axis if proved else _axis(ladder, item)
+        if not (proved or failing):
+            break
+    return Outcome(proved, margins, axis=axis)
 
 
 def _first_open(required: Sequence[Requirement], margins: Margins) -> Requirement:

@@ -32,15 +32,16 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
-from reachjax.numerics.rounding import TINY
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulated, Simulations
 from reachjax.sets import AbstractSet
 from reachjax.tubes.by_cells import affordable
-from reachjax.tubes.cell_decisions import decided_by_cells, roots
+from reachjax.tubes.cell_decisions import decided_by_cells
 from reachjax.tubes.cell_tasks import CellTask
+from reachjax.tubes.cell_tree import CellTree
+from reachjax.tubes.findings import Findings
 from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.ladder import WORK, Ladder, StepBounds
 from reachjax.tubes.propagation import (
@@ -49,12 +50,11 @@ from reachjax.tubes.propagation import (
     require_kinds,
     simulations_from,
 )
-from reachjax.tubes.refutations import Suspect, counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
-from reachjax.tubes.soundness import Claim, compiled_runs, require_unbroken, worst_of
+from reachjax.tubes.soundness import compiled_runs, require_unbroken, worst_of
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.targets import target_of
-from reachjax.tubes.verdicts import Counterexample, Verdict, VerdictStatus
+from reachjax.tubes.verdicts import Verdict, VerdictStatus
 
 FIRST_PROGRAMS = 50
 """Linear programs that each bound may take at first, while ranges are those of affine forms."""
@@ -151,11 +151,11 @@ def decide(
     required = requirements(loop.states, horizon, goal, avoid, safe)
     simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     if cells is not None:
-        counts, most = roots(X0, cells)
+        parts = CellTree.over(X0, cells)
         require_executor(executor)
         require_bar(progress)
         task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
-        return decided_by_cells(task, X0, counts, most, simulations, budget, executor, progress)
+        return decided_by_cells(task, X0, parts, simulations, budget, executor, progress)
     decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
     try:
         return _by_remedies(decision, loop, X0, horizon, start, required, relaxation, budget)
@@ -201,8 +201,8 @@ def _by_remedies(
             return decision.verdict()
         task = CellTask(on_host, horizon, start, tuple(required), nodes=0)
         share = budget.share(FOR_CELLS if relaxation.nodes else 1.0)
-        given = most, decision.simulations, share
-        by_cells = decided_by_cells(task, X0, roots(X0, most)[0], *given)
+        parts = CellTree.whole(X0, most)
+        by_cells = decided_by_cells(task, X0, parts, decision.simulations, share)
         if by_cells.status is not VerdictStatus.UNKNOWN or not relaxation.nodes:
             return by_cells
     try:
@@ -240,27 +240,21 @@ class _Decision:
         simulations: Simulations | None,
         budget: Budget,
     ):
-        self._loop, self._X0, self._start, self._budget = loop, X0, start, budget
-        self._horizon, self._on_host = horizon, jax.device_get(loop)
+        self._loop, self._start, self._budget = loop, start, budget
+        self._horizon, self._on_host, self._X0 = horizon, jax.device_get(loop), X0
         self._scenarios = Scenarios.of(loop, X0, horizon, start)
         self._middle = self._scenarios.middle(np.asarray(boxed(X0, "X0").center))
-        self._required = {(item.name, item.time): item for item in required}
-        self._open = dict(self._required)
-        self._margins = {item.name: np.full(horizon + 1, np.nan) for item in required}
-        for item in required:
-            self._margins[item.name][item.time] = -np.inf  # as long as nothing is known
-        self._simulated = {item.name: np.full(horizon + 1, np.nan) for item in required}
+        self._findings = Findings(loop, X0, horizon, start, required)
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
         self._ends: dict[tuple[str, int], np.ndarray] = {}
-        self._example: Counterexample | None = None
         self.simulations = simulations
         if simulations is not None:
-            self._seen(required, simulations.runs)
+            self._findings.simulate(simulations.runs)
 
     @property
     def ended(self) -> bool:
         """Whether nothing is left to be decided."""
-        return self._example is not None or not self._open
+        return self._findings.ended
 
     def verdict(self) -> Verdict:
         """The verdict from everything proved and simulated so far.
@@ -269,20 +263,12 @@ class _Decision:
             UnsoundError: a trajectory breaks what is proved.
         """
         self._require_unbroken()
-        status = VerdictStatus.UNKNOWN if self._open else VerdictStatus.PROVED
-        if self._example is not None:
-            status = VerdictStatus.REFUTED
         ends = Counter(SolverStatus(int(code)) for codes in self._ends.values() for code in codes)
-        known = status, self._margins, self._simulated, self._example
-        return Verdict(*known, ends=dict(ends), certificates=self._certificates)
+        return self._findings.verdict(dict(ends), certificates=self._certificates)
 
     def _require_unbroken(self) -> None:
         """Raise an error if a trajectory, as JAX runs it, breaks what is proved."""
-        claims = [
-            Claim(item, self._margins[item.name][item.time])
-            for key, item in self._required.items()
-            if key not in self._open
-        ]
+        claims = [claim for claim in self._findings.claims if claim.proved]
         if claims:
             rows = self._middle[None]
             if self.simulations is not None:
@@ -292,11 +278,10 @@ class _Decision:
 
     def at_first(self) -> None:
         """Decide what is required of the initial set itself."""
-        for key, item in list(self._open.items()):
+        for item in list(self._findings.open.values()):
             if item.time == 0:
                 compared = item.compared_with(self._X0)
-                holds, margin = item.proved(compared), float(compared.margins.min())
-                self._note(key, holds, margin if holds else min(margin, -TINY))
+                self._findings.prove(item, float(compared.margins.min()), item.proved(compared))
 
     def climb(self, ladder: Ladder, tighten: bool) -> None:
         """Climb until all is decided, or nothing more can be.
@@ -305,12 +290,12 @@ class _Decision:
             ladder: at the initial set.
             tighten: whether the ranges of units are bounded by linear programs.
         """
-        last = max(time for _, time in self._open)
+        last = max(time for _, time in self._findings.open)
         for k in range(1, last + 1):
             ladder.advance(tighten)
             if self._budget.overdue:
                 return
-            for key, item in list(self._open.items()):
+            for key, item in list(self._findings.open.items()):
                 if item.time == k and not self.ended:
                     self._decided(key, item, ladder)
             if self.ended:
@@ -319,13 +304,13 @@ class _Decision:
     def _decided(self, key: tuple[str, int], item: Requirement, ladder: Ladder) -> None:
         """Bound one requirement at the time that the ladder has come to."""
         target, units = target_of(item, ladder, self.simulations, self._middle)
-        left = sum(other.time >= item.time for other in self._open.values())
+        left = sum(other.time >= item.time for other in self._findings.open.values())
         share = self._budget.share(1 / left)
         climbed = ladder.bounds(target, (left - 1) * len(target.forms), share)
         right = climbed.bounds <= 0 if item.inside else climbed.bounds < 0
         margin = float(np.min(-climbed.bounds / units))
         holds = bool(np.all(right))
-        self._note(key, holds, margin)
+        self._findings.prove(item, margin, holds)
         self._ends[key] = climbed.codes
         if holds:
             self._certificates[key] = _certificate(climbed, target.simulated, not item.inside)
@@ -334,32 +319,14 @@ class _Decision:
             pulled = np.concatenate([middle + p * (worst - middle) for p in PULLS])
             self._tried(item, self._scenarios.clipped(pulled))
 
-    def _note(self, key: tuple[str, int], holds: bool, margin: float) -> None:
-        name, k = key
-        self._margins[name][k] = np.fmax(self._margins[name][k], margin)
-        if holds:
-            del self._open[key]
-
     def _tried(self, item: Requirement, scenarios: np.ndarray) -> None:
         """Simulate scenarios that may break a requirement."""
         if self.simulations is not None:
-            self._seen([item], self.simulations.include(scenarios))
+            runs = self.simulations.include(scenarios)
         else:
             given = self._on_host, scenarios, self._horizon, self._start
-            self._seen([item], Runs(scenarios, self._scenarios.runs(*given)))
-
-    def _seen(self, items: list[Requirement], runs: Runs) -> None:
-        """What trajectories show that do not overflow, a counterexample perhaps."""
-        runs = runs.some(np.isfinite(runs.states).all(axis=(1, 2)))
-        if not len(runs.states):
-            return
-        found: list[Suspect] = []
-        for item in items:
-            rooms = item.simulated(runs.states)
-            row = self._simulated[item.name]
-            row[item.time] = np.fmin(row[item.time], rooms.min())
-            found += suspects(item, rooms, runs)
-        self._example = counterexample(self._loop, self._X0, found, self._start)
+            runs = Runs(scenarios, self._scenarios.runs(*given))
+        self._findings.simulate(runs, [item])
 
 
 def _certificate(climbed: StepBounds, known: Simulated, least: bool) -> BranchCertificate:

@@ -54,15 +54,22 @@ class Target(NamedTuple):
 
     Attributes:
         forms: of each bound.
-        values: `(c, n_x) -> (c, g)`, what states have of it.
+        values: `(c, n_x) -> (c, g)`, what states have of it; None where nothing is simulated.
         enough: whether a bound will do, given its number, itself, and what is attained.
         simulated: what is known of their values.
     """
 
     forms: Sequence[AffineForms]
-    values: Callable[[np.ndarray], np.ndarray]
+    values: Callable[[np.ndarray], np.ndarray] | None
     enough: Callable[[int, float, float], bool]
     simulated: Simulated
+
+    def closed(
+        self, bounds: Float[np.ndarray, " g"], attained: Float[np.ndarray, " g"]
+    ) -> Bool[np.ndarray, " g"]:
+        """Which bounds will do."""
+        pairs = enumerate(zip(bounds, attained, strict=True))
+        return np.array([self.enough(number, *pair) for number, pair in pairs], bool)
 
 
 class StepBounds(NamedTuple):
@@ -221,8 +228,8 @@ class Ladder:
 
     def facets(
         self, directions: Float[np.ndarray, "f n_x"], simulated: Simulated, gap: float
-    ) -> tuple[Target, Float[np.ndarray, " f"]]:
-        """Bounds of directions that are attained but for a part of their ranges, and these.
+    ) -> Target:
+        """Bounds of directions that are attained but for a part of their ranges.
 
         Args:
             directions: one row a facet.
@@ -240,7 +247,28 @@ class Ladder:
             return bound - attained <= gap * ranges[facet]
 
         each = [forms[i : i + 1] for i in range(len(directions))]
-        return Target(each, lambda states: states @ directions.T, enough, simulated), ranges
+        return Target(each, lambda states: states @ directions.T, enough, simulated)
+
+    def below(
+        self,
+        directions: Float[np.ndarray, "f n_x"],
+        levels: Float[np.ndarray, " f"],
+        middle: Float[np.ndarray, " s"],
+    ) -> Target:
+        """Bounds of directions that are no larger than levels, without any simulation.
+
+        Args:
+            directions: one row a facet.
+            levels: of each.
+            middle: some scenario.
+        """
+        forms = directions @ self.horizon.state
+        each = [forms[i : i + 1] for i in range(len(directions))]
+
+        def enough(facet: int, bound: float, attained: float) -> bool:
+            return bound <= levels[facet]
+
+        return Target(each, None, enough, Simulated.nothing(middle, len(directions)))
 
     def bounds(self, target: Target, left: int = 0, budget: Budget | None = None) -> StepBounds:
         """Bounds of the state after the steps so far.
@@ -257,6 +285,8 @@ class Ladder:
         for number, forms in enumerate(target.forms):
 
             def attained(columns: list[np.ndarray], number: int = number) -> float:
+                if target.values is None:
+                    return -np.inf
                 begun = self._scenarios_at(np.array(columns))
                 ended.extend(begun)
                 steps = len(horizon.steps)
@@ -283,12 +313,8 @@ class Ladder:
         ]
         judged = self._by_leaves(target, best, worst, found, ended)
         codes = [
-            self._ended(trees.get(number), budget)
-            if not target.enough(number, float(bound), float(known))
-            else SolverStatus.SOLVED
-            for number, (bound, known) in enumerate(
-                zip(judged.bounds, judged.attained, strict=True)
-            )
+            SolverStatus.SOLVED if closed else self._ended(trees.get(number), budget)
+            for number, closed in enumerate(target.closed(judged.bounds, judged.attained))
         ]
         return judged._replace(codes=np.array(codes, int))
 
@@ -321,6 +347,10 @@ class Ladder:
                 tree.grow(int(min(turn, self._nodes - before)))
                 pool -= tree.nodes - before
                 self.spend(tree.nodes - before)
+
+    def scenarios_of(self, climbed: StepBounds) -> Float[np.ndarray, "f s"]:
+        """The scenarios at which bounds would be attained, were they attained."""
+        return self._scenarios_at(climbed.columns)
 
     def _scenarios_at(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c s"]:
         """The scenarios that columns stand for.

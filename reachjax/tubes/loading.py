@@ -21,10 +21,12 @@ from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.numerics.storage import read
 from reachjax.tubes.kept import Kept
-from reachjax.tubes.partitions import Bar, PartitionedTube
-from reachjax.tubes.propagation import Options, Task, check_task
+from reachjax.tubes.methods import Problem
+from reachjax.tubes.partitions import PartitionedTube
+from reachjax.tubes.propagation import Options, check_problem
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.rechecks import Recheck, require_partition
+from reachjax.tubes.searches import Bar
 
 MISSING = (
     "was written without its loop, whose functions cannot be stored: give the loop again, "
@@ -127,7 +129,8 @@ def _sealed(kept: Any) -> ReachTube | PartitionedTube:
 def _whole(tube: Any) -> ReachTube:
     """A tube whose sets and proofs are as many and as large as they should be."""
     require_kind("it", tube, ReachTube, "a tube")
-    check_task(Task(tube.loop, tube.sets[0], tube.horizon, tube.template, tube.start), Options())
+    given = tube.loop, tube.sets[0], tube.template, tube.horizon, tube.start
+    check_problem(Problem(*given), Options())
     if len(tube.certificates) != len(tube.sets) or tube.certificates[0] is not None:
         raise ValueError(f"it has {len(tube.sets)} sets, but {len(tube.certificates)} certificates")
     for k in range(1, tube.horizon + 1):

@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -21,7 +20,6 @@ from jaxtyping import Float, Int
 from reachjax.loops import ClosedLoop
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
-    described,
     is_concrete,
     owned,
     real_number,
@@ -29,36 +27,29 @@ from reachjax.numerics.checks import (
     require_double_precision,
     require_executor,
     require_kind,
-    whole_number,
-    wrapped,
 )
 from reachjax.numerics.files import writable
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
-from reachjax.sets import AbstractSet, Box, Template
-from reachjax.sets.cells import grid, halves
+from reachjax.sets import AbstractSet, Template
 from reachjax.solvers import AbstractSolver, Auto
-from reachjax.tubes.cell_jobs import CellJobs
+from reachjax.tubes.cell_tree import CellTree, Node
 from reachjax.tubes.displays import SAMPLES as SHOWN
 from reachjax.tubes.displays import display, picture, table
 from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.kept import keep
-from reachjax.tubes.propagation import GAP, SAMPLES, Options, Task
+from reachjax.tubes.methods import AbstractMethod, Problem
+from reachjax.tubes.propagation import GAP, SAMPLES, Options
 from reachjax.tubes.reach import ReachTube, tube_of
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
+from reachjax.tubes.searches import AbstractSearch, Bar, Question
 from reachjax.tubes.tables import frame, rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pandas import DataFrame
-
-AHEAD = 1
-"""How many cells an executor is given for each of its workers: they share what time is left."""
-
-Bar = Callable[[Iterable[Any]], Iterable[Any]]
-"""Wraps an iteration over cells, such as `tqdm.tqdm`."""
 
 BESIDE = 1e-9
 """States that are further beside the initial set than this are not in it."""
@@ -180,7 +171,7 @@ def reach_partitioned(
     X0: AbstractSet,
     horizon: int,
     template: Template,
-    relaxation: AbstractRelaxation = BranchAndCut(),  # noqa: B008  (immutable)
+    relaxation: AbstractRelaxation | AbstractMethod = BranchAndCut(),  # noqa: B008
     window: int | None = None,
     solver: AbstractSolver = Auto(),  # noqa: B008
     *,
@@ -255,65 +246,70 @@ def reach_partitioned(
         "gap": real_number("gap", gap, 0.0),
     }
     budget = Budget.of(time_limit)
+    search = _Tubes(X0, CellTree.over(X0, cells), loop, template, options, budget)
+    search.remember(known)
     own = ThreadPoolExecutor(os.cpu_count()) if executor is None else None
-    run = _Run(loop, template, options, own or executor, progress, budget)
-    run.remember(known)
     try:
-        counts: Any = cells
-        if isinstance(cells, np.ndarray | jax.Array) and cells.ndim < 2:
-            counts = cells.tolist()
-        if isinstance(counts, int | np.integer):
-            tubes = _guided(run, X0, whole_number("cells", counts, 1), gap)
-        elif isinstance(counts, Sequence) and not isinstance(counts, str):
-            parts = [cell.part for cell in grid(X0, counts)]
-            tubes = [tube for tube in run.tubes(parts, len(parts)) if tube is not None]
-            if len(tubes) < len(parts):  # one tube from all of the set stands for the others
-                tubes.append(run.whole(X0))
-        else:
-            raise TypeError(
-                "cells must be a whole number, or one for each coordinate, but "
-                f"{described(cells)} arrived"
-            )
+        search.all_of(own or executor, progress)
+        tubes = search.union
     except KeyboardInterrupt:
         budget.stop()  # threads look at the clock, and end by themselves
-        if not run.done:
+        if not search.done:
             raise
         message = (
-            f"interrupted with {len(run.done)} cells done: this exception's `found` has their "
+            f"interrupted with {len(search.done)} cells done: this exception's `found` has their "
             "tubes, and reach_partitioned(..., known=found) goes on"
         )
-        raise Interrupted(message, tuple(run.done)) from None
+        raise Interrupted(message, tuple(search.done)) from None
     finally:
         if own is not None:
             own.shutdown(wait=False, cancel_futures=True)
     return PartitionedTube.sealed(X0, tuple(tubes))
 
 
-class _Run:
-    """Tubes of one loop, computed by an executor, cell by cell.
+class _Tubes(AbstractSearch):
+    """Tubes of one loop from the cells of a set.
 
-    Attributes:
-        done: the tubes so far.
+    Where cells are to be halved, that happens in rounds: the quarter of them whose bounds leave the
+    widest gaps in the union.
+
+    Args:
+        X0: the set.
+        cells: of it, to begin with; each has its tube, or None.
+        loop: the closed loop.
+        template: the facets of every set.
+        options: of each tube.
+        budget: of the call.
     """
 
     def __init__(
         self,
+        X0: AbstractSet,
+        cells: CellTree,
         loop: ClosedLoop,
         template: Template,
-        options: dict,
-        executor: Any,
-        progress: Bar | None,
+        options: dict[str, Any],
         budget: Budget,
     ):
+        self._X0, self._cells, self._options, self._budget = X0, cells, options, budget
         self._loop, self._template = jax.device_get((loop, template))
-        self._options, self._budget = options, budget
-        self._executor, self._progress = executor, progress
         self._known: dict[bytes, ReachTube] = {}
+        self._round, self._halves = cells.leaves, dict[Node, list[Node]]()
+        self._asked = deque[Node]()
+        self._left = len(self._round) if cells.most is None else 2 * cells.most - 1
+        self._widths: np.ndarray | None = None
 
     @property
     def done(self) -> list[ReachTube]:
         """The tubes so far."""
         return list(self._known.values())
+
+    @property
+    def union(self) -> tuple[ReachTube, ...]:
+        """Tubes that hold all states; one from all of the set stands for those that are missing."""
+        tubes = [node.found for node in self._cells.leaves]
+        found = [tube for tube in tubes if tube is not None]
+        return (*found, self._whole()) if len(found) < len(tubes) else tuple(found)
 
     def remember(self, tubes: Sequence[ReachTube]) -> None:
         """Take tubes for those of their cells.
@@ -334,49 +330,57 @@ class _Run:
                 )
             self._known[_question(tube.sets[0])] = tube
 
-    def tubes(self, cells: Sequence[AbstractSet], later: int) -> list[ReachTube | None]:
-        """One for each cell, in their order; None of those that there was no time for.
+    def all_of(self, executor: Executor | None, progress: Bar | None) -> None:
+        """All tubes, round by round; those that a bar leaves out, too."""
+        while self._round:
+            for bar in (progress, None):
+                self._asked = deque(node for node in self._round if node.found is None)
+                self.run(executor, bar)
+            self._round = [] if self._cells.most is None else self._next_round()
 
-        Args:
-            cells: the cells.
-            later: how many there will be in all, these included; they share the time.
+    def question(self, asked: int, workers: int) -> Question | None:
+        """The tube of the next cell that has none."""
+        while self._asked and not self._budget.late:
+            node = self._asked.popleft()
+            node.found = self._known.get(_question(node.part))
+            if node.found is None:
+                part = min(1.0, workers / max(self._left, 1))
+                self._left -= 1
+                given = self._loop, self._template, self._options, self._budget, part
+                return Question([node], _tube, (jax.device_get(node.part), *given))
+        return None
 
-        Raises:
-            Exception: the first error of a cell ends the run.
-        """
-        names = [_question(cell) for cell in cells]
-        left = deque(i for i, name in enumerate(names) if name not in self._known)
-        with closing(self._results(cells, names, left, later)) as results:
-            for _ in wrapped(self._progress, results):
-                pass
-            for _ in results:  # what a bar left out
-                pass
-        return [self._known.get(name) for name in names]
+    def answered(self, question: Question, answer: ReachTube) -> ReachTube:
+        """The tube, as a bar sees it."""
+        (node,) = question.nodes
+        tube = jax.device_put(answer)
+        node.found = self._known[_question(node.part)] = tube
+        return tube
 
-    def _results(
-        self, cells: Sequence[AbstractSet], names: Sequence[bytes], left: deque[int], later: int
-    ) -> Generator[ReachTube, None, None]:
-        """Each tube as it comes."""
-        given = self._loop, self._template, self._options
-        jobs = CellJobs[int](self._executor, AHEAD)
-        try:
-            while (left and not self._budget.late) or jobs:
-                while left and len(jobs) < jobs.most and not self._budget.late:
-                    part = min(1.0, jobs.workers / max(later, 1))
-                    later -= 1
-                    number = left.popleft()
-                    cell = jax.device_get(cells[number])
-                    jobs.submit(number, _tube, cell, *given, self._budget, part)
-                for number, tube in jobs.finished():
-                    found = self._known[names[number]] = jax.device_put(tube)
-                    yield found
-        finally:
-            jobs.cancelled()
-
-    def whole(self, X0: AbstractSet) -> ReachTube:
+    def _whole(self) -> ReachTube:
         """The tube from all of a set, here and whatever the time."""
-        given = jax.device_get(X0), self._loop, self._template, self._options
+        given = jax.device_get(self._X0), self._loop, self._template, self._options
         return jax.device_put(_tube(*given, self._budget, 1.0))
+
+    def _next_round(self) -> list[Node]:
+        """The halves that are asked about now that those of the last round are known."""
+        for node, halves in self._halves.items():
+            if all(half.found is not None for half in halves):  # else the time is over
+                self._cells.replace(node, halves, self._cells.longest(node))
+        leaves, left = self._cells.leaves, (self._cells.most or 0) - self._cells.count
+        fruitless = self._halves and not any(node.halves for node in self._halves)
+        if fruitless or left <= 0 or leaves[0].found is None:
+            return []
+        tubes = [leaf.found for leaf in leaves]
+        if self._widths is None:
+            self._widths = _widths(tubes[0])
+        worst = [leaves[i] for i in _worst(self._X0, tubes, self._widths, self._options["gap"])]
+        axes = {node: self._cells.longest(node) for node in worst}
+        some = [node for node in worst if self._cells.can_halve(node, axes[node])]
+        some = some[: min(math.ceil(len(leaves) / 4), left)]
+        self._halves = {node: self._cells.halved(node, axes[node]) for node in some}
+        self._left = 2 * left
+        return [half for pair in self._halves.values() for half in pair]
 
 
 def _question(*parts: Any) -> bytes:
@@ -399,37 +403,9 @@ def _tube(
     """
     with jax.enable_x64(True):
         loop, cell, template = jax.device_put((loop, cell, template))
-        task = Task(loop, cell, options["horizon"], template, options["start"])
+        problem = Problem(loop, cell, template, options["horizon"], options["start"])
         others = {name: options[name] for name in Options._fields if name in options}
-        return jax.device_get(tube_of(task, Options(**others, time_limit=budget.share(part))))
-
-
-def _guided(run: _Run, X0: AbstractSet, count: int, gap: float) -> list[ReachTube]:
-    """Halve the cells at which the union's gap is widest, along their longest side."""
-    first, *_ = run.tubes([X0], 2 * count - 1)
-    boxes, tubes = [X0.bounding_box()], [first or run.whole(X0)]
-    sides = np.asarray(boxes[0].widths)
-    sides = np.where(sides > 0, sides, np.inf)  # a side without length is not halved
-    widths = _widths(tubes[0])
-    while len(tubes) < count:
-        some = min(math.ceil(len(tubes) / 4), count - len(tubes))
-        worst = _worst(X0, tubes, widths, gap)[:some]
-        if not worst:
-            break
-        parts = [halves(X0, boxes[i], sides) for i in worst]
-        flat = [half.part for pair in parts for half in pair]
-        found = iter(run.tubes(flat, 2 * (count - len(tubes))))
-        kept = dict(enumerate(zip(boxes, tubes, strict=True)))
-        done = list[tuple[Box, ReachTube]]()
-        for i, pair in zip(worst, parts, strict=True):
-            those = [(half.box, tube) for half in pair if (tube := next(found)) is not None]
-            if len(those) == len(pair):  # else the cell stays as it is: the time is over
-                del kept[i]
-                done += those
-        if not done:
-            break
-        boxes, tubes = map(list, zip(*kept.values(), *done, strict=True))
-    return tubes
+        return jax.device_get(tube_of(problem, Options(**others, time_limit=budget.share(part))))
 
 
 def _attained(X0: AbstractSet, tube: ReachTube, t: int) -> Float[np.ndarray, " m"]:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.budget import Budget, TimeOverError
+from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     is_concrete,
     owned,
@@ -26,16 +25,12 @@ from reachjax.numerics.checks import (
 from reachjax.numerics.derivatives import first_order
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof
-from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.witnesses import Simulations
-from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
+from reachjax.sets import AbstractSet, AbstractTemplate, Box
 from reachjax.sets.unusable import ThinSetError, UnusableSetError
 from reachjax.solvers import AbstractSolver, Auto
-from reachjax.tubes.by_branching import sets_by_branching
-from reachjax.tubes.by_cells import sets_by_cells
-from reachjax.tubes.by_forms import sets_by_forms
-from reachjax.tubes.by_programs import sets_by_programs
-from reachjax.tubes.steps import Reached, Setting, boxed
+from reachjax.tubes.choice import method_of
+from reachjax.tubes.methods import AbstractMethod, Problem, ReachSet, at
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 """Wraps the iteration over time steps, such as `tqdm.tqdm` or `rich.progress.track`."""
@@ -45,14 +40,14 @@ SAMPLES = 1000
 GAP = 1e-4
 """What may stay open of a facet, as a part of its range."""
 
-LARGEST_WINDOW = 64
-"""The most columns of a window whose length is chosen."""
-
 KINDS = {
     "loop": (ClosedLoop, "a ClosedLoop"),
     "X0": (AbstractSet, "a set such as Box(lower, upper) or Polytope(A, b)"),
     "template": (AbstractTemplate, "a template, such as Template.box(n) or EllipsoidTemplate()"),
-    "relaxation": (AbstractRelaxation, "a relaxation object, such as BranchAndCut()"),
+    "relaxation": (
+        (AbstractRelaxation, AbstractMethod),
+        "a relaxation object, such as BranchAndCut()",
+    ),
     "solver": (AbstractSolver, "a solver object, such as Auto()"),
 }
 """What arguments of these names are, and what errors say was expected."""
@@ -61,7 +56,7 @@ KINDS = {
 class Options(NamedTuple):
     """By what sets are bounded: see `reach`."""
 
-    relaxation: AbstractRelaxation = BranchAndCut()
+    relaxation: AbstractRelaxation | AbstractMethod = BranchAndCut()
     window: int | None = None
     solver: AbstractSolver = Auto()
     samples: int = SAMPLES
@@ -84,84 +79,55 @@ class Options(NamedTuple):
         return cls(**options)
 
 
-class Task(NamedTuple):
-    """What sets are bounded of.
-
-    Attributes:
-        loop: the closed loop.
-        X0: the set of initial states.
-        horizon: the number of steps.
-        template: what every set looks like.
-        start: the time of `X0`.
-    """
-
-    loop: ClosedLoop
-    X0: AbstractSet
-    horizon: int
-    template: AbstractTemplate
-    start: int
-
-    @property
-    def fixed(self) -> Task:
-        """The task without derivatives."""
-        loop, X0, template = jax.lax.stop_gradient((self.loop, self.X0, self.template))
-        return self._replace(loop=loop, X0=X0, template=template)
-
-
 class Propagated(NamedTuple):
-    """The sets after `1 .. k` steps and their proofs.
+    """The sets after `1 .. k` steps with their proofs.
 
     Attributes:
         sets: `k` of them.
-        proofs: one for each.
         interrupted: whether the horizon was to be reached, and somebody stopped that (Ctrl-C).
     """
 
-    sets: list[AbstractSet]
-    proofs: list[AbstractProof]
+    sets: list[ReachSet]
     interrupted: bool
 
 
 def propagated(
-    task: Task, options: Options, known: Sequence[tuple[AbstractSet, AbstractProof]] = ()
+    problem: Problem, options: Options, known: Sequence[tuple[AbstractSet, AbstractProof]] = ()
 ) -> Propagated:
-    """The sets of a task, whose arguments have been checked.
+    """The sets of a problem, whose arguments have been checked.
 
     Args:
-        task: what they are bounded of.
-        options: by what.
-        known: the first ones, with their proofs.
+        problem: the problem.
+        options: by what they are bounded.
+        known: the first sets, with their proofs.
 
     Raises:
         KeyboardInterrupt: the call was interrupted before any set was proved.
         ValueError: the initial set is empty or unbounded, states overflow, or the progress bar
             leaves out steps.
     """
-    budget = Budget.of(options.time_limit)
-    loop, X0, template = first_order((task.loop, task.X0, task.template))
-    task = task._replace(loop=loop, X0=X0, template=template)
-    fixed, horizon, simulations = task.fixed, task.horizon, None
-    if is_concrete((fixed.loop, fixed.X0)):
-        simulations = simulations_from(
-            fixed.loop, fixed.X0, horizon, task.start, options.samples, options.seed
-        )
-    before = [_as_reached(*each) for each in known]
+    budget, horizon, simulations = Budget.of(options.time_limit), problem.horizon, None
+    loop, X0, template = first_order(problem.parts)
+    fixed = jax.lax.stop_gradient((loop, X0))
+    if is_concrete(fixed):
+        given = horizon, problem.start, options.samples, options.seed
+        simulations = simulations_from(*fixed, *given)
+    before = [_as_reached(k, *each) for k, each in enumerate(known, start=1)]
     bar = wrapped(options.progress, range(len(before), horizon))
-    setting = Setting(
-        loop=task.loop,
-        start=task.start,
-        relaxation=options.relaxation,
-        solver=options.solver,
-        limit=LARGEST_WINDOW if options.window is None else None,
-        drop_columns=options.window != 1 and is_concrete((fixed.loop, fixed.X0, fixed.template)),
+    problem = dataclasses.replace(
+        problem,
+        loop=loop,
+        X0=X0,
+        template=template,
         simulations=simulations,
         gap=options.gap,
         budget=budget,
-        note=getattr(bar, "set_postfix_str", _unheard),
+        note=getattr(bar, "set_postfix_str", problem.note),
     )
+    method = method_of(options.relaxation, problem, options.window, options.solver)
     steps, interrupted = list(before), False
     try:
-        for _, step in zip(bar, _following(task, options, setting, before), strict=False):
+        for _, step in zip(bar, method.sets(problem, before), strict=False):
             steps.append(step)
             if budget.stopped:
                 raise KeyboardInterrupt
@@ -178,75 +144,16 @@ def propagated(
     proofs = [step.proof for step in steps]
     if simulations is not None and is_concrete(proofs):
         proofs = _with_witnesses(steps, simulations, climb=not budget.late)
-    return Propagated([step.region for step in steps], owned(proofs), interrupted)
+    both = zip(steps, owned(proofs), strict=True)
+    return Propagated([step._replace(proof=proof) for step, proof in both], interrupted)
 
 
-def _following(
-    task: Task, options: Options, setting: Setting, known: Sequence[Reached]
-) -> Iterator[Reached]:
-    """The steps after those that are known."""
-    loop, X0, horizon, template, start = task
-    relaxation, window = options.relaxation, options.window
-    box = boxed(X0, "X0")
-    if relaxation.by_forms:  # forms go back to the initial set: they take milliseconds
-        held = X0 if getattr(relaxation, "programs", False) else X0.closed_form(box)
-        forms = sets_by_forms(loop, X0, held, box, template, horizon, start)
-        return itertools.islice(forms, len(known), None)
-    if window is None and isinstance(relaxation, BranchAndCut) and isinstance(template, Template):
-        if loop.curved and relaxation.cells > 1 and X0.parts[1] is None:
-            given = setting, relaxation.cells, X0, box, template, horizon
-            return sets_by_cells(*given, known=len(known))
-        return sets_by_branching(setting, relaxation.nodes, X0, box, template, horizon, known)
-    steps = sets_by_programs(setting, X0, template, horizon, window, known)
-    concrete = is_concrete(jax.lax.stop_gradient((loop, X0, template)))
-    if template.parts[1] is not None or not concrete:
-        return steps
-    forms = sets_by_forms(loop, X0, X0.closed_form(box), box, template, horizon, start)
-    return _in_time(setting.budget, steps, forms, len(known), horizon)
-
-
-def _in_time(
-    budget: Budget, steps: Iterator[Reached], forms: Iterator[Reached], known: int, horizon: int
-) -> Iterator[Reached]:
-    """Steps by programs as long as there is time, then by forms, which take little.
-
-    A step shares the time that is left with the later ones. What it takes beyond its share is what
-    no clock cuts; the next one takes as much again, and is not begun where that is not left.
-
-    Args:
-        budget: of the time.
-        steps: the ones by programs that are not known.
-        forms: all steps by forms.
-        known: how many steps are known.
-        horizon: how many there are in all.
-    """
-    beyond = 0.0
-    while known < horizon and budget.left > beyond:
-        began, share = time.monotonic(), budget.left / (horizon - known)
-        try:
-            with budget.in_force():
-                step = next(steps, None)
-        except TimeOverError:
-            break
-        if step is None:
-            return
-        known, beyond = known + 1, max(time.monotonic() - began - share, 0.0)
-        yield step
-    for step in itertools.islice(forms, known, None):
-        codes = np.full(len(step.proof.codes), int(SolverStatus.TIME))
-        yield step._replace(proof=step.proof.replace(codes=codes))
-
-
-def _as_reached(region: AbstractSet, proof: AbstractProof) -> Reached:
+def _as_reached(k: int, region: AbstractSet, proof: AbstractProof) -> ReachSet:
     states = proof.witness_states
     if not is_concrete(states):
-        return Reached(region, proof, np.zeros((0, 0)), climb=False)
+        return ReachSet(region, proof, at(k))
     states = np.asarray(states)
-    return Reached(region, proof, states[np.isfinite(states).all(axis=1)], climb=False)
-
-
-def _unheard(note: str) -> None:
-    """Where there is no bar that shows notes."""
+    return ReachSet(region, proof, at(k), states[np.isfinite(states).all(axis=1)])
 
 
 def simulations_from(
@@ -270,7 +177,7 @@ def simulations_from(
 
 
 def _with_witnesses(
-    steps: list[Reached], simulations: Simulations, climb: bool
+    steps: list[ReachSet], simulations: Simulations, climb: bool
 ) -> list[AbstractProof]:
     """Simulate what the certificates bound, from the initial set.
 
@@ -279,12 +186,12 @@ def _with_witnesses(
         simulations: from the initial set.
         climb: whether there is time for gradient ascent.
     """
-    simulated = [step.states for step in steps if not (step.climb and climb) and len(step.states)]
+    simulated = [step.worst for step in steps if not (step.ascend and climb) and len(step.worst)]
     if simulated:
         simulations.include(*simulated)
     for k, step in enumerate(steps, start=1):
-        if climb and step.climb and len(step.states):
-            simulations.climb(k, step.region, np.arange(len(step.states)), step.states)
+        if climb and step.ascend and len(step.worst):
+            simulations.climb(k, step.region, np.arange(len(step.worst)), step.worst)
     found = [simulations.attained(k, step.region) for k, step in enumerate(steps, start=1)]
     return [
         step.proof.replace(witnesses=values, witness_states=states)
@@ -321,18 +228,18 @@ def require_kinds(**arguments: Any) -> None:
         require_kind(name, value, *KINDS[name])
 
 
-def check_task(task: Task, options: Options) -> None:
+def check_problem(problem: Problem, options: Options) -> None:
     """Check what a user gave.
 
     Raises:
         RuntimeError: JAX's 64-bit floats are off.
         TypeError: an argument is of another kind.
         ValueError: dimensions disagree, a number is too small, a time-varying loop or template ends
-            before the horizon, or the window is to be chosen from traced numbers.
+            before the horizon.
     """
-    loop, X0, horizon, template, start = task
-    relaxation, window = options.relaxation, options.window
-    require_kinds(loop=loop, X0=X0, template=template, relaxation=relaxation, solver=options.solver)
+    (loop, X0, template), horizon = problem.parts, problem.horizon
+    given = {"relaxation": options.relaxation, "solver": options.solver}
+    require_kinds(loop=loop, X0=X0, template=template, **given)
     require_double_precision(loop=loop, X0=X0, template=template)
     same_size(
         "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)
@@ -342,7 +249,7 @@ def check_task(task: Task, options: Options) -> None:
         "the dimension of template is",
         (loop.states, template.dimension or loop.states),
     )
-    loop.check_horizon(horizon, start)
+    loop.check_horizon(horizon, problem.start)
     if template.steps is not None and template.steps < horizon:
         raise ValueError(f"template is given for {template.steps} steps, but horizon is {horizon}")
     require_bar(options.progress)
@@ -350,10 +257,5 @@ def check_task(task: Task, options: Options) -> None:
     whole_number("seed", options.seed, 0)
     real_number("gap", options.gap, 0.0)
     Budget.of(options.time_limit)
-    if window is not None:
-        whole_number("window", window, 1)
-    elif not (relaxation.by_forms or is_concrete(jax.lax.stop_gradient((loop, X0, template)))):
-        raise ValueError(
-            "window=None is chosen from numbers: inside jax.jit, vmap or scan give a number, such "
-            "as window=1"
-        )
+    if options.window is not None:
+        whole_number("window", options.window, 1)

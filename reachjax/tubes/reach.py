@@ -6,6 +6,7 @@ recheck. A tube repeats it, each set being the next one's set of states (equatio
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
@@ -29,13 +30,13 @@ from reachjax.tubes.displays import SAMPLES as SHOWN
 from reachjax.tubes.displays import display, picture, table
 from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.kept import keep
+from reachjax.tubes.methods import AbstractMethod, Problem, ReachSet, at
 from reachjax.tubes.propagation import (
     GAP,
     SAMPLES,
     Options,
     Progress,
-    Task,
-    check_task,
+    check_problem,
     propagated,
 )
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
@@ -71,6 +72,23 @@ class ReachTube(Replaceable):
 
     def __post_init__(self):
         self.require_sealed()
+
+    @classmethod
+    def of(cls, problem: Problem, reached: Sequence[ReachSet]) -> ReachTube:
+        """The tube of the sets of a problem."""
+        sets = problem.X0, *(each.region for each in reached)
+        proofs = None, *(each.proof for each in reached)
+        return cls.sealed(problem.loop, problem.template, sets, proofs, problem.start)
+
+    @property
+    def reached(self) -> tuple[ReachSet, ...]:
+        """What is proved of each sample after the first: a set, its span of time, its proof."""
+        pairs = zip(self.sets[1:], self.certificates[1:], strict=True)
+        return tuple(
+            ReachSet(region, proof, at(k))
+            for k, (region, proof) in enumerate(pairs, start=1)
+            if proof is not None
+        )
 
     @classmethod
     def sealed(
@@ -211,9 +229,11 @@ class ReachTube(Replaceable):
         """
         self.require_sealed()
         horizon = self.horizon + whole_number("steps", steps, 1)
-        task = Task(self.loop, self.sets[0], horizon, self.template, self.start)
+        problem = Problem(self.loop, self.sets[0], self.template, horizon, self.start)
         proofs = [self.proof(t) for t in range(1, self.horizon + 1)]
-        return tube_of(task, Options.named(options), list(zip(self.sets[1:], proofs, strict=True)))
+        return tube_of(
+            problem, Options.named(options), list(zip(self.sets[1:], proofs, strict=True))
+        )
 
 
 def _shown(tube: ReachTube, t: int) -> list[Any]:
@@ -232,19 +252,19 @@ def _shown(tube: ReachTube, t: int) -> list[Any]:
 
 
 def tube_of(
-    task: Task, options: Options, known: Sequence[tuple[AbstractSet, AbstractProof]] = ()
+    problem: Problem, options: Options, known: Sequence[tuple[AbstractSet, AbstractProof]] = ()
 ) -> ReachTube:
-    """The tube of a task, some of whose first sets may be known."""
-    check_task(task, options)
-    loop, X0, template = owned((task.loop, task.X0, task.template))
-    found = propagated(task._replace(loop=loop, X0=X0, template=template), options, known)
-    sets, certificates = (X0, *found.sets), (None, *found.proofs)
-    tube = ReachTube.sealed(loop, template, sets, certificates, start=task.start)
+    """The tube of a problem, some of whose first sets may be known."""
+    check_problem(problem, options)
+    loop, X0, template = owned(problem.parts)
+    own = dataclasses.replace(problem, loop=loop, X0=X0, template=template)
+    found = propagated(own, options, known)
+    tube = ReachTube.of(own, found.sets)
     if found.interrupted:
-        done, left = tube.horizon, task.horizon - tube.horizon
+        done, left = tube.horizon, problem.horizon - tube.horizon
         message = (
-            f"interrupted after {done} of {task.horizon} steps. They are proved: this exception's "
-            f"`tube` has them, and tube.extended({left}) goes on"
+            f"interrupted after {done} of {problem.horizon} steps. They are proved: this "
+            f"exception's `tube` has them, and tube.extended({left}) goes on"
         )
         raise Interrupted(message, tube)
     return tube
@@ -301,7 +321,7 @@ def reach(
     X0: AbstractSet,
     horizon: int,
     template: AbstractTemplate,
-    relaxation: AbstractRelaxation = BranchAndCut(),  # noqa: B008  (immutable)
+    relaxation: AbstractRelaxation | AbstractMethod = BranchAndCut(),  # noqa: B008  (immutable)
     window: int | None = None,
     solver: AbstractSolver = Auto(),  # noqa: B008
     *,
@@ -319,7 +339,7 @@ def reach(
         X0: the set of initial states.
         horizon: the number `N` of steps.
         template: what every set looks like: facet directions, ellipsoids, or both.
-        relaxation: which products of facts are used.
+        relaxation: which products of facts are used; or a method of its own (`AbstractMethod`).
         window: over how many steps each program reaches back, as far as there are steps: 1 is the
             paper's recursion, the horizon goes back to `X0` in one shot. Longer ones are tighter,
             and their programs larger. None: the longest that the solver bears, chosen from numbers,
@@ -370,4 +390,4 @@ def reach(
         True
     """
     options = Options(relaxation, window, solver, samples, seed, progress, gap, time_limit)
-    return tube_of(Task(loop, X0, horizon, template, start), options)
+    return tube_of(Problem(loop, X0, template, horizon, start), options)

@@ -6,7 +6,7 @@ products of facts, ellipsoids. Each step rests on the sets that are proved by th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.numerics.budget import ENDLESS
 from reachjax.programs.facts import FactLayout
@@ -32,7 +33,7 @@ from reachjax.proofs.branches import BranchCertificate
 from reachjax.proofs.cells import CellCertificate
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.proofs.linear import LinearCertificate
-from reachjax.sets import AbstractSet
+from reachjax.sets import AbstractSet, AbstractTemplate, Polytope
 from reachjax.sets.cells import from_tree
 from reachjax.solvers import Auto
 from reachjax.tubes.disagreements import DisagreementError
@@ -59,6 +60,35 @@ class _Unrolled(NamedTuple):
     taken: int = 0
 
 
+class _CellTube(NamedTuple):
+    """What is said over one cell of an initial set, as a tube says it."""
+
+    loop: ClosedLoop
+    template: AbstractTemplate
+    sets: tuple[AbstractSet, ...]
+    certificates: tuple[AbstractProof | None, ...]
+    start: int
+
+    @property
+    def horizon(self) -> int:
+        """The number of steps."""
+        return len(self.certificates) - 1
+
+    def proof(self, k: int) -> AbstractProof:
+        """What is said of the states after `k` steps."""
+        found = self.certificates[k]
+        if found is None:
+            raise ValueError(f"nothing is said of the cell after {k} steps")
+        return found
+
+
+def _over_cell(proof: AbstractProof | None, number: int, axes: list[int]) -> AbstractProof | None:
+    """The proof over one of the cells that these axes leave; None if there is none."""
+    if not isinstance(proof, CellCertificate) or np.asarray(proof.axes).tolist() != axes:
+        return None
+    return proof.proofs[number] if number < len(proof.proofs) else None
+
+
 class Repeat:
     """The propagation of a tube, as its proofs say that it was.
 
@@ -67,8 +97,9 @@ class Repeat:
         sets: those that are proved so far; they grow from outside.
     """
 
-    def __init__(self, tube: ReachTube, sets: Sequence[AbstractSet]):
+    def __init__(self, tube: ReachTube | _CellTube, sets: list[AbstractSet]):
         self._tube, self._sets = tube, sets
+        self._within: dict[int, Repeat] = {}
         self._forms = _Unrolled(None, [])
         self._windows: dict[Origin, Window] = {}
 
@@ -87,12 +118,10 @@ class Repeat:
         if isinstance(proof, LinearCertificate):
             *_, last = (p for p in tube.certificates if isinstance(p, LinearCertificate))
             slopes = np.asarray(last.slopes)
-            found = self._by_forms(k, ("slopes", last.k), [(tube.sets[0], self._box)], slopes)
+            (found,) = self._by_forms(k, ("slopes", last.k), [(tube.sets[0], self._box)], slopes)
             return proof.replace(**own, slopes=jax.device_put(slopes[:k])), found
         if isinstance(proof, CellCertificate):
-            axes = np.asarray(proof.axes).tolist()
-            cells = ((cell.part, cell.box) for cell in from_tree(tube.sets[0], axes))
-            return proof.replace(**own), self._by_forms(k, axes, cells)
+            return self._by_cells(k, proof.replace(**own))
         if isinstance(proof, BranchCertificate):
             proof = self._branches(k, proof)
         elif isinstance(proof, AbstractCertificate):
@@ -113,8 +142,8 @@ class Repeat:
 
     def _by_forms(
         self, k: int, key: Any, parts: Any, slopes: Float[np.ndarray, "k units"] | None = None
-    ) -> Float[np.ndarray, " f"]:
-        """The largest bounds over these parts of the initial set."""
+    ) -> Float[np.ndarray, "c f"]:
+        """The bounds over each of these parts of the initial set."""
         tube, forms = self._tube, self._forms
         if forms.key != key or forms.taken >= k:
             steps = range(1, tube.horizon + 1 if slopes is None else len(slopes) + 1)
@@ -125,7 +154,37 @@ class Repeat:
         for _ in range(forms.taken, k):
             found = [np.asarray(next(each).offsets) for each in forms.parts]
         self._forms = forms._replace(taken=k)
-        return np.max(np.where(np.isnan(found), np.inf, found), axis=0)
+        return np.where(np.isnan(found), np.inf, found)
+
+    def _by_cells(self, k: int, proof: CellCertificate) -> Again:
+        """The proof over cells, each by forms and by what else is said of it."""
+        axes = np.asarray(proof.axes).tolist()
+        cells = from_tree(self._tube.sets[0], axes)
+        found = self._by_forms(k, axes, ((cell.part, cell.box) for cell in cells))
+        if not proof.proofs:
+            return proof, found.max(axis=0)
+        if len(proof.proofs) != len(cells):
+            raise ValueError(f"it has {len(cells)} cells, but {len(proof.proofs)} proofs")
+        again = list(proof.proofs)
+        for number, (cell, each) in enumerate(zip(cells, proof.proofs, strict=True)):
+            if each is not None:
+                again[number], bounds = self._over(number, axes, cell.part).of(k, each)
+                self._within[number].reached(self._directions(k), bounds)
+                found[number] = np.fmin(found[number], bounds)
+        return proof.replace(proofs=tuple(again)), found.max(axis=0)
+
+    def _over(self, number: int, axes: list[int], part: AbstractSet) -> Repeat:
+        """The propagation over a cell of the initial set."""
+        if number not in self._within:
+            tube = self._tube
+            proofs = [None, *(_over_cell(p, number, axes) for p in tube.certificates[1:])]
+            own = _CellTube(tube.loop, tube.template, (part,), tuple(proofs), tube.start)
+            self._within[number] = Repeat(own, [part])
+        return self._within[number]
+
+    def reached(self, directions: Any, bounds: Float[np.ndarray, " f"]) -> None:
+        """Note the set that is proved of the next step of a cell."""
+        self._sets.append(Polytope(directions, bounds))
 
     @cached_property
     def _ladder(self) -> Ladder:

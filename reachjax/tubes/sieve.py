@@ -49,18 +49,42 @@ def smallest(margins: Margins) -> float:
     return float(min(known, default=-np.inf))
 
 
-class CellVerdict(NamedTuple):
-    """Whether a cell is proved or refuted, and by what margins.
+class Unbounded(NamedTuple):
+    """An `UnboundedError` as other processes can send it.
+
+    Attributes:
+        given: what it was made of.
+    """
+
+    given: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, error: UnboundedError) -> Unbounded:
+        """The record of an error."""
+        return cls((*error.given, error.line))
+
+    @property
+    def error(self) -> UnboundedError:
+        """The error, to be raised."""
+        return UnboundedError(*self.given)
+
+
+class Outcome(NamedTuple):
+    """What is found of a cell.
 
     Attributes:
         proved: whether all requirements hold from every state of it.
+        margins: of those that were looked at; NaN of the others.
         refuted: whether one of them fails from every state of it.
-        margins: of all requirements; NaN at times at which they are not meant.
+        axis: along which it should be halved; -1 where nothing says that.
+        unbounded: the unit that has no bounds over it, if there is one.
     """
 
     proved: bool
-    refuted: bool
     margins: Margins
+    refuted: bool = False
+    axis: int = -1
+    unbounded: Unbounded | None = None
 
     @property
     def margin(self) -> float:
@@ -175,8 +199,8 @@ class Sieve:
         lower, upper = (np.stack(ends) for ends in zip(*filled, strict=True))
         return self._loop, lower, upper, self._later
 
-    def sifted(self, cells: Sequence[Ends]) -> list[CellVerdict]:
-        """The verdict on each cell, at most `TOGETHER` of them."""
+    def sifted(self, cells: Sequence[Ends]) -> list[Outcome]:
+        """What is found of each cell, at most `TOGETHER` of them."""
         _, lower, upper, _ = given = self._given(cells)
         bounds = SIFT(*given, t=self._start)
         first = _at_first(self._directions[0], lower, upper)
@@ -184,7 +208,7 @@ class Sieve:
         with np.errstate(invalid="ignore"):
             return [self._judged(uppers) for uppers in bounds[: len(cells)]]
 
-    def _judged(self, uppers: Float[np.ndarray, "h+1 m"]) -> CellVerdict:
+    def _judged(self, uppers: Float[np.ndarray, "h+1 m"]) -> Outcome:
         """What bounds say of one cell."""
         items, proved, refuted = [rows.item for rows in self._rows], True, False
         margins = no_margins(items, len(uppers) - 1)
@@ -193,7 +217,7 @@ class Sieve:
             holds, fails, margin = rows.judged(uppers[item.time])
             margins[item.name][item.time] = margin
             proved, refuted = proved and holds, refuted or fails
-        return CellVerdict(proved, refuted, margins)
+        return Outcome(proved, margins, refuted)
 
 
 def _at_first(

@@ -17,17 +17,16 @@ from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, require_kind, whole_number
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
-from reachjax.numerics.rounding import TINY
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet
 from reachjax.sets.unusable import ThinSetError
+from reachjax.tubes.findings import Findings
 from reachjax.tubes.partitions import BESIDE, PartitionedTube
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.recurrence import for_ever
-from reachjax.tubes.refutations import counterexample, suspects
 from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, of_tube
-from reachjax.tubes.soundness import Claim, require_unbroken
-from reachjax.tubes.verdicts import Verdict, VerdictStatus, of_cells
+from reachjax.tubes.soundness import require_unbroken
+from reachjax.tubes.verdicts import Verdict, of_cells
 
 
 @logged
@@ -113,27 +112,14 @@ def _decided(
     runs = _runs(tube, samples, seed)
     if X0 is not tube.sets[0]:  # a cell may hold points beside the initial set
         runs = runs.some(np.asarray(X0.contains(runs.states[:, 0], BESIDE)))
-    margins: dict[str, np.ndarray] = {}
-    simulated: dict[str, np.ndarray] = {}
-    proved, found, claims = True, [], list[Claim]()
+    findings = Findings(tube.loop, X0, tube.horizon, tube.start, required)
+    findings.simulate(runs)
     for item in required:
-        blank = np.full(tube.horizon + 1, np.nan)
-        compared, rooms = item.compared(tube), item.simulated(runs.states)
-        holds, margin = item.proved(compared), float(compared.margins.min())
-        if not holds:  # what underflows or is no number proves nothing
-            margin = min(margin, -TINY) if np.isfinite(margin) else -np.inf
-        margins.setdefault(item.name, blank.copy())[item.time] = margin
-        simulated.setdefault(item.name, blank.copy())[item.time] = rooms.min(initial=np.inf)
-        proved = proved and holds
-        claims.append(Claim(item, margin, holds))
-        found += suspects(item, rooms, runs)
+        compared = item.compared(tube)
+        findings.prove(item, float(compared.margins.min()), item.proved(compared))
     begun = Scenarios.of(tube.loop, tube.sets[0], tube.horizon, tube.start)
-    require_unbroken(tube.loop, begun, tube.start, runs, claims)
-    example = counterexample(tube.loop, X0, found, tube.start)
-    if example is not None:
-        return Verdict(VerdictStatus.REFUTED, margins, simulated, example, ends)
-    status = VerdictStatus.PROVED if proved else VerdictStatus.UNKNOWN
-    return Verdict(status, margins, simulated, None, ends)
+    require_unbroken(tube.loop, begun, tube.start, runs, findings.claims)
+    return findings.verdict(ends)
 
 
 def _runs(tube: ReachTube, samples: int, seed: int) -> Runs:

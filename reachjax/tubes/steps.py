@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ from reachjax.programs.lmi import Program
 from reachjax.programs.preactivations import first_inputs, first_rows
 from reachjax.programs.relaxations import AbstractRelaxation, CuttingPlanes
 from reachjax.programs.windows import Window
-from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
+from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, Box, Polytope
 from reachjax.sets.unusable import ThinSetError
@@ -37,23 +36,6 @@ def boxed(X: AbstractSet, name: str) -> Box:
         return X.bounding_box()
     except (ValueError, ThinSetError) as error:
         raise ValueError(f"{name} cannot be used: {error}") from None
-
-
-class Reached(NamedTuple):
-    """The set of one step.
-
-    Attributes:
-        region: it surely holds the states.
-        proof: of that.
-        states: `(c, p)`, initial states that the proof thinks of as the worst, or scenarios, which
-            may end early; there may be none.
-        climb: whether ascents begin at them, one for each value that the set bounds.
-    """
-
-    region: AbstractSet
-    proof: AbstractProof
-    states: Float[np.ndarray, "c n_x"]
-    climb: bool
 
 
 @dataclasses.dataclass(frozen=True)

@@ -269,4 +269,4 @@ def of_cells(verdicts: list[Verdict]) -> Verdict:
 
 def _least(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """The smallest of every cell's margins."""
-    return {name: np.min([part[name] for part in parts], axis=0) for name in parts[0]}
+    return {name: np.fmin.reduce([part[name] for part in parts]) for name in parts[0]}

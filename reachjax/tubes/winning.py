@@ -10,9 +10,9 @@ outer one.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+import itertools
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import closing
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +21,6 @@ from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
-from reachjax.loops.units import UnboundedError
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     require_bar,
@@ -30,29 +29,25 @@ from reachjax.numerics.checks import (
     require_kind,
     same_size,
     whole_number,
-    wrapped,
 )
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.sets import Box
-from reachjax.tubes.cell_jobs import CellJobs
-from reachjax.tubes.cell_tasks import CellTask, bounded, fails_everywhere
+from reachjax.tubes.cell_tasks import CellTask, outcome_of
+from reachjax.tubes.cell_tree import CellTree, Node
 from reachjax.tubes.interruptions import Interrupted
-from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.propagation import known_numbers
 from reachjax.tubes.requirements import AvoidSets, Region, Timed, requirements
 from reachjax.tubes.seals import seal_of
-from reachjax.tubes.sieve import TOGETHER, CellVerdict, Ends, Margins, Sieve, no_margins
+from reachjax.tubes.searches import AbstractSearch, Bar, Question
+from reachjax.tubes.sieve import TOGETHER, Ends, Outcome, Sieve
 from reachjax.tubes.soundness import require_unbroken_cells
 from reachjax.tubes.verdicts import DecidedCell, VerdictStatus
 from reachjax.tubes.winning_sets import WinningSet
 
 LAST_PROGRAMS = 10
 """Linear programs that a bound may take in a cell that is not halved any more."""
-
-AHEAD = 2
-"""How many batches an executor is given for each of its workers: more are halved out of order."""
 
 ROOM = 0.2
 """Linear programs are tried where the least room of trajectories is at least this part of what is
@@ -63,6 +58,9 @@ INNER = 8
 
 NEARLY = 0.1
 """Coordinates whose influence differs by no more than this part are cut by turns."""
+
+Waiting = tuple[float, int, Node]
+"""A cell in a heap, the largest first."""
 
 LONGEST = 256
 """A side that is so many times as long as another one, in parts of the domain's, is cut first."""
@@ -103,7 +101,7 @@ def winning_set(
     time_limit: float | None = None,
     known: WinningSet | None = None,
     executor: Executor | None = None,
-    progress: Callable[[Iterable[Any]], Iterable[Any]] | None = None,
+    progress: Bar | None = None,
 ) -> WinningSet:
     """From which initial states of a box a specification holds: cells, refined at the boundary.
 
@@ -167,7 +165,9 @@ def winning_set(
         f"{number}: {item.name}, {item.time}, {item.inside}": (item.region, item.ball)
         for number, item in enumerate(required)
     }
-    seal, cells_so_far = seal_of(loop, domain, asked, start=start), [_whole(domain)]
+    seal = seal_of(loop, domain, asked, start=start)
+    ends = np.asarray(domain.lower), np.asarray(domain.upper)
+    given = [DecidedCell(*ends, VerdictStatus.UNKNOWN, np.nan)]
     if known is not None:
         require_kind("known", known, WinningSet, "a WinningSet, as winning_set(...) returns it")
         if not np.array_equal(known.seal, seal):
@@ -175,104 +175,77 @@ def winning_set(
                 "known must be of the same loop, domain, start, horizon and requirements, but of "
                 "another question arrived: what was proved of that says nothing of this one"
             )
-        cells_so_far = list(known.cells)
-    run = _Run(task, domain, cells_so_far, most, Budget.of(time_limit))
+        given = list(known.cells)
+    roots = [Node(cell.lower, cell.upper, found=cell) for cell in given]
+    search = _Winning(task, CellTree(domain, roots, most), Budget.of(time_limit))
     try:
-        with closing(run.results(executor)) as results:  # a bar may end before they do
-            for _ in wrapped(progress, results):
-                pass
+        search.run(executor, progress)
     except KeyboardInterrupt:
-        found = WinningSet(domain, tuple(run.done), seal)
+        found = WinningSet(domain, search.cells, seal)
         message = (
             f"interrupted with {len(found.cells)} cells: this exception's `found` is the winning "
             "set so far, and winning_set(..., known=found) goes on"
         )
         raise Interrupted(message, found) from None
-    require_unbroken_cells(loop, domain, horizon, start, required, run.done)
-    return WinningSet(domain, tuple(run.done), seal)
+    require_unbroken_cells(loop, domain, horizon, start, required, search.cells)
+    return WinningSet(domain, search.cells, seal)
 
 
-def _whole(domain: Box) -> DecidedCell:
-    lower, upper = np.asarray(domain.lower), np.asarray(domain.upper)
-    return DecidedCell(lower, upper, VerdictStatus.UNKNOWN, np.nan)
+class _Winning(AbstractSearch):
+    """The cells of a domain, of which the largest that are open are asked about first.
 
+    Each is a `DecidedCell`; those that programs are left to wait until no other is open.
+    """
 
-class _Run:
-    """The cells that are decided so far, and those that are open, the largest first."""
+    ahead = 2  # more would be halved out of order
 
-    def __init__(
-        self,
-        task: CellTask,
-        domain: Box,
-        cells: Sequence[DecidedCell],
-        most: int,
-        budget: Budget,
-    ):
-        self._task, self._most, self._budget = task, most, budget
-        self._scale = np.asarray(domain.upper) - np.asarray(domain.lower)
-        self._scale = np.where(self._scale > 0, self._scale, 1.0)
-        self.done = [cell for cell in cells if cell.status is not VerdictStatus.UNKNOWN]
-        self._open: list[tuple[float, int, DecidedCell]] = []
-        self._left: list[tuple[float, int, DecidedCell]] = []
-        self._count, self._number = len(cells), 0
-        for cell in cells:
-            if cell.status is VerdictStatus.UNKNOWN:
-                self._push(self._open, cell)
+    def __init__(self, task: CellTask, cells: CellTree, budget: Budget):
+        self._task, self._tree, self._budget = task, cells, budget
+        self._serial, self._last = itertools.count(), False
+        self._open, self._left = list[Waiting](), list[Waiting]()
+        for node in cells.leaves:
+            if node.found.status is VerdictStatus.UNKNOWN:
+                self._push(self._open, node)
 
-    def _push(self, cells: list[tuple[float, int, DecidedCell]], cell: DecidedCell) -> None:
-        self._number += 1
-        volume = float(np.prod((cell.upper - cell.lower) / self._scale))
-        heapq.heappush(cells, (-volume, self._number, cell))
+    @property
+    def cells(self) -> tuple[DecidedCell, ...]:
+        """What is known of all cells."""
+        return tuple(DecidedCell(*node.ends, *node.found[2:]) for node in self._tree.leaves)
 
-    def results(self, executor: Executor | None) -> Generator[int, None, None]:
-        """How many cells are decided, after each batch."""
-        try:
-            yield from self._decided(executor, self._open, TOGETHER, self._task._replace(nodes=0))
-            yield from self._decided(executor, self._left, 1, self._task)
-        finally:
-            self.done += [cell for _, _, cell in self._open + self._left]
+    def _push(self, waiting: list[Waiting], node: Node) -> None:
+        heapq.heappush(waiting, (-self._tree.volume(node), next(self._serial), node))
 
-    def _decided(
-        self,
-        executor: Executor | None,
-        cells: list[tuple[float, int, DecidedCell]],
-        together: int,
-        task: CellTask,
-    ) -> Iterator[int]:
-        """How many cells are decided, after each batch of some, the largest first."""
-        jobs = CellJobs[list[DecidedCell]](executor, AHEAD)
-        try:
-            while (cells and not self._budget.late) or jobs:
-                while cells and len(jobs) < jobs.most and not self._budget.late:
-                    batch = [heapq.heappop(cells)[2] for _ in range(min(together, len(cells)))]
-                    boxes = [(cell.lower, cell.upper) for cell in batch]
-                    jobs.submit(batch, sorted_cells, task, boxes, self._scale, self._budget)
-                for batch, results in jobs.finished():
-                    left = list(zip(batch, results, strict=True))
-                    try:
-                        while left:
-                            self._judged(*left[-1], task.by_programs)
-                            left.pop()
-                    except KeyboardInterrupt:
-                        self.done += [cell for cell, _ in left]
-                        raise
-                    yield len(self.done)
-        finally:
-            self.done += [cell for batch in jobs.cancelled() for cell in batch]
+    def question(self, asked: int, workers: int) -> Question | None:
+        """Trajectories and forms of many cells; or programs for one, once no others are open."""
+        self._last = not self._open and (self._last or not asked)
+        waiting, together = (self._left, 1) if self._last else (self._open, TOGETHER)
+        if self._budget.late or not waiting:
+            return None
+        nodes = [heapq.heappop(waiting)[-1] for _ in range(min(together, len(waiting)))]
+        task = self._task if self._last else self._task._replace(nodes=0)
+        boxes = [node.ends for node in nodes]
+        return Question(nodes, sorted_cells, (task, boxes, self._tree.sides, self._budget))
 
-    def _judged(self, cell: DecidedCell, found: Sorted, last: bool) -> None:
+    def answered(self, question: Question, answer: Sequence[Sorted]) -> int:
+        """How many cells are decided, as far as a bar is concerned."""
+        last = question.given[0] is self._task
+        for node, found in zip(question.nodes, answer, strict=True):
+            self._judge(node, found, last)
+        return self._tree.count - len(self._open) - len(self._left)
+
+    def _judge(self, node: Node, found: Sorted, last: bool) -> None:
         """Keep a cell, or halve it as long as there may be more, or leave it to programs."""
-        middle = cell.lower + (cell.upper - cell.lower) / 2
-        at, low, high = middle[found.axis], cell.lower[found.axis], cell.upper[found.axis]
-        if found.status is VerdictStatus.UNKNOWN and self._count < self._most and low < at < high:
-            self._count += 1
-            for end in ("lower", "upper"):
-                part = {end: np.where(np.arange(len(middle)) == found.axis, at, getattr(cell, end))}
-                self._push(self._open, cell._replace(margin=found.margin, **part))
+        undecided = found.status is VerdictStatus.UNKNOWN
+        node.found = node.found._replace(status=found.status, margin=found.margin)
+        if undecided and self._tree.can_halve(node, found.axis):
+            halves = self._tree.halved(node, found.axis)
+            for half in halves:
+                half.found = node.found
+            self._tree.replace(node, halves, found.axis)
+            for half in halves:
+                self._push(self._open, half)
         elif found.promising and self._task.by_programs and not last:
-            self._push(self._left, cell._replace(margin=found.margin))
-        else:
-            self.done.append(cell._replace(status=found.status, margin=found.margin))
+            self._push(self._left, node)
 
 
 @lenient
@@ -293,7 +266,7 @@ def sorted_cells(
         each = np.split(rooms, np.cumsum([len(part) for part in points])[:-1], axis=1)
         broken = [(part.min(axis=0) < 0) for part in each]
         alike = [number for number, some in enumerate(broken) if some.all() or not some.any()]
-        sifted: dict[int, CellVerdict] = {}
+        sifted: dict[int, Outcome] = {}
         if len(alike) >= ENOUGH:
             sieve = Sieve(task.loop, task.horizon, task.start, task.required)
             some = [boxes[number] for number in alike]
@@ -346,7 +319,7 @@ def _sorted(
     ends: Ends,
     scale: Float[np.ndarray, " n"],
     rooms: Float[np.ndarray, "r c"],
-    sifted: CellVerdict | None,
+    sifted: Outcome | None,
     budget: Budget,
 ) -> Sorted:
     """What is found of one box, given what trajectories from it do, and forms say of it."""
@@ -356,7 +329,8 @@ def _sorted(
     if sifted is None and budget.late:
         return Sorted(VerdictStatus.UNKNOWN, np.nan, _axis(least, widths))
     if sifted is None:
-        sifted = _bounded(task, Box(*ends), rooms)
+        broken = [bool(np.all(row < 0)) for row in rooms]
+        sifted = outcome_of(task, jax.device_get(Box(*ends)), budget, broken=broken)
     number = np.argmin([sifted.margins[item.name][item.time] for item in task.required])
     status = VerdictStatus.REFUTED if sifted.refuted else VerdictStatus.UNKNOWN
     status = VerdictStatus.PROVED if sifted.proved else status
@@ -367,40 +341,3 @@ def _sorted(
 def _promising(least: Float[np.ndarray, " c"], margin: float) -> bool:
     """Whether what trajectories leave as room is no small part of what a bound leaves open."""
     return bool(least.min() > 0 and least.min() >= ROOM * (least.min() - margin))
-
-
-def _bounded(task: CellTask, box: Box, rooms: Float[np.ndarray, "r c"]) -> CellVerdict:
-    """What forms and programs say of one box, given how trajectories from it fare."""
-    margins = no_margins(task.required, task.horizon)
-    try:
-        proved, refuted = _climbed(task, jax.device_get(box), rooms, margins)
-    except UnboundedError:  # of halves there may be bounds
-        proved = refuted = False
-    return CellVerdict(proved, refuted, margins)
-
-
-def _climbed(
-    task: CellTask, box: Box, rooms: Float[np.ndarray, "r c"], margins: Margins
-) -> tuple[bool, bool]:
-    """Whether a box is proved, or refuted; margins are noted as they are found.
-
-    Raises:
-        UnboundedError: a unit has no bounds over it.
-    """
-    scenarios = Scenarios.of(task.loop, box, task.horizon, task.start)
-    ladder = Ladder(task.loop, box, box, scenarios, task.start, task.nodes, Budget(work=WORK))
-    broken = [bool(np.all(row < 0)) for row in rooms]
-    middle, proved = scenarios.middle(np.asarray(box.center)), not any(broken)
-    for k in range(task.horizon + 1):
-        if k:
-            ladder.advance(tighten=False)
-        for item, fails in zip(task.required, broken, strict=True):
-            if item.time != k:
-                continue
-            if fails and fails_everywhere(item, ladder):
-                return False, True
-            if proved:
-                proved, margins[item.name][k] = bounded(item, ladder, box, middle)
-        if not (proved or any(broken)):
-            break
-    return proved, False

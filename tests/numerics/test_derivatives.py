@@ -22,7 +22,7 @@ def penalty(monkeypatch):
     def computed(*_, **__):
         raise RuntimeError("it is being computed")
 
-    monkeypatch.setattr(propagation, "_following", computed)
+    monkeypatch.setattr(propagation, "method_of", computed)
     loop = autonomous([[0.5]])
 
     def of(number):

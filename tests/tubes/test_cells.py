@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes.by_cells import _Node
+from reachjax.tubes.cell_tree import Node
 from tests.quick_cases import some
 
 PERIOD = 0.1
@@ -160,9 +160,9 @@ def test_a_facet_that_never_moves_is_done():
 
 def test_a_tree_may_be_deep():
     axes = [0, -1] * 2000 + [-1]
-    root = node = _Node(None, [], (0, 0))
+    root = node = Node(np.zeros(1), np.ones(1))
     for _ in range(2000):
-        node.axis, node.halves = 0, [_Node(None, [], (0, 0), node) for _ in range(2)]
+        node.axis, node.halves = 0, [Node(*node.ends, parent=node) for _ in range(2)]
         node = node.halves[1]
     assert root.axes == axes
 

@@ -15,7 +15,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.numerics import budget
-from reachjax.tubes import by_cells, by_programs, propagation, recurrence
+from reachjax.tubes import by_cells, by_programs, recurrence
 from tests.networks import he_network
 
 PATIENCE = 8.0
@@ -218,8 +218,7 @@ def test_steps_that_keep_to_their_shares_are_begun_and_others_are_not(
         return found
 
     monkeypatch.setattr(by_programs, "successors", slowly)
-    for module in (budget, propagation):
-        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(budget, "time", clock)
     given = small, rj.Box([1.0], [2.0]), 3, rj.Template.box(1), rj.LocalBounds()
     tube = rj.reach(*given, time_limit=9.0)
     assert len(begun) == by_programs_are

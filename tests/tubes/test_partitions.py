@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.sets.cells import grid, halves
+from reachjax.sets.cells import grid, halves_along
+from reachjax.tubes.cell_tree import CellTree, Node
 from tests.closed_loops import autonomous, closed_loop, random_loop, recursion
 
 RECURSION = {"relaxation": rj.LocalBounds(), "window": 1}
@@ -44,7 +45,7 @@ def test_cells_cover_the_set(name):
     # the vertices too, where there are some: cells that only touch the set hold them
     if isinstance(X, rj.PolyhedralSet):
         points = jnp.concatenate([points, X.vertices()])
-    for cells in (grid(X, (4, 4)), halves(X, X.bounding_box(), np.ones(2)), grid(X, (1, 1))):
+    for cells in (grid(X, (4, 4)), halves_along(X, X.bounding_box(), 1), grid(X, (1, 1))):
         inside = np.array([cell.part.contains(points, 1e-9) for cell in cells])
         assert inside.any(axis=0).all()
 
@@ -70,16 +71,17 @@ def test_cells_are_cut_in_every_dimension():
     cells = grid(X, (1, 2, 3))
     assert len(cells) == 6
     assert sum(cell.part.volume() for cell in cells) == pytest.approx(6.0)
-    lower, upper = halves(X, X, np.ones(3))
+    lower, upper = halves_along(X, X, 2)
     assert [lower.box.upper.tolist(), upper.box.upper.tolist()] == [[1, 2, 1.5], [1, 2, 3]]
-    assert halves(X, X, np.array([0.1, 2.0, 3.0]))[0].box.upper.tolist() == [0.5, 2, 3]
+    tree = CellTree.whole(X)
+    assert tree.longest(Node(np.zeros(3), np.array([0.6, 1.0, 1.5]))) == 0  # in parts of X's sides
 
 
 @pytest.mark.costly
 def test_cells_of_cells_have_no_more_facets():
     ball = rj.Ellipsoid([0.0, 0.0], np.eye(2))
-    half = halves(ball, ball.bounding_box(), np.ones(2))[0]
-    quarter = halves(ball, half.box, np.ones(2))[0]
+    half = halves_along(ball, ball.bounding_box(), 0)[0]
+    quarter = halves_along(ball, half.box, 1)[0]
     assert len(quarter.part.facts()) == len(half.part.facts()) == 4
 
 

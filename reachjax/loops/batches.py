@@ -46,6 +46,43 @@ def _evaluated(unit: AbstractUnit, *y: Batch) -> Batch:
     return Batch(np.asarray(unit(*values)))
 
 
+PARTS = tuple(k / 8 for k in range(1, 8))
+"""At these parts of a period states in between samples are looked at."""
+
+
+def in_between(
+    loop: ClosedLoop,
+    states: Float[np.ndarray, "c n_x"],
+    following: Float[np.ndarray, "c n_x"],
+    t: int,
+    disturbances: Float[np.ndarray, "c n_w"] | None = None,
+    noises: Float[np.ndarray, "c n_x"] | None = None,
+) -> Float[np.ndarray, "s c n_x"]:
+    """States in between two samples, as the cubic with the right ends and derivatives has them.
+
+    Args:
+        loop: of numpy arrays, with a differential equation for a plant.
+        states: at a sample.
+        following: at the next one.
+        t: the time of the former.
+        disturbances: those of the period, of a loop that has some.
+        noises: the same.
+    """
+    plant: Any = loop.plant
+    w, v = (None if part is None else Batch(part) for part in (disturbances, noises))
+    u = loop.input(Batch(states), t, _evaluated, v)
+    others, period = [u] if w is None else [u, w], float(plant.period)
+    first, last = (
+        period * plant.f.propagate((Batch(x), *others), _evaluated).values
+        for x in (states, following)
+    )
+    found = []
+    for s in PARTS:
+        ends = (1 - s) ** 2 * (1 + 2 * s) * states + s**2 * (3 - 2 * s) * following
+        found.append(ends + s * (1 - s) ** 2 * first - s**2 * (1 - s) * last)
+    return np.stack(found)
+
+
 def trajectories(
     loop: ClosedLoop,
     states: Float[np.ndarray, "c n_x"],

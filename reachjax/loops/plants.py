@@ -39,6 +39,11 @@ class AbstractPlant(Replaceable, abc.ABC):
         return 0
 
     @property
+    def continuous(self) -> bool:
+        """Whether there are states in between samples; not of a plant in discrete time."""
+        return False
+
+    @property
     def bends(self) -> bool:
         """Whether its successors bend smoothly by more than the units it has; not here."""
         return False

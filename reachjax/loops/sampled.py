@@ -125,6 +125,11 @@ class SampledPlant(AbstractPlant):
         return None
 
     @property
+    def continuous(self) -> bool:
+        """Whether there are states in between samples: there are."""
+        return True
+
+    @property
     def bends(self) -> bool:
         """Whether its successors bend smoothly, whatever its units are."""
         return True
@@ -166,7 +171,7 @@ class SampledPlant(AbstractPlant):
                 return unit(self.flow, *given)
         except UnboundedError as error:
             unit_of, _, lower, upper = error.given
-            raise UnboundedError(unit_of, t, lower, upper, line=error.line) from None
+            raise UnboundedError(unit_of, int(t), lower, upper, line=error.line) from None
 
     def _limits(self, given: tuple[Limits, ...]) -> Limits:
         """What limits lead to; nothing is known if they are infinite."""

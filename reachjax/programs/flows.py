@@ -34,7 +34,12 @@ class Between(NamedTuple):
 
     def values(self, directions: Float[Array | np.ndarray, "m n_x"]) -> list[AffineForms]:
         """Forms `(m,)` of directions, one of which each direction does not exceed at any time."""
-        return [directions @ point for four in self.points for point in four]
+        return [directions @ point for point in self.states]
+
+    @property
+    def states(self) -> list[AffineForms]:
+        """The control points, the last of which are states at the next sample."""
+        return [point for four in self.points for point in four]
 
     def bounds(
         self, directions: Float[Array | np.ndarray, "m n_x"], start: InitialColumns
@@ -91,7 +96,7 @@ def _condensed(
 
 def _expanded(found: TaylorModels, forms: AffineForms, symbols: Symbols) -> AffineForms:
     """Numbers of such symbols as forms over all columns."""
-    xp, count = namespace(forms.rows), symbols.count
+    xp, count = namespace(forms.rows), symbols.own
     first = xp.zeros((len(forms.rows), 2 + count))
     radii = xp.stack([forms.radii[:, 0], xp.zeros_like(forms.radii[:, 0])], axis=1)
     rest = AffineForms(xp.concatenate([first, forms.rows[:, 2 + count :]], axis=1), radii)

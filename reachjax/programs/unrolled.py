@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.functions import Compiled
@@ -131,13 +131,24 @@ def unrolled_from_boxes(
     lower: Float[Array, "c n_x"],
     upper: Float[Array, "c n_x"],
     directions: Float[Array, "N m n_x"],
+    whole: Bool[Array, "N m"] | None = None,
     t: int = 0,
 ) -> Float[Array, "c N m"]:
-    """Upper bounds of directions after 1, ..., N steps from each of many boxes, in one call."""
+    """Upper bounds of directions after 1, ..., N steps from each of many boxes, in one call.
+
+    Args:
+        loop: the closed loop.
+        lower: ends of the boxes.
+        upper: the same.
+        directions: one row a facet, for each step.
+        whole: which of them are bounded at all times since the sample before; None for none.
+        t: the time of the boxes.
+    """
 
     def one(lower: Float[Array, " n_x"], upper: Float[Array, " n_x"]) -> Float[Array, "N m"]:
         box = Box(lower, upper)
-        return unrolled_at_once(loop, box, box, directions, t).offsets
+        found = unrolled_at_once(loop, box, box, directions, t, between=whole is not None)
+        return found.offsets if whole is None else jnp.where(whole, found.between, found.offsets)
 
     return jax.vmap(one)(lower, upper)
 

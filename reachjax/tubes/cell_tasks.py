@@ -95,7 +95,8 @@ def _climbed(
     around = jax.device_get(boxed(jax.device_put(part), "X0"))
     scenarios = Scenarios.of(task.loop, part, task.horizon, task.start)
     limits = task.nodes, budget.with_work(WORK)
-    ladder = Ladder(task.loop, part, around, scenarios, task.start, *limits)
+    between = any(item.throughout for item in task.required)
+    ladder = Ladder(task.loop, part, around, scenarios, task.start, *limits, between=between)
     if by_forms and isinstance(part, Box) and not task.by_programs:
         ladder.advance(tighten=False)  # nothing but forms could be tried again
         axis = _axis(ladder, _first_open(task.required, margins))
@@ -134,9 +135,8 @@ def bounded(
     if item.time == 0:
         compared = item.compared_with(jax.device_put(part))
         return item.proved(compared), float(compared.margins.min())
-    rows, units = values_of(item, ladder)
-    uppers = rows.ends(ladder.horizon.start)[1]
-    bounds = uppers if item.inside else uppers.min(keepdims=True)
+    forms, units = values_of(item, ladder)
+    bounds = np.array([rows.ends(ladder.horizon.start)[1].min() for rows in forms])
     if not _all_right(item, bounds) and len(ladder.horizon.zero):
         bounds = ladder.bounds(target_of(item, ladder, None, middle)[0]).bounds
     return _all_right(item, bounds), float(np.min(-bounds / units))

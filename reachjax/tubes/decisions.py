@@ -148,7 +148,8 @@ def decide(
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     budget, (loop, X0) = Budget.of(time_limit), known_numbers("decide", loop, X0, "X0")
-    required = requirements(loop.states, horizon, goal, avoid, safe)
+    continuous = loop.plant.continuous
+    required = requirements(loop.states, horizon, goal, avoid, safe, continuous)
     simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     if cells is not None:
         parts = CellTree.over(X0, cells)
@@ -188,7 +189,9 @@ def _by_remedies(
         if not decision.ended:
             scenarios = Scenarios.of(on_host, begun, horizon, start)
             own = budget.with_work(np.inf if budget.timed else WORK)
-            ladder = Ladder(on_host, begun, around, scenarios, start, nodes, own)
+            between = any(item.throughout for item in required)
+            given = on_host, begun, around, scenarios, start, nodes, own
+            ladder = Ladder(*given, between=between)
             decision.climb(ladder, tighten=nodes > FIRST_PROGRAMS)
 
     by_cells, most = None, 1

@@ -6,13 +6,17 @@ Whoever decides notes here what it finds, in any order and from anywhere: `verif
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.batches import in_between
 from reachjax.loops.scenarios import Runs
+from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import TINY
 from reachjax.sets import AbstractSet
 from reachjax.tubes.refutations import counterexample, suspects
@@ -45,6 +49,7 @@ class Findings:
         required: Sequence[Requirement],
     ):
         self._loop, self._X0, self._start, self._required = loop, X0, start, required
+        self._on_host = in_numpy(loop)
         self._margins, self._simulated = (
             {item.name: np.full(horizon + 1, np.nan) for item in required} for _ in range(2)
         )
@@ -93,10 +98,23 @@ class Findings:
             return
         found = []
         for item in self._required if items is None else items:
-            rooms, row = item.simulated(runs.states), self._simulated[item.name]
+            rooms, row = self._rooms(item, runs), self._simulated[item.name]
             row[item.time] = np.fmin(row[item.time], rooms.min())
             found += suspects(item, rooms, runs)
         self.example = self.example or counterexample(self._loop, self._X0, found, self._start)
+
+    def _rooms(self, item: Requirement, runs: Runs) -> Float[np.ndarray, " c"]:
+        """How far each trajectory is on the right side, in between samples too if that is meant."""
+        rooms, t = item.simulated(runs.states), item.time - 1
+        if not item.throughout:
+            return rooms
+        _, *drawn = self._loop.split(runs.scenarios)
+        at = [None if part is None else np.asarray(part[:, t]) for part in drawn]
+        ends = runs.states[:, t], runs.states[:, t + 1]
+        with np.errstate(all="ignore"):
+            dense = in_between(self._on_host, *ends, self._start + t, *at)
+        here = dataclasses.replace(item, time=0)
+        return np.fmin.reduce([rooms, *(here.simulated(states[:, None]) for states in dense)])
 
     def verdict(self, ends: Mapping[Any, int] | None = None, **more: Any) -> Verdict:
         """The verdict from everything proved and simulated so far.

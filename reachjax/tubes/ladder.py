@@ -114,6 +114,7 @@ class Ladder:
         nodes: how many linear programs a bound may take.
         budget: what all linear programs may take, work in rows and columns, squared.
         note: is told what happens.
+        between: whether what is in between samples is to be bounded too.
 
     Attributes:
         horizon: forms and facts.
@@ -129,11 +130,12 @@ class Ladder:
         nodes: int,
         budget: Budget,
         note: Callable[[str], None] = lambda note: None,
+        between: bool = False,
     ):
         self._note, self._scenarios = note, scenarios
         self._middle = scenarios.middle(np.asarray(box.center))
         self._loop, self._t, self._nodes, self._budget = loop, t, nodes, budget
-        self.horizon = Horizon(loop, X0, box, t)
+        self.horizon = Horizon(loop, X0, box, t, between)
         start = self.horizon.start
         columns = start.spread.shape[1]
         self._programs = (

@@ -16,7 +16,13 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
-from reachjax.numerics.checks import floats_of, owned, require_double_precision, whole_number
+from reachjax.numerics.checks import (
+    floats_of,
+    is_concrete,
+    owned,
+    require_double_precision,
+    whole_number,
+)
 from reachjax.numerics.files import writable
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
@@ -24,7 +30,7 @@ from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.proofs.witnesses import initial_states
-from reachjax.sets import AbstractSet, AbstractTemplate
+from reachjax.sets import AbstractSet, AbstractTemplate, Polytope
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.displays import SAMPLES as SHOWN
 from reachjax.tubes.displays import display, picture, table
@@ -40,6 +46,7 @@ from reachjax.tubes.propagation import (
     propagated,
 )
 from reachjax.tubes.seals import Seal, require_sealed, seal_of
+from reachjax.tubes.spans import spans_by_forms
 from reachjax.tubes.tables import frame, rows
 
 if TYPE_CHECKING:
@@ -118,6 +125,28 @@ class ReachTube(Replaceable):
     def __repr__(self) -> str:
         sets = self.template.summary
         return f"ReachTube(horizon={self.horizon}, {sets}, states={self.loop.states})"
+
+    @property
+    def spans(self) -> tuple[Polytope, ...]:
+        """Sets that hold all states from each sample to the next one, of a differential equation.
+
+        They have the directions of the tube's own sets, of ellipsoids the axes, and are bounded by
+        affine forms. Of known numbers they are kept.
+
+        Raises:
+            TypeError: the plant is one in discrete time, which has no states in between.
+        """
+        if not self.loop.plant.continuous:
+            raise TypeError(
+                "a plant in discrete time has no states in between samples: spans are of a "
+                "SampledPlant"
+            )
+        kept = self.__dict__.get("_spans")
+        if kept is None:
+            kept = spans_by_forms(self.loop, self.sets[0], self.template, self.horizon, self.start)
+            if is_concrete(kept):
+                object.__setattr__(self, "_spans", kept)
+        return kept
 
     @property
     def horizon(self) -> int:

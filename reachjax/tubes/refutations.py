@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.batches import PARTS
 from reachjax.loops.closed_loop import Scenario
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.host import in_numpy
@@ -61,7 +62,10 @@ def counterexample(
     on_host = in_numpy(loop)
     for room, item, scenario, states in ordered:
         drawn = loop.split(scenario)
-        if scenarios.surely_contains(scenario) and surely_broken(on_host, item, drawn, start):
+        if not scenarios.surely_contains(scenario):
+            continue
+        part = broken_at(on_host, item, drawn, start)
+        if part is not None:
             _, w, v = drawn
             noises = [None] * (len(states) - 1) if v is None else v
             inputs = [
@@ -69,14 +73,32 @@ def counterexample(
                 for t, (x, noise) in enumerate(zip(states[:-1], noises, strict=True))
             ]
             parts = item.name, item.time, -room, states, np.stack(inputs)
-            return Counterexample(*parts, disturbances=w, noises=v)
+            plant: Any = on_host.plant
+            instant = (item.time - 1 + part) * float(plant.period) if plant.continuous else None
+            return Counterexample(*parts, disturbances=w, noises=v, instant=instant)
     return None
 
 
-def surely_broken(loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int) -> bool:
-    """Whether the exact trajectory of a scenario breaks a requirement, rounding accounted for."""
-    *_, reached = enclosures(loop, scenario, item.time, start)
-    return most_room(item, reached) < 0
+def broken_at(loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int) -> float | None:
+    """Where the exact trajectory of a scenario surely breaks a requirement, rounding accounted for.
+
+    Returns:
+        The part of the period before, 1 at the sample; None where that is not known.
+    """
+    reached = enclosures(loop, scenario, item.time, start)
+    if most_room(item, reached[-1]) < 0:
+        return 1.0
+    if not item.throughout:
+        return None
+    plant: Any = loop.plant
+    t, before = item.time - 1, reached[-2]
+    drawn = [None if each is None else each[t] for each in scenario[1:]]
+    for part in PARTS:
+        shorter = in_numpy(loop.replace(plant=plant.replace(period=part * plant.period)))
+        held = start + t, *drawn
+        if most_room(item, successor_box(shorter, before, *held)) < 0:
+            return part
+    return None
 
 
 def enclosures(loop: ClosedLoop, scenario: Scenario, steps: int, start: int) -> list[Box]:

@@ -57,6 +57,7 @@ class Requirement:
             around it where they must not.
         inside: whether states must be in it, or out of it.
         ball: the ellipsoid; None of other sets.
+        throughout: whether it is meant at all times since the sample before.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Requirement:
     region: PolyhedralSet
     inside: bool
     ball: Ellipsoid | None = None
+    throughout: bool = False
 
     @property
     def looser(self) -> PolyhedralSet:
@@ -74,7 +76,11 @@ class Requirement:
 
     def compared(self, tube: ReachTube) -> Compared:
         """What every state surely does not exceed, and should not: of each facet, or of the set."""
-        return self.compared_with(tube.sets[self.time])
+        return self.compared_with(self.holding(tube))
+
+    def holding(self, tube: ReachTube) -> AbstractSet:
+        """The set of a tube that holds all states which the requirement is about."""
+        return tube.spans[self.time - 1] if self.throughout else tube.sets[self.time]
 
     def compared_with(self, reached: AbstractSet, by_offsets: bool = False) -> Compared:
         """What states of a set surely do not exceed, and should not: of each facet, or of the set.
@@ -123,7 +129,8 @@ def of_tube(
     """
     require_kind("tube", tube, ReachTube, "a ReachTube, as reach(...) returns it")
     tube.require_sealed()
-    return requirements(tube.loop.states, tube.horizon, goal, avoid, safe)
+    continuous = tube.loop.plant.continuous
+    return requirements(tube.loop.states, tube.horizon, goal, avoid, safe, continuous)
 
 
 def requirements(
@@ -132,8 +139,18 @@ def requirements(
     goal: Timed | None,
     avoid: AvoidSets | None,
     safe: Region | None,
+    continuous: bool = False,
 ) -> list[Requirement]:
     """A specification's requirements, one for each set and time.
+
+    Args:
+        states: of the loop.
+        horizon: the number of steps.
+        goal: where states must be, at samples.
+        avoid: where they must not be.
+        safe: where they must be all along.
+        continuous: whether the latter two are meant at all times, in between samples too: at a
+            sample, since the one before.
 
     Raises:
         TypeError: a set is no Box, Polytope or Ellipsoid, or a time no whole number.
@@ -154,7 +171,12 @@ def requirements(
             known[key] = _checked(item, states)
     checked = (known[id(item.region), item.inside] for item in found)
     return [
-        dataclasses.replace(one, name=item.name, time=item.time)
+        dataclasses.replace(
+            one,
+            name=item.name,
+            time=item.time,
+            throughout=continuous and item.time > 0 and item.name != "goal",
+        )
         for one, item in zip(checked, found, strict=True)
     ]
 
@@ -245,7 +267,7 @@ def shortfall(
     check_margin(margin)
     missing = jnp.zeros(())
     for item in of_tube(tube, goal, avoid, safe):
-        margins = item.compared_with(tube.sets[item.time], by_offsets=True).margins
+        margins = item.compared_with(item.holding(tube), by_offsets=True).margins
         missing += jnp.sum(jnp.maximum(0.0, margin - margins))
     return missing
 

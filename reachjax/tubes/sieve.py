@@ -164,9 +164,12 @@ class Sieve:
             self._rows.append(_Rows.of(item, int(ends[item.time])))
             ends[item.time] = self._rows[-1].end
         directions = np.zeros((horizon + 1, int(ends.max()), loop.states))
+        whole = np.zeros(directions.shape[:2], dtype=bool)
         for rows in self._rows:
             directions[rows.item.time, rows.first : rows.end] = rows.directions
+            whole[rows.item.time, rows.first : rows.end] = rows.item.throughout
         self._directions, self._later = directions, jnp.asarray(directions[1:])
+        self._whole = jnp.asarray(whole[1:]) if whole.any() else None
 
     def pays(self, cells: Sequence[Ends], budget: Budget) -> bool:
         """Whether the compiled call is there, and faster than what these cells take one by one.
@@ -188,7 +191,9 @@ class Sieve:
         """The seconds that a call takes one by one; None where this cell has no bounds."""
         box, began = in_numpy(Box(*cell)), time.perf_counter()
         try:
-            list(unrolled(self._on_host, box, box, self._directions[1:], self._start))
+            between = self._whole is not None
+            given = self._on_host, box, box, self._directions[1:], self._start
+            list(unrolled(*given, between=between))
         except UnboundedError:
             return None
         return TOGETHER * (time.perf_counter() - began)
@@ -197,11 +202,11 @@ class Sieve:
         """The arguments of the compiled call."""
         filled = [*cells, *[cells[-1]] * (TOGETHER - len(cells))]
         lower, upper = (np.stack(ends) for ends in zip(*filled, strict=True))
-        return self._loop, lower, upper, self._later
+        return self._loop, lower, upper, self._later, self._whole
 
     def sifted(self, cells: Sequence[Ends]) -> list[Outcome]:
         """What is found of each cell, at most `TOGETHER` of them."""
-        _, lower, upper, _ = given = self._given(cells)
+        _, lower, upper, *_ = given = self._given(cells)
         bounds = SIFT(*given, t=self._start)
         first = _at_first(self._directions[0], lower, upper)
         bounds = np.concatenate([first[:, None], bounds], axis=1)

@@ -29,15 +29,16 @@ def target_of(
         The target, and what a distance of 1 in the units of the state changes its values by.
     """
     C, d, norms = _facets(item)
-    rows, units = values_of(item, ladder)
-    forms = [rows[i : i + 1] for i in range(len(d))] if item.inside else [rows]
+    forms, units = values_of(item, ladder)
+    unknown = len(forms) - (len(d) if item.inside else 1)  # those in between samples
 
     def values(after: np.ndarray) -> np.ndarray:
         excess = after @ C.T - d
-        return excess if item.inside else (-excess / norms).min(axis=1, keepdims=True)
+        found = excess if item.inside else (-excess / norms).min(axis=1, keepdims=True)
+        return np.concatenate([np.full((len(found), unknown), -np.inf), found], axis=1)
 
-    lower, upper = rows.ends(ladder.horizon.start)
-    sizes = upper - lower if item.inside else [np.max(upper - lower)]
+    ends = [rows.ends(ladder.horizon.start) for rows in forms]
+    sizes = [np.max(upper - lower) for lower, upper in ends]
 
     def enough(number: int, bound: float, attained: float) -> bool:
         return bound <= -BELOW * sizes[number] or attained > 0
@@ -49,17 +50,34 @@ def target_of(
     return Target(forms, values, enough, known), units
 
 
-def values_of(item: Requirement, ladder: Ladder) -> tuple[AffineForms, Float[np.ndarray, " k"]]:
-    """Forms of which all must be below zero, or if states must be outside, one at each state.
+def values_of(
+    item: Requirement, ladder: Ladder
+) -> tuple[list[AffineForms], Float[np.ndarray, " g"]]:
+    """Groups of forms: in each, one must be below zero at each state.
+
+    In between samples all control points must be on the right side: of a set to be avoided, of one
+    facet that is the same for all of them, as their hull is then too.
 
     Returns:
-        The forms, and what a distance of 1 in the units of the state changes them by.
+        The groups, and what a distance of 1 in the units of the state changes their values by.
     """
     C, d, norms = _facets(item)
-    state = ladder.horizon.state
+    horizon = ladder.horizon
+    states = [horizon.state]
+    if item.throughout:
+        assert horizon.spans  # they were asked for
+        states = [point.padded(horizon.width) for point in horizon.spans[-1].states]
     if item.inside:
-        return C @ state + (-d), norms
-    return (1 / norms) * (d - C @ state), np.ones(1)
+        every = [C @ state + (-d) for state in states]
+        return [rows[i : i + 1] for rows in every for i in range(len(d))], np.tile(
+            norms, len(every)
+        )
+    every = [(1 / norms) * (d - C @ state) for state in states]
+    if item.throughout:
+        uppers = np.max([rows.ends(horizon.start)[1] for rows in every], axis=0)
+        best = int(np.argmin(np.nan_to_num(uppers, nan=np.inf)))
+        every = [rows[best : best + 1] for rows in every]
+    return every, np.ones(len(every))
 
 
 def _facets(item: Requirement) -> list[np.ndarray]:

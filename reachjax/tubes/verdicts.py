@@ -47,6 +47,8 @@ class Counterexample:
         inputs: `(horizon, n_u)`.
         disturbances: `(horizon, n_w)`; None of a loop without.
         noises: `(horizon, n_x)`; None of a loop without.
+        instant: when, in the plant's units of time, of a differential equation: it may be in
+            between the sample at `time` and the one before.
     """
 
     requirement: str
@@ -56,6 +58,7 @@ class Counterexample:
     inputs: Float[np.ndarray, "h n_u"]
     disturbances: Float[np.ndarray, "h n_w"] | None = None
     noises: Float[np.ndarray, "h n_x"] | None = None
+    instant: float | None = None
 
 
 class DecidedCell(NamedTuple):

@@ -185,7 +185,7 @@ def _refreshed(
         The state, and the other arguments, of these symbols.
     """
     xp, n, (initial, curved, radii) = namespace(state.rows), len(state), state.symbols
-    first = 1 + state.symbols.count
+    first = 1 + state.symbols.own
     own = abs(state.rows[:, first:]) @ radii * (1 + gamma(len(radii))) + state.radii
     symbols = Symbols(initial, curved, xp.concatenate([own * (1 + gamma(2)), radii[n:]]))
     eye = xp.eye(n, len(radii))
@@ -197,7 +197,7 @@ def _refreshed(
 def _composed(found: TaylorModels, state: TaylorModels) -> TaylorModels:
     """What was found of a state's new symbols, of the state's own ones."""
     xp, n, symbols = namespace(found.rows), len(state), state.symbols
-    first = 1 + symbols.count
+    first = 1 + symbols.own
     slope, own = found.rows[:, first : first + n], state.rows[:, first:]
     more = xp.concatenate([xp.zeros((len(found), n)), found.rows[:, first + n :]], axis=1)
     rows = xp.concatenate([found.rows[:, :first], slope @ own + more], axis=1)

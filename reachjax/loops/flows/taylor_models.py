@@ -52,7 +52,7 @@ class Symbols(NamedTuple):
         return _pairs(self.initial if self.curved else 0)
 
     @property
-    def count(self) -> int:
+    def own(self) -> int:
         """How many `w` and products of them there are."""
         return self.initial + len(self.pairs[0])
 
@@ -83,7 +83,7 @@ class TaylorModels(AbstractNumber):
     @cached_property
     def _parts(self) -> tuple[Any, Any, Any]:
         """Sizes of what is linear in `w`, of products of `w`, and of what is of other symbols."""
-        n, count = self.symbols.initial, self.symbols.count
+        n, count = self.symbols.initial, self.symbols.own
         sizes = abs(self.rows[:, 1:])
         error = 1 + gamma(self.rows.shape[1])
         others = sizes[:, count:] @ self.symbols.radii
@@ -157,7 +157,7 @@ class TaylorModels(AbstractNumber):
     def times(self, other: TaylorModels) -> TaylorModels:
         """Products, entry by entry, without what is of degree three."""
         xp, symbols = namespace(self.rows, other.rows), self.symbols
-        n, count, (i, j) = symbols.initial, symbols.count, symbols.pairs
+        n, count, (i, j) = symbols.initial, symbols.own, symbols.pairs
         a, b = self.rows, other.rows
         center, another = a[:, :1], b[:, :1]
         rows = center * b + another * a

@@ -73,7 +73,7 @@ def in_between(
     u = loop.input(Batch(states), t, _evaluated, v)
     others, period = [u] if w is None else [u, w], float(plant.period)
     first, last = (
-        period * plant.f.propagate((Batch(x), *others), _evaluated).values
+        period * plant.flow.rate((Batch(x), *others), _evaluated).values
         for x in (states, following)
     )
     found = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 from typing import Any
 
 import jax
@@ -9,23 +10,155 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.loops.flows.flow import Flow
+from reachjax.loops.flows.flow import AbstractFlow, Flow
+from reachjax.loops.flows.linear import LinearFlow
 from reachjax.loops.flows.series import Tape
 from reachjax.loops.flows.steps import Settings
 from reachjax.loops.functions import Function
 from reachjax.loops.limits import Limits
-from reachjax.loops.plants import AbstractPlant
+from reachjax.loops.plants import AbstractPlant, AffinePlant
 from reachjax.loops.units import AtUnit, UnboundedError, evaluate
 from reachjax.loops.values import UnsupportedError, Value
-from reachjax.numerics.checks import is_concrete, real_number, whole_number
-from reachjax.numerics.pytrees import pytree, static
-from reachjax.numerics.rounding import Ball
+from reachjax.numerics.checks import Numbers, is_concrete, real_number, whole_number
+from reachjax.numerics.pytrees import converted, pytree, static
+from reachjax.numerics.rounding import Ball, namespace
 
 NAME = "SampledPlant"
 
 
+def _period(value: Any, name: str = f"{NAME}.period") -> Any:
+    """The time between two samples.
+
+    Raises:
+        TypeError: it is no number.
+        ValueError: it is not above zero.
+    """
+    if is_concrete(value) and real_number(name, value, 0) == 0:
+        raise ValueError(f"{name} must be above 0, but {float(value)} arrived")
+    return jnp.asarray(value, float)
+
+
+class AbstractSampledPlant(AbstractPlant):
+    """A plant in continuous time, whose input is held over each period.
+
+    The states of a loop are those at its samples.
+    """
+
+    period: Float[Array | np.ndarray, ""]
+
+    @property
+    @abc.abstractmethod
+    def flow(self) -> AbstractFlow:
+        """Its flow over one period."""
+
+    @property
+    def steps(self) -> int | None:
+        """No number of steps: the differential equation does not know the time."""
+        return None
+
+    @property
+    def continuous(self) -> bool:
+        """Whether there are states in between samples: there are."""
+        return True
+
+    @property
+    def bends(self) -> bool:
+        """Whether its successors bend smoothly, whatever its units are."""
+        return True
+
+    def propagate(
+        self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
+    ) -> Any:
+        """The state a period after `x` under input `u` and disturbances `w`.
+
+        Of plain numbers it is integrated, of intervals enclosed. What other kinds of number make of
+        it is done at a layer of units, the `Flow`.
+
+        Raises:
+            UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
+        """
+        if self.disturbances and w is None:
+            w = np.zeros((self.disturbances, self.states)) @ x
+        given = (x, u) if w is None else (x, u, w)
+        if isinstance(x, np.ndarray | jax.Array) or hasattr(x, "values"):
+            return self.flow.simulated(given, unit)
+        try:
+            with np.errstate(all="ignore"):  # what overflows has no bounds
+                if type(x) is Ball:
+                    return self.flow.enclosed(tuple(map(_interval, given)))
+                if isinstance(x, Limits):
+                    return self._limits(given)
+                return unit(self.flow, *given)
+        except UnboundedError as error:
+            unit_of, _, lower, upper = error.given
+            raise UnboundedError(unit_of, int(t), lower, upper, line=error.line) from None
+
+    def _limits(self, given: tuple[Limits, ...]) -> Limits:
+        """What limits lead to; nothing is known if they are infinite."""
+        ends = [(each.least, each.most) for each in given]
+        if not np.isfinite(ends[0]).all() or not np.isfinite(ends[1]).all():
+            return Limits.unknown(self.states)
+        found = self.flow.enclosed(tuple(Ball.between(*each) for each in ends))
+        return Limits(np.asarray(found.lower), np.asarray(found.upper))
+
+
 @pytree
-class SampledPlant(AbstractPlant):
+class SampledAffinePlant(AbstractSampledPlant):
+    """The affine differential equation `dx/dt = A x + B u + c + E w`, input held over each period.
+
+    It is sampled exactly, by an enclosed matrix exponential, however fast it is. It comes from
+    `SampledPlant.affine`.
+
+    Args:
+        A: `(n_x, n_x)`, per unit of time.
+        B: `(n_x, n_u)`.
+        c: `(n_x,)`; zero when left out.
+        period: the time between two samples.
+        E: `(n_x, n_w)`, how disturbances enter; none when left out.
+        held: whether disturbances are constant over each period.
+        fewest: steps in between samples, in compiled code.
+
+    Raises:
+        TypeError: an argument is not numeric.
+        ValueError: shapes disagree, an entry is not finite, or the period is not above zero.
+    """
+
+    A: Float[Array, "n n"] = converted(converter=Numbers("(n_x, n_x)"))
+    B: Float[Array, "n m"] = converted(converter=Numbers("(n_x, n_u)"))
+    c: Float[Array, " n"] = converted(converter=Numbers("(n_x,)"))
+    period: Float[Array | np.ndarray, ""] = converted(converter=_period)
+    E: Float[Array, "n w"] | None = converted(converter=Numbers("(n_x, n_w)"), default=None)
+    held: bool = static(default=False)
+    fewest: int = static(default=1)
+
+    def __post_init__(self):
+        AffinePlant(self.A, self.B, self.c, self.E)  # its errors name what is wrong
+
+    @property
+    def states(self) -> int:
+        """The number `n_x` of states."""
+        return self.A.shape[-1]
+
+    @property
+    def inputs(self) -> int:
+        """The number `n_u` of inputs."""
+        return self.B.shape[-1]
+
+    @property
+    def disturbances(self) -> int:
+        """The number `n_w` of disturbances."""
+        return 0 if self.E is None else self.E.shape[-1]
+
+    @property
+    def flow(self) -> LinearFlow:
+        """Its flow over one period."""
+        parts = [self.A, self.B, *([] if self.E is None else [self.E]), self.c[:, None]]
+        matrix = namespace(self.A).concatenate(parts, axis=1)
+        return LinearFlow(matrix, Settings(self.period, None, self.fewest, self.held))
+
+
+@pytree
+class SampledPlant(AbstractSampledPlant):
     """A differential equation `dx/dt = f(x, u, w)`, whose input is held over each period.
 
     The states of a loop are those at its samples. They are enclosed by Taylor models, rounding and
@@ -82,11 +215,9 @@ class SampledPlant(AbstractPlant):
             m = whole_number(f"{NAME}.inputs", inputs, 1)
             d = whole_number(f"{NAME}.disturbances", disturbances, 0)
             f = Function.of(f, (n, m, d) if d else (n, m), n, f"{NAME}.f")
-        if is_concrete(period) and real_number(f"{NAME}.period", period, 0) == 0:
-            raise ValueError(f"{NAME}.period must be above 0, but {float(period)} arrived")
         order = None if order is None else whole_number(f"{NAME}.order", order, 1)
         steps = 1 if steps is None else whole_number(f"{NAME}.steps", steps, 1)
-        self._set(f=f, period=jnp.asarray(period, float), order=order, held=bool(held))
+        self._set(f=f, period=_period(period), order=order, held=bool(held))
         self._set(fewest=1 << (steps - 1).bit_length())  # parts of a period are exact
         try:
             jax.eval_shape(lambda plant: plant.period * len(plant.flow.tape.nodes), self)
@@ -120,21 +251,6 @@ class SampledPlant(AbstractPlant):
         return sum(self.f.structure.inputs[2:])
 
     @property
-    def steps(self) -> int | None:
-        """No number of steps: the function does not know the time."""
-        return None
-
-    @property
-    def continuous(self) -> bool:
-        """Whether there are states in between samples: there are."""
-        return True
-
-    @property
-    def bends(self) -> bool:
-        """Whether its successors bend smoothly, whatever its units are."""
-        return True
-
-    @property
     def flow(self) -> Flow:
         """Its flow over one period; of numpy arrays it is kept."""
         on_host = all(isinstance(each, np.ndarray) for each in jax.tree.leaves(self))
@@ -146,40 +262,32 @@ class SampledPlant(AbstractPlant):
                 object.__setattr__(self, "_flow", kept)
         return kept
 
-    def propagate(
-        self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
-    ) -> Any:
-        """The state a period after `x` under input `u` and disturbances `w`.
+    @staticmethod
+    def affine(
+        A: Any, B: Any, c: Any = None, *, period: Any, E: Any = None, held: bool = False
+    ) -> SampledAffinePlant:
+        """The plant `dx/dt = A x + B u + c + E w`, sampled exactly.
 
-        Of plain numbers it is integrated, of intervals enclosed. What other kinds of number make of
-        it is done at a layer of units, the `Flow`.
+        Args:
+            A: `(n_x, n_x)`, per unit of time.
+            B: `(n_x, n_u)`.
+            c: `(n_x,)`; zero when left out.
+            period: the time between two samples.
+            E: `(n_x, n_w)`, how disturbances enter; none when left out.
+            held: whether disturbances are constant over each period.
 
         Raises:
-            UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
-        """
-        if self.disturbances and w is None:
-            w = np.zeros((self.disturbances, self.states)) @ x
-        given = (x, u) if w is None else (x, u, w)
-        if isinstance(x, np.ndarray | jax.Array) or hasattr(x, "values"):
-            return self.flow.simulated(given, unit)
-        try:
-            with np.errstate(all="ignore"):  # what overflows has no bounds
-                if type(x) is Ball:
-                    return self.flow.enclosed(tuple(map(_interval, given))).state.ball
-                if isinstance(x, Limits):
-                    return self._limits(given)
-                return unit(self.flow, *given)
-        except UnboundedError as error:
-            unit_of, _, lower, upper = error.given
-            raise UnboundedError(unit_of, int(t), lower, upper, line=error.line) from None
+            TypeError: an argument is not numeric.
+            ValueError: shapes disagree, an entry is not finite, or the period is not above zero.
 
-    def _limits(self, given: tuple[Limits, ...]) -> Limits:
-        """What limits lead to; nothing is known if they are infinite."""
-        ends = [(each.least, each.most) for each in given]
-        if not np.isfinite(ends[0]).all() or not np.isfinite(ends[1]).all():
-            return Limits.unknown(self.states)
-        found = self.flow.enclosed(tuple(Ball.between(*each) for each in ends)).state.ball
-        return Limits(np.asarray(found.lower), np.asarray(found.upper))
+        Example:
+            >>> plant = SampledPlant.affine([[0, 1], [0, 0]], [[0], [1]], period=0.5)
+            >>> plant.propagate(jnp.array([1.0, 0.0]), jnp.array([1.0])).round(6).tolist()
+            [1.125, 0.5]
+        """
+        A = Numbers("(n_x, n_x)")(A, "SampledPlant.affine's A")
+        c = jnp.zeros(len(A)) if c is None else c
+        return SampledAffinePlant(A, B, c, period, E, bool(held))
 
 
 def _interval(number: Any) -> Ball:

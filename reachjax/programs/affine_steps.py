@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.flows.flow import Flow
+from reachjax.loops.flows.flow import AbstractFlow
 from reachjax.loops.limits import Limits
 from reachjax.loops.units import AbstractUnit, Bilinear, Quadratic, SmoothUnit, UnboundedError
 from reachjax.numerics.rounding import TINY, Ball, gamma, namespace
@@ -144,7 +144,7 @@ def step_forms(
         nonlocal done, width, free
         if place is None:  # branches that began alike must not share the columns they add
             given = tuple(y.padded(width) for y in given)
-        if isinstance(unit, Flow):
+        if isinstance(unit, AbstractFlow):
             successor, between = flowed_forms(unit, given, start, spans is not None)
             if spans is not None:
                 spans.append(between)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.loops.flows.flow import Flow
+from reachjax.loops.flows.flow import AbstractFlow
 from reachjax.loops.flows.taylor_models import Symbols, TaylorModels
 from reachjax.numerics.rounding import Ball, gamma, larger, namespace
 from reachjax.programs.affine import AffineForms, joined
@@ -54,7 +54,7 @@ class Between(NamedTuple):
 
 
 def flowed_forms(
-    flow: Flow, given: tuple[AffineForms, ...], start: InitialColumns, between: bool = False
+    flow: AbstractFlow, given: tuple[AffineForms, ...], start: InitialColumns, between: bool = False
 ) -> tuple[AffineForms, Between]:
     """The state after one period, and those in between if they are asked for.
 

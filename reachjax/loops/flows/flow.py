@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 from typing import Any
 
@@ -14,41 +15,23 @@ from reachjax.loops.units import AtUnit
 from reachjax.numerics.rounding import Ball
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Flow:
-    """What a state is led to within a period, under an input that is held.
+class AbstractFlow(abc.ABC):
+    """What a state is led to within a period, under an input that is held."""
 
-    Attributes:
-        f: the right-hand side, of a state, an input and perhaps disturbances.
-        tape: of `f`.
-        settings: how a period is done.
-    """
+    @abc.abstractmethod
+    def rate(self, given: tuple[Any, ...], unit: AtUnit) -> Any:
+        """The derivative of the state, of any kind of number.
 
-    f: Function
-    tape: Tape
-    settings: Settings
-
-    def simulated(self, given: tuple[Any, ...], unit: AtUnit) -> Any:
-        """The state afterwards, of numbers that nothing is proved of."""
-        x, *others = given
-
-        def rate(x: Any) -> Any:
-            return self.f.propagate((x, *others), unit)
-
-        return integrated(rate, x, self.settings.period, max(2, self.settings.steps))
-
-    def enclosed(self, given: tuple[Ball, ...], between: bool = False) -> Flowed:
-        """What intervals lead to, as Taylor models of them.
-
-        Raises:
-            UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
+        Args:
+            given: the state, the input, and disturbances if there are any.
+            unit: what is done at a layer of units.
         """
-        models, first, parts = TaylorModels.of(joined([*given])), 0, list[TaylorModels]()
-        for each in given:
-            parts.append(models[first : first + len(each.mid)])
-            first += len(each.mid)
-        return self.followed(parts, given[0], between)
 
+    @abc.abstractmethod
+    def simulated(self, given: tuple[Any, ...], unit: AtUnit) -> Any:
+        """The state afterwards, of numbers that nothing is proved of; arguments as of `rate`."""
+
+    @abc.abstractmethod
     def followed(self, given: list[TaylorModels], box: Ball, between: bool = False) -> Flowed:
         """What Taylor models lead to.
 
@@ -60,5 +43,45 @@ class Flow:
         Raises:
             UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
         """
+
+    def enclosed(self, given: tuple[Ball, ...]) -> Ball:
+        """What intervals lead to.
+
+        Raises:
+            UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
+        """
+        models, first, parts = TaylorModels.of(joined([*given])), 0, list[TaylorModels]()
+        for each in given:
+            parts.append(models[first : first + len(each)])
+            first += len(each)
+        return self.followed(parts, given[0]).state.ball
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Flow(AbstractFlow):
+    """The flow of any function, by Taylor models.
+
+    Attributes:
+        f: the right-hand side, of a state, an input and perhaps disturbances.
+        tape: of `f`.
+        settings: how a period is done.
+    """
+
+    f: Function
+    tape: Tape
+    settings: Settings
+
+    def rate(self, given: tuple[Any, ...], unit: AtUnit) -> Any:
+        """The function itself."""
+        return self.f.propagate(given, unit)
+
+    def simulated(self, given: tuple[Any, ...], unit: AtUnit) -> Any:
+        """The state afterwards, by extrapolation."""
+        x, *others = given
+        steps = max(2, self.settings.steps)
+        return integrated(lambda x: self.rate((x, *others), unit), x, self.settings.period, steps)
+
+    def followed(self, given: list[TaylorModels], box: Ball, between: bool = False) -> Flowed:
+        """What Taylor models lead to, step by step."""
         x, *others = given
         return flowed(self.tape, x, others, box, self.settings, between)

@@ -290,14 +290,28 @@ def _drift(
     if len(others) < 2 or settings.held:
         return 0.0, 0.0
     given = [each.ball for each in others]
-    pairs = [_slopes(tape, [B, *given]) for B in boxes]
+    slopes = [_slopes(tape, [B, *given]) for B in boxes]
+    return drift(slopes, given[-1], settings.period)
+
+
+def drift(slopes: list[tuple[Ball, Ball]], W: Ball, h: Any) -> tuple[Any, Any]:
+    """How far a signal can take states from where its mean does.
+
+    Args:
+        slopes: bounds of derivatives by states and by the signal, of each step.
+        W: what the signal is in.
+        h: how long the period is.
+
+    Returns:
+        Bounds `(n,)` at the end of the period, and within it.
+    """
     low, high = (
-        reduce(extreme, (getattr(G, end) for _, G in pairs))
+        reduce(extreme, (getattr(G, end) for _, G in slopes))
         for extreme, end in ((smaller, "lower"), (larger, "upper"))
     )
-    G, h, n = Ball.between(low, high), settings.period, len(boxes[0].mid)
-    rate = reduce(larger, (larger(abs(A.lower), abs(A.upper)) for A, _ in pairs))
-    size, radius = larger(abs(low), abs(high)), h * given[-1].rad * (1 + gamma(4))
+    G, n = Ball.between(low, high), len(slopes[0][0].mid)
+    rate = reduce(larger, (larger(abs(A.lower), abs(A.upper)) for A, _ in slopes))
+    size, radius = larger(abs(low), abs(high)), h * W.rad * (1 + gamma(4))
     growth = _exponential_less_one(h * rate * (1 + gamma(2)))
     error = 1 + gamma(4 * n + 16)
     end = (G.rad * (1 + gamma(2)) + growth @ size * error) @ radius * error

@@ -1,0 +1,80 @@
+"""Of a differential equation what is safe is decided at all times, in between samples too."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+from reachjax.loops.batches import in_between
+
+TURN = 2 * math.pi
+X0 = rj.Box([-0.01, 0.99], [0.01, 1.01])
+STILL = rj.MLP.from_layers([([[0.0, 0.0]], [0.0])])
+
+
+def turning(x, u):
+    """Half a turn a period."""
+    return TURN * jnp.array([x[1], -x[0]]) + u
+
+
+def loops():
+    """A state that turns, as a function and by matrices."""
+    matrices = [[0, TURN], [-TURN, 0]], [[1], [1]]
+    plants = rj.SampledPlant(turning, 2, 1, 0.5), rj.SampledPlant.affine(*matrices, period=0.5)
+    return [rj.ClosedLoop(plant, STILL) for plant in plants]
+
+
+@pytest.mark.parametrize("loop", loops(), ids=["function", "matrices"])
+def test_what_is_safe_at_samples_alone_is_refuted_in_between(loop):
+    safe = rj.Box([-0.5, -2.0], [0.5, 2.0])
+    tube = rj.reach(loop, X0, 2, rj.Template.box(2), relaxation=rj.LinearBounds())
+    assert all(float(np.max(abs(np.asarray(each.b)[[0, 2]]))) < 0.1 for each in tube.sets[1:])
+    for verdict in (rj.decide(loop, X0, 2, safe=safe), rj.verify(tube, safe=safe)):
+        assert verdict.refuted
+        instant = verdict.counterexample.instant
+        assert min(abs(instant - k / 2) for k in range(3)) > 0.05
+
+
+@pytest.mark.parametrize("loop", loops(), ids=["function", "matrices"])
+def test_what_is_safe_at_all_times_is_proved(loop):
+    safe, avoid = rj.Box([-1.2, -1.2], [1.2, 1.2]), [rj.Box([1.2, -0.1], [1.5, 0.1])]
+    verdict = rj.decide(loop, X0, 2, safe=safe, avoid=avoid)
+    assert verdict.proved
+    tube = rj.reach(loop, X0, 2, rj.Template.regular(16), relaxation=rj.LinearBounds())
+    assert rj.verify(tube, safe=safe).proved
+    by_cells = rj.decide(loop, X0, 2, safe=safe, cells=[2, 1])
+    assert by_cells.proved
+
+
+@pytest.mark.parametrize("loop", loops(), ids=["function", "matrices"])
+def test_spans_hold_what_is_simulated_in_between(loop):
+    tube = rj.reach(loop, X0, 3, rj.Template.box(2), relaxation=rj.LinearBounds())
+    points = np.random.default_rng(0).uniform(X0.lower, X0.upper, size=(50, 2))
+    states = np.asarray(loop.simulate(points, 3))
+    for k, span in enumerate(tube.spans):
+        period = loop.plant.period
+        for part in (0.1, 0.3, 0.5, 0.9):
+            shorter = loop.replace(plant=loop.plant.replace(period=part * period))
+            inner = np.asarray(shorter.simulate(states[:, k], 1))[:, 1]
+            assert np.all(np.asarray(span.contains(inner)))
+        assert np.all(np.asarray(span.contains(states[:, k : k + 2].reshape(-1, 2))))
+
+
+def test_a_plant_in_discrete_time_has_no_spans():
+    loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.zeros((2, 1))), STILL)
+    tube = rj.reach(loop, X0, 1, rj.Template.box(2))
+    with pytest.raises(TypeError, match="no states in between"):
+        _ = tube.spans
+
+
+def test_states_that_are_looked_at_in_between_are_near_the_flow():
+    import jax
+
+    loop = jax.device_get(loops()[0])
+    points = np.random.default_rng(0).uniform(X0.lower, X0.upper, size=(5, 2))
+    states = np.asarray(loop.simulate(points, 1))
+    found = in_between(loop, points, states[:, 1], 0)
+    exact = np.stack([np.sin(math.pi / 8) * points[:, 1] + np.cos(math.pi / 8) * points[:, 0]])
+    np.testing.assert_allclose(found[0][:, 0], exact[0], atol=0.05)

@@ -79,6 +79,11 @@ class AbstractSampledPlant(AbstractPlant):
         """
         if self.disturbances and w is None:
             w = np.zeros((self.disturbances, self.states)) @ x
+        if isinstance(x, Ball) and type(x) is not Ball:
+            raise TypeError(
+                "the flow of a differential equation has no rows over a basis: give "
+                "relaxation=LinearBounds() or BranchAndCut(), and a template of facets"
+            )
         given = (x, u) if w is None else (x, u, w)
         if isinstance(x, np.ndarray | jax.Array) or hasattr(x, "values"):
             return self.flow.simulated(given, unit)

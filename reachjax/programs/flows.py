@@ -68,7 +68,8 @@ def flowed_forms(
         UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
     """
     forms = joined(given)
-    box = Ball.between(*given[0].ends(start, cut=True))
+    cut = start.cut is not None and not start.cut.needs_programs
+    box = Ball.between(*given[0].ends(start, cut))
     symbols, models = _condensed(forms, [len(each) for each in given], start)
     found = flow.followed(models, box, between)
     points = (

@@ -139,13 +139,18 @@ def flowed(
     Raises:
         UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
     """
-    todo, controls, boxes = [1.0 / settings.steps] * settings.steps, list[Control](), list[Ball]()
-    state, proved, count = x, np.array(True), settings.steps
+    todo, controls = [1.0 / settings.steps] * settings.steps, list[Control]()
+    state, proved, count, done = x, np.array(True), settings.steps, 0.0
+    varying, slopes = len(others) > 1 and not settings.held, list[tuple[Ball, Ball]]()
+    signal = others[-1].ball
+    end: Any = 0.0
+    within: Any = 0.0
     while todo:
         part = todo.pop()
         h = settings.period * part
         here, given = _refreshed(state, others)
-        X = here.ball if boxes else here.ball.meeting(box)
+        # a signal may have taken states away from where its mean has
+        X = here.widened(within).ball if done else here.ball.meeting(box)
         piece, holds = _enclosed(tape, X, [each.ball for each in given], h, part, settings)
         if piece is None or (piece.excess > 1 and count < MOST and part / 2 >= SHORTEST):
             todo, count = [*todo, part / 2, part / 2], count + 1
@@ -159,9 +164,10 @@ def flowed(
             inner = here + (1 / 3) * terms[0], found - (1 / 3) * last
             wide = [point.widened(piece.fourth / 16) for point in (here, *inner, found)]
             controls.append(Control(tuple(_composed(each, state) for each in wide), part))
-        boxes.append(piece.B)
-        state = _composed(found, state)
-    end, within = _drift(tape, boxes, others, settings)
+        state, done = _composed(found, state), done + part
+        if varying:
+            slopes.append(_slopes(tape, [piece.B, *(each.ball for each in others)]))
+            end, within = drift(slopes, signal, settings.period * done)
     xp = namespace(state.rows)
     lost = xp.where(proved, 0.0, xp.inf)
     controls = [
@@ -277,21 +283,6 @@ def _escaped(X: Ball, B: Ball) -> UnboundedError:
         "period, or slower units",
     )
     return UnboundedError(Within(origin=origin), 0, float(X.lower[k]), float(X.upper[k]))
-
-
-def _drift(
-    tape: Tape, boxes: list[Ball], others: list[TaylorModels], settings: Settings
-) -> tuple[Any, Any]:
-    """How far disturbances that vary can take states from where their means do.
-
-    Returns:
-        Bounds `(n,)` at the end of a period, and within it.
-    """
-    if len(others) < 2 or settings.held:
-        return 0.0, 0.0
-    given = [each.ball for each in others]
-    slopes = [_slopes(tape, [B, *given]) for B in boxes]
-    return drift(slopes, given[-1], settings.period)
 
 
 def drift(slopes: list[tuple[Ball, Ball]], W: Ball, h: Any) -> tuple[Any, Any]:

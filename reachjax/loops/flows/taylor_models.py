@@ -227,7 +227,7 @@ def require_bounds(unit: AbstractUnit, gap: Any, lower: Any, upper: Any) -> None
     """
     if namespace(gap, lower, upper) is not np:
         return
-    lost = np.flatnonzero(~np.isfinite(gap))
+    lost = np.flatnonzero(~np.isfinite(gap) & np.isfinite(lower) & np.isfinite(upper))
     if len(lost):
         raise UnboundedError(unit, 0, float(lower[lost[0]]), float(upper[lost[0]]))
 

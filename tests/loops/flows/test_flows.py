@@ -185,17 +185,17 @@ def test_what_is_not_known_stays_so():
         assert not np.isfinite(found.mid + found.rad).any()
 
 
-@pytest.mark.parametrize("held", [True, False])
-def test_disturbances_take_states_nowhere_else_than_is_said(held):
+@pytest.mark.parametrize(("held", "steps"), [(True, 1), (False, 1), (False, 4)])
+def test_disturbances_take_states_nowhere_else_than_is_said(held, steps):
     def own(x, u, w):
         return jnp.array([x[1] + 0.3 * w[0], jnp.sin(x[0]) + u[0] + w[1] * x[1]])
 
     period, pieces, rng = 0.2, 16, np.random.default_rng(0)
-    plant = on_host(rj.SampledPlant(own, 2, 1, period, disturbances=2, held=held))
+    plant = rj.SampledPlant(own, 2, 1, period, disturbances=2, held=held, steps=steps)
     short = on_host(rj.SampledPlant(own, 2, 1, period / pieces, disturbances=2, held=True))
     X, U = Ball(np.array([0.3, -0.5]), np.full(2, 0.05)), Ball.exact(np.array([0.4]))
     W = Ball(np.zeros(2), np.array([0.5, 0.2]))
-    found = plant.propagate(X, U, w=W)
+    found = on_host(plant).propagate(X, U, w=W)
     most = np.full(2, -np.inf)
     for signal in range(60):
         x = X.mid + X.rad * rng.choice([-1, 1], size=2)

@@ -312,11 +312,11 @@ class _Decision:
         climbed = ladder.bounds(target, (left - 1) * len(target.forms), share)
         right = climbed.bounds <= 0 if item.inside else climbed.bounds < 0
         margin = float(np.min(-climbed.bounds / units))
-        holds = bool(np.all(right))
+        holds, one_of_several = bool(np.all(right)), not (item.inside or item.throughout)
         self._findings.prove(item, margin, holds)
         self._ends[key] = climbed.codes
         if holds:
-            self._certificates[key] = _certificate(climbed, target.simulated, not item.inside)
+            self._certificates[key] = _certificate(climbed, target.simulated, one_of_several)
         if not np.all(right):
             worst, middle = climbed.worst[climbed.attained > 0], self._middle
             pulled = np.concatenate([middle + p * (worst - middle) for p in PULLS])

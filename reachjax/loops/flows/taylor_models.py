@@ -265,7 +265,13 @@ def joined(numbers: list[Any]) -> Any:
 
 def product(one: Any, other: Any) -> Any:
     """Products, entry by entry, of numbers of one kind."""
-    return one.times(other) if hasattr(one, "times") else one * other
+    if isinstance(one, TaylorModels):
+        return one.times(other)
+    if not isinstance(one, Ball):
+        return one * other
+    mid = one.mid * other.mid  # |a b - m n| <= |m| s + |n| r + r s
+    spread = abs(one.mid) * other.rad + abs(other.mid) * one.rad + one.rad * other.rad
+    return Ball(mid, (spread * (1 + gamma(4)) + gamma(1) * abs(mid) + 4 * TINY) * (1 + gamma(4)))
 
 
 def zeros(number: Any) -> Any:

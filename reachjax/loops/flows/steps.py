@@ -32,11 +32,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.loops.flows.enclosures import enclosed
+from reachjax.loops.flows.enclosures import constant_ball, enclosed
 from reachjax.loops.flows.series import Series, Solution, Tape, solved
 from reachjax.loops.flows.taylor_models import Symbols, TaylorModels, joined, zeros
 from reachjax.loops.units import Origin, UnboundedError, Within
-from reachjax.numerics.rounding import Ball, gamma, larger, namespace, smaller
+from reachjax.numerics.rounding import Ball, constant, gamma, larger, namespace, smaller
 
 ORDER = 6
 """The order of compiled steps, where none is given."""
@@ -242,6 +242,8 @@ def _remainder(
 ) -> _Piece:
     """A step of the order that was asked for, or of the lowest whose remainder is small enough.
 
+    Derivatives take remainders for constants.
+
     If none is, of the one whose remainder is smallest.
     """
     chosen, least = order or ORDER, 0.0
@@ -259,8 +261,8 @@ def _remainder(
             terms.append(solution.advance())
     else:
         terms = solved(tape, B, others, h, max(chosen, 3) + 1)
-    fourth = larger(abs(terms[3].lower), abs(terms[3].upper))
-    return _Piece(B, terms[chosen], fourth, chosen, least)
+    fourth = constant(larger(abs(terms[3].lower), abs(terms[3].upper)))
+    return _Piece(B, constant_ball(terms[chosen]), fourth, chosen, least)
 
 
 def _excess(remainder: Ball, rate: Ball, X: Ball) -> float:

@@ -60,7 +60,7 @@ def test_a_plant_of_matrices_is_that_of_its_function(held):
     np.testing.assert_allclose(one.mid, other.mid, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(one.rad, other.rad, rtol=1e-2)
     x, u, w = np.array([0.3, -0.2]), np.ones(1), np.full(1, 0.1)
-    np.testing.assert_allclose(affine.propagate(x, u, w=w), f.propagate(x, u, w=w), rtol=1e-12)
+    np.testing.assert_allclose(affine.propagate(x, u, w=w), f.propagate(x, u, w=w), rtol=1e-9)
 
 
 def test_in_between_samples_a_plant_of_matrices_is_that_of_its_function():

@@ -50,7 +50,14 @@ from reachjax.tubes.propagation import (
     require_kinds,
     simulations_from,
 )
-from reachjax.tubes.requirements import AvoidSets, Region, Requirement, Timed, requirements
+from reachjax.tubes.requirements import (
+    AvoidSets,
+    Region,
+    Requirement,
+    Timed,
+    period_of,
+    requirements,
+)
 from reachjax.tubes.soundness import compiled_runs, require_unbroken, worst_of
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.targets import target_of
@@ -148,8 +155,7 @@ def decide(
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     budget, (loop, X0) = Budget.of(time_limit), known_numbers("decide", loop, X0, "X0")
-    continuous = loop.plant.continuous
-    required = requirements(loop.states, horizon, goal, avoid, safe, continuous)
+    required = requirements(loop.states, horizon, goal, avoid, safe, period_of(loop))
     simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     if cells is not None:
         parts = CellTree.over(X0, cells)

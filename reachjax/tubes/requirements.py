@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import is_concrete, real_number, require_kind
 from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet, Polytope
@@ -129,8 +130,18 @@ def of_tube(
     """
     require_kind("tube", tube, ReachTube, "a ReachTube, as reach(...) returns it")
     tube.require_sealed()
-    continuous = tube.loop.plant.continuous
-    return requirements(tube.loop.states, tube.horizon, goal, avoid, safe, continuous)
+    return requirements(tube.loop.states, tube.horizon, goal, avoid, safe, period_of(tube.loop))
+
+
+def period_of(loop: ClosedLoop) -> float | None:
+    """The period of a plant in continuous time, where it is known; None in discrete time.
+
+    Traced ones count as one unit of time.
+    """
+    plant: Any = loop.plant
+    if not plant.continuous:
+        return None
+    return float(plant.period) if is_concrete(plant.period) else 1.0
 
 
 def requirements(
@@ -139,18 +150,18 @@ def requirements(
     goal: Timed | None,
     avoid: AvoidSets | None,
     safe: Region | None,
-    continuous: bool = False,
+    period: float | None = None,
 ) -> list[Requirement]:
     """A specification's requirements, one for each set and time.
 
     Args:
         states: of the loop.
         horizon: the number of steps.
-        goal: where states must be, at samples.
+        goal: where states must be, at samples or over spans.
         avoid: where they must not be.
         safe: where they must be all along.
-        continuous: whether the latter two are meant at all times, in between samples too: at a
-            sample, since the one before.
+        period: of a plant in continuous time: then the latter two are meant at all times, in
+            between samples too, at a sample since the one before.
 
     Raises:
         TypeError: a set is no Box, Polytope or Ellipsoid, or a time no whole number.
@@ -158,7 +169,8 @@ def requirements(
             the horizon.
     """
     everywhere = range(horizon + 1)
-    found = [Requirement("goal", t, G, True) for t, G in timed_goals(goal, horizon)]
+    goals = timed_goals(goal, horizon, period)
+    found = [Requirement("goal", t, G, True, throughout=whole) for t, G, whole in goals]
     found += [Requirement("safe", t, safe, True) for t in everywhere if safe is not None]  # type: ignore[arg-type]
     for t, regions in timed_sets_to_avoid(avoid, horizon):
         found += [Requirement(f"avoid[{i}]", t, A, False) for i, A in regions]  # type: ignore[arg-type]
@@ -175,7 +187,8 @@ def requirements(
             one,
             name=item.name,
             time=item.time,
-            throughout=continuous and item.time > 0 and item.name != "goal",
+            throughout=item.throughout
+            or (period is not None and item.name != "goal" and item.time > 0),
         )
         for one, item in zip(checked, found, strict=True)
     ]

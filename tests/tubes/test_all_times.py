@@ -64,6 +64,28 @@ def test_spans_hold_what_is_simulated_in_between(loop):
         assert np.all(np.asarray(span.contains(states[:, k : k + 2].reshape(-1, 2))))
 
 
+@pytest.mark.parametrize("loop", loops(), ids=["function", "matrices"])
+def test_a_goal_over_a_span_is_one_at_all_times_of_it(loop):
+    right, wide = rj.Box([-0.2, -1.2], [1.2, 1.2]), rj.Box([-1.2, -1.2], [1.2, 1.2])
+    first = rj.decide(loop, X0, 2, goal={(0.0, 0.5): right})  # half a turn on this side
+    assert first.proved
+    whole = rj.decide(loop, X0, 2, goal={(0.0, 1.0): right})
+    assert whole.refuted
+    assert 0.5 < whole.counterexample.instant < 1.0
+    assert rj.decide(loop, X0, 2, goal={(0.5, 1.0): wide, 0.0: right}).proved
+
+
+def test_errors_of_spans_say_which_times_there_are():
+    loop, G = loops()[0], rj.Box([-1.2, -1.2], [1.2, 1.2])
+    with pytest.raises(ValueError, match="no sample"):
+        rj.decide(loop, X0, 2, goal={(0.2, 0.5): G})
+    with pytest.raises(ValueError, match="the horizon is 1"):
+        rj.decide(loop, X0, 2, goal={(0.5, 1.5): G})
+    discrete = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.zeros((2, 1))), STILL)
+    with pytest.raises(TypeError, match="discrete time"):
+        rj.decide(discrete, X0, 2, goal={0.5: G})
+
+
 def test_a_plant_in_discrete_time_has_no_spans():
     loop = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.zeros((2, 1))), STILL)
     tube = rj.reach(loop, X0, 1, rj.Template.box(2))

@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.flows.taylor_models import (
@@ -323,12 +324,11 @@ class Series:
             series.columns[place].append(found)
         return series.columns[tape.result][0]
 
-    def coefficient(self, k: Any, inputs: Sequence[Any]) -> Any:
-        """Another coefficient than the first one of the result, in compiled code."""
+    def coefficient(self, k: Any, inputs: Sequence[Any]) -> None:
+        """All coefficients at another place than the first, in compiled code."""
         for place, node in enumerate(self._tape.nodes):
             found = inputs[place] if node is None else settled_number(self._next(place, node, k))
             self.columns[place] = self.columns[place].set(k, found)
-        return self.columns[self._tape.result][k]
 
     def _first(self, node: Node) -> Any:
         given = [self.columns[parent][0] for parent in node.parents]
@@ -338,22 +338,30 @@ class Series:
     def _next(self, place: int, node: Node, k: Any) -> Any:
         one, *others = (self.columns[parent] for parent in node.parents)
         if node.apply is None:
-            return _convolved(one, others[0], k, False)
+            return _convolved(one, others[0], k)
         if node.unit is None:
-            return node.apply(None, *(Change(each[k]) for each in (one, *others))).number
+            return node.apply(None, *(Change(_newest(each)) for each in (one, *others))).number
         if isinstance(node.unit, Square):
-            return _convolved(one, one, k, False)
+            return _convolved(one, one, k)
         if isinstance(node.unit, Within):
-            return one[k]
+            return _newest(one)
         if not isinstance(node.unit, SmoothUnit):
-            return _slope(node.unit, one[0]) * one[k]
-        return _convolved(one, self.columns[self._tape.slopes[place]], k, True)
+            return _slope(node.unit, one.first if isinstance(one, _Stack) else one[0]) * _newest(
+                one
+            )
+        slope = self._tape.slopes[place]
+        return _convolved(one, self.columns[slope], k, True, slope < place)
 
 
-def _convolved(ones: Any, others: Any, k: Any, slope: bool) -> Any:
+def _newest(column: Any) -> Any:
+    """The last coefficient that is known."""
+    return column.newest if isinstance(column, _Stack) else column[-1]
+
+
+def _convolved(ones: Any, others: Any, k: Any, slope: bool = False, known: bool = True) -> Any:
     """The sum of products of coefficients whose places add up to `k`, as `_Stack.convolved`."""
     if isinstance(ones, _Stack):
-        return ones.convolved(others, k, slope)
+        return ones.convolved(others, k, slope, known)
     first = 1 if slope else 0
     pairs = [(ones[j], others[k - j]) for j in range(first, k + 1)]
     if len(pairs) == 1:
@@ -423,72 +431,89 @@ def solved(tape: Tape, x: Any, others: Sequence[Any], h: Any, order: int) -> lis
     series = Series(tape)
     first = h * series.advance([x, *others])
     stacks = [_Stack.of(column[0], order) for column in series.columns]
-    stacks[0] = stacks[0].set(1, first)
     nothing = [zeros(each) for each in others]
 
     def advance(carry: Any, k: Any) -> tuple[Any, Any]:
-        known = [stack.holding(part) for stack, part in zip(stacks, carry, strict=True)]
-        own = Series(tape, known)
-        rate = own.coefficient(k, [known[0][k], *nothing])
-        following = _part(h, k + 1) * rate
-        known = [*own.columns]
-        known[0] = known[0].set(k + 1, following)
-        return [each.parts for each in known], arrays(following)
+        known, parts = carry
+        own = Series(tape, [each.holding(*part) for each, part in zip(stacks, known, strict=True)])
+        own.coefficient(k, [rebuilt(x, parts), *nothing])
+        following = arrays(_part(h, k + 1) * own.columns[tape.result].newest)
+        return ([each.parts for each in own.columns], following), following
 
-    ks = jax.numpy.arange(1, order)
-    _, rest = jax.lax.scan(advance, [stack.parts for stack in stacks], ks)
-    return [first, *(rebuilt(x, [part[k] for part in rest]) for k in range(order - 1))]
+    begun = [stack.parts for stack in stacks], arrays(first)
+    _, rest = jax.lax.scan(advance, begun, jnp.arange(1, order))
+    every = [
+        [jax.lax.index_in_dim(part, k, keepdims=False) for part in rest] for k in range(order - 1)
+    ]
+    return [first, *(rebuilt(x, parts) for parts in every)]
 
 
 class _Stack:
     """Coefficients of a number in compiled code, those that are not known yet being zero.
 
+    They are kept in both orders, so that convolutions look nothing up by a traced place.
+
     Attributes:
-        parts: the arrays of numbers, with a leading axis of coefficients.
+        parts: the arrays of numbers, with a leading axis: of coefficients, and of these backwards
+            from the newest one.
     """
 
-    def __init__(self, like: Any, parts: list[Any]):
-        self._like, self.parts = like, parts
+    def __init__(self, like: Any, forward: list[Any], backward: list[Any]):
+        self._like, self.parts = like, (forward, backward)
 
     @classmethod
     def of(cls, first: Any, order: int) -> _Stack:
-        """The first coefficient, and `order` of them to come."""
-        parts = []
-        for part in map(jax.numpy.asarray, arrays(first)):
-            empty = jax.numpy.zeros((order + 1, *part.shape))
-            parts.append(empty.at[0].set(part))
-        return cls(first, parts)
+        """The first coefficient, and as many to come as there are before this order."""
+        parts = [
+            jnp.concatenate([part[None], jnp.zeros((order - 1, *part.shape))])
+            for part in map(jnp.asarray, arrays(first))
+        ]
+        return cls(first, parts, parts)
 
-    def holding(self, parts: list[Any]) -> _Stack:
+    def holding(self, forward: list[Any], backward: list[Any]) -> _Stack:
         """Other coefficients of the same number."""
-        return _Stack(self._like, parts)
+        return _Stack(self._like, forward, backward)
 
-    def __getitem__(self, k: Any) -> Any:
-        return rebuilt(self._like, [part[k] for part in self.parts])
+    @property
+    def first(self) -> Any:
+        """The first coefficient."""
+        return self._at_front(self.parts[0])
+
+    @property
+    def newest(self) -> Any:
+        """The last one that is known."""
+        return self._at_front(self.parts[1])
+
+    def _at_front(self, parts: list[Any]) -> Any:
+        found = [jax.lax.index_in_dim(part, 0, keepdims=False) for part in parts]
+        return rebuilt(self._like, found)
 
     def set(self, k: Any, number: Any) -> _Stack:
-        """The coefficients with another one at this place."""
-        pairs = zip(self.parts, arrays(number), strict=True)
-        return _Stack(self._like, [whole.at[k].set(part) for whole, part in pairs])
+        """The coefficients with the next one, whose place is `k`."""
+        forward, backward = [], []
+        for new, one, other in zip(arrays(number), *self.parts, strict=True):
+            here = jnp.arange(len(one)).reshape(-1, *[1] * new.ndim) == k
+            forward.append(jnp.where(here, new[None], one))
+            backward.append(jnp.concatenate([new[None], other[:-1]]))
+        return _Stack(self._like, forward, backward)
 
-    def convolved(self, other: _Stack, k: Any, slope: bool) -> Any:
+    def convolved(self, other: _Stack, k: Any, slope: bool, known: bool = True) -> Any:
         """The sum of products of coefficients whose places add up to `k`.
 
         Args:
             other: of the other number.
             k: which one is wanted.
-            slope: whether those of this number count by their places over `k`.
+            slope: whether those of this number count by their places over `k`, so that the first
+                one does not.
+            known: whether that of the other number at this place is known.
         """
-        count = len(self.parts[0])
-        places = k - jax.numpy.arange(count)
-        weights = jax.numpy.where(places < 0, 0.0, 1.0)
-        if slope:
-            weights = weights * jax.numpy.arange(count) / k
+        first, count = int(slope), len(self.parts[0][0])
+        skipped = 0 if slope and not known else first
+        ones = [self._flat(part[first:]) for part in self.parts[0]]
+        others = [self._flat(part[skipped : skipped + count - first]) for part in other.parts[1]]
+        weights = jnp.arange(first, count) / k if slope else jnp.ones(count)
+        matrix = jnp.kron(weights, np.eye(self.parts[0][0].shape[1]))
+        return matrix @ product(rebuilt(self._like, ones), rebuilt(other._like, others))
 
-        def flat(part: Any) -> Any:
-            return part.reshape(-1, *part.shape[2:])
-
-        ones = rebuilt(self._like, [flat(part) for part in self.parts])
-        others = [flat(part[jax.numpy.maximum(places, 0)]) for part in other.parts]
-        size = self.parts[0].shape[1]
-        return jax.numpy.kron(weights, np.eye(size)) @ product(ones, rebuilt(other._like, others))
+    def _flat(self, part: Any) -> Any:
+        return part.reshape(-1, *part.shape[2:])

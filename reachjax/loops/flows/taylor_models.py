@@ -33,6 +33,16 @@ def _pairs(n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.triu_indices(n)
 
 
+@lru_cache(maxsize=64)
+def _packing(n: int) -> np.ndarray:
+    """From all products of two of `n` numbers to coefficients of the products that are symbols."""
+    i, j = _pairs(n)
+    found, columns = np.zeros((n * n, len(i))), np.arange(len(i))
+    found[i * n + j, columns] = np.where(i == j, SQUARE, 1.0)
+    found[j * n + i, columns] = np.where(i == j, SQUARE, 1.0)
+    return found
+
+
 class Symbols(NamedTuple):
     """What polynomials are of.
 
@@ -157,7 +167,7 @@ class TaylorModels(AbstractNumber):
     def times(self, other: TaylorModels) -> TaylorModels:
         """Products, entry by entry, without what is of degree three."""
         xp, symbols = namespace(self.rows, other.rows), self.symbols
-        n, count, (i, j) = symbols.initial, symbols.own, symbols.pairs
+        n, count = symbols.initial, symbols.own
         a, b = self.rows, other.rows
         center, another = a[:, :1], b[:, :1]
         rows = center * b + another * a
@@ -165,9 +175,7 @@ class TaylorModels(AbstractNumber):
         whole, whole_ = one + two + three, one_ + two_ + three_
         if symbols.curved:
             g, h = a[:, 1 : 1 + n], b[:, 1 : 1 + n]
-            half = g[:, i] * h[:, j] * np.where(i == j, SQUARE, 1.0)
-            mixed = np.where(i == j, 0.0, 1.0) * g[:, j] * h[:, i]
-            products = half + mixed
+            products = (g[:, :, None] * h[:, None, :]).reshape(len(g), n * n) @ _packing(n)
             parts = [center * another + SQUARE * (g * h).sum(axis=1, keepdims=True)]
             parts += [rows[:, 1 : 1 + n], rows[:, 1 + n : 1 + count] + products]
             left = one * (two_ + three_) + (two + three) * whole_

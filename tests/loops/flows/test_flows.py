@@ -207,7 +207,7 @@ def test_disturbances_take_states_nowhere_else_than_is_said(held, steps):
             x = short.propagate(x, U.mid, w=w)
         assert np.all((found.lower <= x) & (x <= found.upper))
         most = np.maximum(most, (abs(x - found.mid)) / found.rad)
-    assert np.all(most >= 0.9)  # nor is much more said
+    assert np.all(most >= (0.9 if held else 0.8))  # nor is much more said
 
 
 def test_compiled_flows_hold_what_flows_in_numpy_do():

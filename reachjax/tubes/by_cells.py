@@ -191,6 +191,7 @@ class _Search(AbstractSearch):
         self._left = affordable(self._loop, problem.horizon, problem.budget)
         self._form = MULTIPLICATIONS / affordable(self._loop, problem.horizon, Budget())
         self._asks, self._price = method.inner.adds_to_forms(loop), 0.0
+        self._stuck = False
         self._planned, self._wanted, self._halvings, self._looked = False, 1, 0, -1
         self.end = SolverStatus.UNKNOWN_GAP
         self._open_parts: np.ndarray | None = None
@@ -270,7 +271,7 @@ class _Search(AbstractSearch):
 
     def question(self, asked: int, workers: int) -> Question | None:
         """Which gap is closed next: by halves of a cell, or by another method over it."""
-        if self._problem.simulations is None or asked:
+        if self._problem.simulations is None or asked or self._stuck:
             return None
         self._look()
         if self._late or (not (self._planned and self._asks) and self._spent):
@@ -314,7 +315,7 @@ class _Search(AbstractSearch):
                 node.found = answer
             self._note()
         elif not self._halved(node, answer):
-            self.ended = True
+            self._stuck = True
         return self.cells.count
 
     def _plan(self, node: Node, tried: _Bounds) -> None:

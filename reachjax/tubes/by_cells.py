@@ -154,6 +154,13 @@ class _Bounds(NamedTuple):
         """The other method's proof of what holds after `k + 1` steps; None if it was not asked."""
         return self.sets[k].proof if self.sets else None
 
+    def by_method(self, k: int, facet: int) -> bool:
+        """Whether the other method proves more of a facet than forms do."""
+        if not self.sets:
+            return False
+        offsets = np.asarray(self.sets[k].region.facets[1])
+        return bool(offsets[facet] < self.steps[k].offsets[facet])
+
     def met(self, sets: Sequence[ReachSet]) -> _Bounds:
         """What both forms and another method say."""
         offsets = np.array([np.asarray(each.region.facets[1]) for each in sets])
@@ -191,7 +198,7 @@ class _Search(AbstractSearch):
         self._left = affordable(self._loop, problem.horizon, problem.budget)
         self._form = MULTIPLICATIONS / affordable(self._loop, problem.horizon, Budget())
         self._asks, self._price = method.inner.adds_to_forms(loop), 0.0
-        self._stuck = False
+        self._stuck, self._tried = False, None
         self._planned, self._wanted, self._halvings, self._looked = False, 1, 0, -1
         self.end = SolverStatus.UNKNOWN_GAP
         self._open_parts: np.ndarray | None = None
@@ -300,6 +307,7 @@ class _Search(AbstractSearch):
             enough = self._left >= self._price and self._budget.left >= programs
             return Question([node], self._by_method, (node,)) if enough else None
         if not self._can_halve(node):
+            self.end = SolverStatus.BUDGET if self.cells.is_full else self.end
             return None
         self.end = SolverStatus.TIME if self._budget.left < 2 * programs else SolverStatus.BUDGET
         enough = self._left >= 2 + 2 * self._price and self._budget.left >= 2 * programs
@@ -320,11 +328,7 @@ class _Search(AbstractSearch):
 
     def _plan(self, node: Node, tried: _Bounds) -> None:
         """Ask the other method of cells if it closes most of what forms leave open; of how many."""
-        before, after = (
-            np.fmax(found.offsets - self._levels, 0.0) / self._ranges
-            for found in (node.found, tried)
-        )
-        before, after = before[self._known :], after[self._known :]
+        before, after = (self._beyond(found.offsets) for found in (node.found, tried))
         self._planned = True
         self._asks = bool(after.sum() <= (1 - CLOSED) * before.sum())
         if self._asks:
@@ -334,12 +338,27 @@ class _Search(AbstractSearch):
                 most = min(most, self._budget.left / seconds)
             gap = max(self._problem.gap, ROUNDED)
             self._wanted = int(min(most, 1 + float(after.max()) / gap))
+            self._tried = node, tried
+
+    def _beyond(self, offsets: Float[np.ndarray, "N f"]) -> Float[np.ndarray, "N f"]:
+        """What bounds leave open, in parts of ranges."""
+        return np.fmax(offsets - self._levels, 0.0) / self._ranges
 
     def finish(self) -> None:
-        """Take stock, also where somebody stopped the search."""
+        """Take stock, also where somebody stopped the search before cells were as good as none."""
         self._note()
-        if self._problem.simulations is not None and self._looked >= 0:
+        if self._tried is not None and not self._halves_pay(*self._tried):
+            self._note()
+        if self._looked >= 0:
             self._open()
+
+    def _halves_pay(self, node: Node, tried: _Bounds) -> bool:
+        """Whether the parts of a cell prove more than it does, which stands in their place if not."""
+        if not node.halves or self._beyond(self.bounds).sum() <= self._beyond(tried.offsets).sum():
+            return True
+        if node is self.cells.roots[0]:
+            node.found, node.halves = tried, []
+        return False
 
     def _look(self) -> None:
         """Simulate where cells say that facets are largest, now and then, and see what is open."""
@@ -453,15 +472,12 @@ class _Slopes:
 
     def of(self, k: int) -> Float[Array, " f"]:
         """The numbers of the facets after `k + 1` steps."""
-        search, problem = self._search, self._problem
-        nodes = [search.leaves[i] for i in search.deciding[k]]
-        found = moving_offsets(problem, nodes, k)
-        for facet, node in enumerate(nodes):
-            if node.found.sets:
-                offset = np.asarray(node.found.sets[k].region.facets[1])[facet]
-                if offset < node.found.steps[k].offsets[facet]:
-                    found[facet] = self._moving(node)[k][facet]
-        return jnp.stack(found)
+        nodes = dict(enumerate(self._search.leaves[i] for i in self._search.deciding[k]))
+        better = {facet: node for facet, node in nodes.items() if node.found.by_method(k, facet)}
+        by_forms = {facet: node for facet, node in nodes.items() if facet not in better}
+        found = moving_offsets(self._problem, by_forms, k)
+        found |= {facet: self._moving(node)[k][facet] for facet, node in better.items()}
+        return jnp.stack([found[facet] for facet in nodes])
 
     def _moving(self, node: Node) -> list[Array]:
         """The offsets that the other method proves over a cell, with their derivatives."""

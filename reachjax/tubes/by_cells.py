@@ -353,7 +353,7 @@ class _Search(AbstractSearch):
             self._open()
 
     def _halves_pay(self, node: Node, tried: _Bounds) -> bool:
-        """Whether the parts of a cell prove more than it does, which stands in their place if not."""
+        """Whether the parts of a cell prove more than it does; it stands in their place if not."""
         if not node.halves or self._beyond(self.bounds).sum() <= self._beyond(tried.offsets).sum():
             return True
         if node is self.cells.roots[0]:

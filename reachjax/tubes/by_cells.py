@@ -138,12 +138,14 @@ class _Bounds(NamedTuple):
         offsets: `(N, f)`, upper bounds; infinite where there is none.
         lost: what has no bounds over it after these steps, if anything has not.
         sets: what another method says; nothing if that was not asked.
+        levels: `(N, f)`, below which nothing was asked of it.
     """
 
     steps: Sequence[ByForms]
     offsets: Float[np.ndarray, "N f"]
     lost: UnboundedError | None = None
     sets: Sequence[ReachSet] = ()
+    levels: Float[np.ndarray, "N f"] = np.zeros((0, 0))
 
     @property
     def is_bounded(self) -> bool:
@@ -161,10 +163,11 @@ class _Bounds(NamedTuple):
         offsets = np.asarray(self.sets[k].region.facets[1])
         return bool(offsets[facet] < self.steps[k].offsets[facet])
 
-    def met(self, sets: Sequence[ReachSet]) -> _Bounds:
+    def met(self, sets: Sequence[ReachSet], levels: Float[np.ndarray, "N f"]) -> _Bounds:
         """What both forms and another method say."""
         offsets = np.array([np.asarray(each.region.facets[1]) for each in sets])
-        return self._replace(offsets=np.fmin(self.offsets, offsets), sets=sets)
+        both = np.fmin(self.offsets, offsets)
+        return self._replace(offsets=both, sets=sets, levels=levels)
 
 
 class _Search(AbstractSearch):
@@ -228,7 +231,7 @@ class _Search(AbstractSearch):
         budget, began = self._budget.with_work(work), self._budget.elapsed
         problem = dataclasses.replace(self._problem, loop=self._problem.fixed[0])
         inner = self._method.inner.sets(problem.over(node.part, self._levels, budget))
-        found = node.found.met(list(inner))
+        found = node.found.met(list(inner), self._levels)
         self._slowest = max(self._slowest, self._budget.elapsed - began)
         self._price = HORIZONS + (work - budget.work) * PER_WORK / self._form
         self._left -= self._price
@@ -483,8 +486,8 @@ class _Slopes:
         """The offsets that the other method proves over a cell, with their derivatives."""
         if id(node) not in self._by_method:
             part, _ = moving_cell(self._problem, node)
-            levels = np.full(self._search.bounds.shape, -np.inf)
-            given = self._problem.over(part, levels, self._problem.budget.with_work(WORK))
+            budget = self._problem.budget.with_work(WORK)
+            given = self._problem.over(part, node.found.levels, budget)
             self._by_method[id(node)] = [each.region.facets[1] for each in self._inner.sets(given)]
         return self._by_method[id(node)]
 

@@ -51,7 +51,7 @@ OVERHEAD = 2.5e7
 PER_WORK = 300.0
 """The products that take as long as a unit of the work of linear programs."""
 
-HORIZONS = 4
+HORIZONS = 6
 """A method that goes through the horizon with facts costs so many forms, its programs aside."""
 
 LOOKED = 8

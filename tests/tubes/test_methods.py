@@ -93,7 +93,7 @@ def test_cells_of_branches_are_tighter_than_both(switching, by_cells):
 
 def test_what_is_proved_of_cells_is_kept_and_proved_again(by_cells, tmp_path):
     by_cells.save(tmp_path / "tube")
-    again = rj.load(tmp_path / "tube", recheck=True)
+    again = rj.load(tmp_path / "tube", by_cells.loop, recheck=True)
     for t in (1, 2, 3):
         np.testing.assert_allclose(again.sets[t].b, by_cells.sets[t].b, rtol=0, atol=1e-9)
 
@@ -106,7 +106,7 @@ def test_proofs_of_other_cells_prove_nothing_of_use(by_cells, tmp_path):
     forged = rj.ReachTube.sealed(by_cells.loop, TEMPLATE, sets, tuple(proofs), 0)
     forged.save(tmp_path / "forged")
     with pytest.raises(DisagreementError):
-        rj.load(tmp_path / "forged", recheck=True)
+        rj.load(tmp_path / "forged", by_cells.loop, recheck=True)
 
 
 @pytest.mark.costly

@@ -32,6 +32,7 @@ from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.affine_steps import step_columns
 from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.proofs.cells import CellCertificate
+from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import Polytope
 from reachjax.tubes.by_forms import AffineForms
@@ -112,7 +113,8 @@ class Cells(AbstractMethod):
             if not is_concrete(problem.loop, problem.X0, directions):
                 bounds = moved_by(bounds, slopes.of(k))
             facets, leaves = len(bounds), search.leaves
-            proofs = tuple(leaf.found.proof(k) for leaf in leaves)
+            first = 0 if k == len(known) else k  # of earlier ones nobody else has the proofs
+            proofs = tuple(leaf.found.proofs(first, k) for leaf in leaves)
             proof = CellCertificate(
                 loop=problem.loop,
                 X0=problem.X0,
@@ -152,9 +154,9 @@ class _Bounds(NamedTuple):
         """Whether all facets have bounds."""
         return bool(np.isfinite(self.offsets).all())
 
-    def proof(self, k: int) -> Any:
-        """The other method's proof of what holds after `k + 1` steps; None if it was not asked."""
-        return self.sets[k].proof if self.sets else None
+    def proofs(self, first: int, k: int) -> tuple[AbstractProof, ...]:
+        """The other method's proofs from one step on until `k`; none if it was not asked."""
+        return tuple(each.proof for each in self.sets[first : k + 1])
 
     def by_method(self, k: int, facet: int) -> bool:
         """Whether the other method proves more of a facet than forms do."""

@@ -87,7 +87,7 @@ def test_cells_of_branches_are_tighter_than_both(switching, by_cells):
     for other in (AffineForms(), branching(), Cells(AffineForms(), 6)):
         tube = rj.reach(switching, X0, HORIZON, TEMPLATE, other, gap=1e-6)
         assert (np.asarray(by_cells.sets[3].b) <= np.asarray(tube.sets[3].b) + 1e-9).all()
-    assert any(proof is not None for proof in by_cells.proof(3).proofs)
+    assert any(by_cells.proof(3).proofs)
     assert 1 < by_cells.proof(3).cells <= 6
 
 
@@ -96,6 +96,17 @@ def test_what_is_proved_of_cells_is_kept_and_proved_again(by_cells, tmp_path):
     again = rj.load(tmp_path / "tube", by_cells.loop, recheck=True)
     for t in (1, 2, 3):
         np.testing.assert_allclose(again.sets[t].b, by_cells.sets[t].b, rtol=0, atol=1e-9)
+
+
+def test_tubes_by_cells_that_went_on_are_proved_again(switching, tmp_path):
+    """Proofs of the first steps over later cells are kept as well."""
+    options = {"relaxation": Cells(branching(), 6), "gap": 1e-6}
+    tube = rj.reach(switching, X0, 1, TEMPLATE, **options).extended(2, **options)
+    assert len(tube.proof(2).proofs[0]) == 2 or not tube.proof(2).proofs[0]
+    tube.save(tmp_path / "tube")
+    again = rj.load(tmp_path / "tube", switching, recheck=True)
+    for t in (1, 2, 3):
+        np.testing.assert_allclose(again.sets[t].b, tube.sets[t].b, rtol=0, atol=1e-9)
 
 
 def test_proofs_of_other_cells_prove_nothing_of_use(by_cells, tmp_path):

@@ -6,9 +6,9 @@ bound is attained by a trajectory up to the gap that may stay open. Cells that h
 are halved first: the initial set is treated like any part of it.
 
 What forms leave out of units that switch falls slowly, and another method costs as much as many
-forms. It is tried on the whole set. Where it closes most of what forms leave open, the set is cut
-into as many cells as there is work for, the largest first, and each that decides a facet is bounded
-by it.
+forms. It is tried on the cell that decides most, once forms had their chance. Where it closes most
+of what they leave open, the set is cut into as many cells as there is work for, the largest first,
+and each that decides a facet is bounded by it.
 """
 
 from __future__ import annotations
@@ -67,10 +67,11 @@ what is open, or the facet is done: what disturbances leave open, no halving clo
 functions leave open falls by a factor of 64 meanwhile."""
 
 CLOSED = 0.5
-"""A method is used on cells if it closes this part of what forms leave open of the whole set."""
+"""A method is used on cells if it closes this part of what forms leave open of one."""
 
-TRIAL = 0.25
-"""The part of the work that this may take."""
+TRIAL, TRIED = 1 / 32, 1 / 8
+"""It is tried once forms have taken this part of the work, and may take as much; of a limited time
+it may take the other part."""
 
 SEARCHING = 0.9
 """The part of the time in which cells are halved: sets, proofs and witnesses take the rest, 0.7 s
@@ -200,10 +201,10 @@ class _Search(AbstractSearch):
         self._deepest = 2 * math.ceil(math.log2(method.most))
         self._longest = self._slowest = 0.0
         root.found = self._by_forms(root)
-        self._left = affordable(self._loop, problem.horizon, problem.budget)
+        self._all = self._left = affordable(self._loop, problem.horizon, problem.budget)
         self._form = MULTIPLICATIONS / affordable(self._loop, problem.horizon, Budget())
         self._asks, self._price = method.inner.adds_to_forms(loop), 0.0
-        self._stuck, self._tried = False, None
+        self._stuck = False
         self._planned, self._wanted, self._halvings, self._looked = False, 1, 0, -1
         self.end = SolverStatus.UNKNOWN_GAP
         self._open_parts: np.ndarray | None = None
@@ -227,10 +228,11 @@ class _Search(AbstractSearch):
             row[:] = np.where(np.isnan(step.offsets), np.inf, step.offsets)
         return _Bounds(steps, offsets, lost)
 
-    def _by_method(self, node: Node, part: float = 1.0) -> _Bounds:
-        """What forms and the other method say over a cell, within a part of the work."""
-        work = min(WORK, part * self._left * self._form / PER_WORK)
-        budget, began = self._budget.with_work(work), self._budget.elapsed
+    def _by_method(self, node: Node, trial: bool = False) -> _Bounds:
+        """What forms and the other method say over a cell, within a part of the work if tried."""
+        forms, share = (TRIAL * self._all, TRIED) if trial else (self._left, 1.0)
+        work, began = min(WORK, forms * self._form / PER_WORK), self._budget.elapsed
+        budget = self._budget.share(share).with_work(work)
         problem = dataclasses.replace(self._problem, loop=self._problem.fixed[0])
         inner = self._method.inner.sets(problem.over(node.part, self._levels, budget))
         found = node.found.met(list(inner), self._levels)
@@ -258,11 +260,6 @@ class _Search(AbstractSearch):
         """Whether no time is left for two halves of a cell, as long as one took at most."""
         return self._budget.left < 2 * self._longest
 
-    @property
-    def _spent(self) -> bool:
-        """Whether there may be no more cells, or no work is left for two halves of one."""
-        return self.cells.is_full or self._left < 2
-
     def enclose(self) -> None:
         """Halve cells that have no bounds until all have.
 
@@ -272,7 +269,7 @@ class _Search(AbstractSearch):
         """
         while open_cells := [leaf for leaf in self.leaves if not leaf.found.is_bounded]:
             leaf = max(open_cells, key=lambda leaf: leaf.depth)  # soon the smallest
-            spent = self._spent or self._late or leaf.depth >= self._deepest
+            spent = self._left < 2 or self._late or leaf.depth >= self._deepest
             if spent or not (self._can_halve(leaf) and self._halved(leaf, self._halves(leaf))):
                 found = leaf.found
                 if found.lost is not None:
@@ -286,25 +283,36 @@ class _Search(AbstractSearch):
         if self._problem.simulations is None or asked or self._stuck:
             return None
         self._look()
-        if self._late or (not (self._planned and self._asks) and self._spent):
+        if self._late or self._left < 2 or (self.cells.is_full and not self._asks):
             self.end = SolverStatus.TIME if self._late else SolverStatus.BUDGET
             return None
         self.end = SolverStatus.STALLED
         node = self._widest()
         if node is None:
             return None
-        if self._asks:
+        if self._asks and (self._planned or self._due):
             return self._with_method(node)
         return Question([node], self._halves, (node,)) if self._can_halve(node) else None
+
+    @property
+    def _due(self) -> bool:
+        """Whether forms had their chance."""
+        if self.cells.is_full:
+            return True
+        if self._budget.timed:
+            whole = self._budget.elapsed + self._budget.left
+            return self._budget.elapsed >= TRIAL * whole
+        return self._all - self._left >= TRIAL * self._all
 
     def _with_method(self, node: Node) -> Question | None:
         """The question about the cell that decides most, where another method may be asked."""
         if not self._planned:
-            return Question([node], self._by_method, (node, TRIAL))
-        if self.cells.count < self._wanted and not self._spent:
+            return Question([node], self._by_method, (node, True))
+        if self.cells.count < self._wanted:
             matter = [leaf for leaf in self.leaves if (leaf.found.offsets > self._levels).any()]
-            largest = max(filter(self._can_halve, matter), key=self.cells.volume, default=None)
-            if largest is not None:
+            plain = [leaf for leaf in matter if not leaf.found.sets and self._can_halve(leaf)]
+            if plain:
+                largest = max(plain, key=self.cells.volume)
                 return Question([largest], self._halves, (largest,))
         programs = self._slowest + self._longest
         if not node.found.sets:
@@ -343,27 +351,16 @@ class _Search(AbstractSearch):
                 most = min(most, self._budget.left / seconds)
             gap = max(self._problem.gap, ROUNDED)
             self._wanted = int(min(most, 1 + float(after.max()) / gap))
-            self._tried = node, tried
 
     def _beyond(self, offsets: Float[np.ndarray, "N f"]) -> Float[np.ndarray, "N f"]:
         """What bounds leave open, in parts of ranges."""
         return np.fmax(offsets - self._levels, 0.0) / self._ranges
 
     def finish(self) -> None:
-        """Take stock, also where somebody stopped the search before cells were as good as none."""
+        """Take stock, also where somebody stopped the search."""
         self._note()
-        if self._tried is not None and not self._halves_pay(*self._tried):
-            self._note()
         if self._looked >= 0:
             self._open()
-
-    def _halves_pay(self, node: Node, tried: _Bounds) -> bool:
-        """Whether the parts of a cell prove more than it does; it stands in their place if not."""
-        if not node.halves or self._beyond(self.bounds).sum() <= self._beyond(tried.offsets).sum():
-            return True
-        if node is self.cells.roots[0]:
-            node.found, node.halves = tried, []
-        return False
 
     def _look(self) -> None:
         """Simulate where cells say that facets are largest, now and then, and see what is open."""

@@ -456,6 +456,9 @@ class _Search(AbstractSearch):
             step = known.steps[k]
             drawn = [values[one] for values in step.drawn]
             found.append(self._scenarios.of_units(np.asarray(step.corners)[one], drawn))
+        if len({each.shape[1] for each in found}) > 1:  # those of forms end at the step
+            middle = self._scenarios.middle(np.asarray(self.cells.roots[0].box.center))
+            found = [self._scenarios.completed(each, middle) for each in found]
         return np.concatenate(found)
 
 

@@ -39,6 +39,16 @@ def branching(nodes: int = 20) -> Branching:
     return Branching(rj.BranchAndCut(nodes=nodes))
 
 
+@pytest.fixture(scope="module")
+def disturbed():
+    def pushed(x, u, w):
+        return swing(x, u) + jnp.array([0.0, 0.05]) * w
+
+    net = rj.MLP.from_layers(he_network((2, 6, 1), 5))
+    plant = rj.NonlinearPlant(pushed, 2, 1, disturbances=1)
+    return rj.ClosedLoop(plant, net, disturbance=rj.Box([-1.0], [1.0]))
+
+
 METHODS = {
     "forms": AffineForms(),
     "programs": Recursion(rj.LocalBounds(), 1),
@@ -50,7 +60,7 @@ METHODS = {
 
 
 @pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("kind", ["switching", "affine"])
+@pytest.mark.parametrize("kind", ["switching", "affine", "disturbed"])
 def test_sets_of_every_method_hold_what_is_simulated_and_are_proved_again(name, kind, request):
     loop = request.getfixturevalue(kind)
     tube = rj.reach(loop, X0, HORIZON, TEMPLATE, METHODS[name])

@@ -91,11 +91,16 @@ from reachjax.training import (
     unsolved,
     volume_penalty,
 )
+from reachjax.tubes.by_branching import Branching
+from reachjax.tubes.by_cells import Cells
+from reachjax.tubes.by_forms import AffineForms
+from reachjax.tubes.by_programs import Recursion
 from reachjax.tubes.decisions import decide
 from reachjax.tubes.disagreements import DisagreementError
 from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.largest import LargestSet, largest_set
 from reachjax.tubes.loading import load
+from reachjax.tubes.methods import AbstractMethod, Problem, ReachSet
 from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
 from reachjax.tubes.plotting import plot_cells, plot_set, plot_tube
 from reachjax.tubes.reach import ReachTube, reach, reach_step
@@ -127,6 +132,7 @@ __all__ = [
     "SCS",
     "AbstractActivation",
     "AbstractCertificate",
+    "AbstractMethod",
     "AbstractNetwork",
     "AbstractPlant",
     "AbstractProof",
@@ -135,6 +141,7 @@ __all__ = [
     "AbstractSolver",
     "AbstractTemplate",
     "AbstractUnit",
+    "AffineForms",
     "AffinePlant",
     "AllProducts",
     "Asin",
@@ -144,7 +151,9 @@ __all__ = [
     "Box",
     "BranchAndCut",
     "BranchCertificate",
+    "Branching",
     "CellCertificate",
+    "Cells",
     "Certificate",
     "ChangeOfBasis",
     "Clarabel",
@@ -179,10 +188,13 @@ __all__ = [
     "PenaltySchedule",
     "PolyhedralSet",
     "Polytope",
+    "Problem",
     "ReLU",
+    "ReachSet",
     "ReachTube",
     "Reciprocal",
     "Recurrence",
+    "Recursion",
     "Residual",
     "Rung",
     "SampledPlant",

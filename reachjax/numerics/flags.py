@@ -15,6 +15,9 @@ from typing import Any, TypeVar
 
 import jax
 
+SIZES = "dimension", "steps", "states", "inputs", "count"
+"""Properties that count something."""
+
 Called = TypeVar("Called", bound=Callable[..., Any])
 
 
@@ -45,7 +48,10 @@ def lenient(function: Called) -> Called:
 
 
 def made_lenient(cls: type) -> None:
-    """Let the public methods and properties that a class defines be `lenient`."""
+    """Let the public methods and properties that a class defines be `lenient`.
+
+    Sizes need no scope: no numbers meet in them.
+    """
     for name, value in list(vars(cls).items()):
         if name.startswith("_") and name not in ("__call__", "__post_init__"):
             continue
@@ -53,5 +59,5 @@ def made_lenient(cls: type) -> None:
             setattr(cls, name, lenient(value))
         elif isinstance(value, classmethod):
             setattr(cls, name, classmethod(lenient(value.__func__)))
-        elif isinstance(value, property) and value.fget is not None:
+        elif isinstance(value, property) and value.fget is not None and name not in SIZES:
             setattr(cls, name, property(lenient(value.fget), doc=value.__doc__))

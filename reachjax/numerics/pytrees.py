@@ -17,8 +17,8 @@ from reachjax.numerics.flags import made_lenient
 
 T = TypeVar("T")
 
-INNER = "reachjax.programs."
-"""The room whose objects are asked by thousands within a call that has opened its scope."""
+INNER = "reachjax.programs.", "reachjax.loops.scenarios"
+"""Whose objects are asked by thousands within a call that has opened its scope."""
 
 
 def static(**kwargs: Any) -> Any:
@@ -74,7 +74,7 @@ class Replaceable:
     """Copies with some fields changed, checked as a new object is.
 
     Public methods of what inherits from it heed none of JAX's strict flags (`flags`), but for
-    forms and programs, which nobody holds who is not called by something public.
+    forms, programs and scenarios, which nobody holds who is not called by something public.
     """
 
     def __init_subclass__(cls, **given: Any):

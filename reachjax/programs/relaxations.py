@@ -262,7 +262,8 @@ class BranchAndCut(AbstractRelaxation):
     semidefinite programs as in `CuttingPlanes`. The first three go back to the initial set and know
     how all states depend on it. Of a loop with smooth units, whose forms are of the second degree,
     the initial set, if it has no curved surface, is halved into cells instead, each with forms of
-    its own: what these leave out falls with the third power of the width. Where numbers are traced
+    its own: what these leave out falls with the third power of the width. Where linear programs and
+    splits close most of what they leave out, each cell has these, too. Where numbers are traced
     (inside `jax.jit`), where a window is given, and for ellipsoids, it is `CuttingPlanes`.
 
     Args:

@@ -31,8 +31,9 @@ class CellCertificate(AbstractProof):
             half with all of its own before the next; -1 where it is a cell.
         k: how many steps after the initial set.
         start: the time of the initial set.
-        proofs: for each cell what proves more than forms; None where nothing does, and none at all
-            if that is so of all.
+        proofs: for each cell what proves more than forms: the proof of this step, behind those of
+            steps before that no certificate has; nothing where forms prove all, and nothing at all
+            if that is so of all cells.
     """
 
     loop: ClosedLoop
@@ -41,7 +42,7 @@ class CellCertificate(AbstractProof):
     axes: Int[Array | np.ndarray, " nodes"]
     k: int = static()
     start: int = static()
-    proofs: tuple[AbstractProof | None, ...] = ()
+    proofs: tuple[tuple[AbstractProof, ...], ...] = ()
 
     def __repr__(self) -> str:
         return (
@@ -78,10 +79,10 @@ class CellCertificate(AbstractProof):
         directions = np.broadcast_to(self.directions, (self.k, *self.directions.shape))
         cells, proofs = from_tree(jax.device_put(self.X0), given), self.proofs
         if axes is not None or not proofs:
-            proofs = (None,) * len(cells)
+            proofs = ((),) * len(cells)
         found = []
-        for cell, proof in zip(cells, proofs, strict=True):
+        for cell, own in zip(cells, proofs, strict=True):
             *_, last = unrolled(self.loop, cell.part, cell.box, directions, self.start)
             bounds = np.where(np.isnan(last.offsets), np.inf, last.offsets)
-            found.append(bounds if proof is None else np.fmin(bounds, proof.recheck()))
+            found.append(np.fmin(bounds, own[-1].recheck()) if own else bounds)
         return np.max(found, axis=0)

@@ -168,12 +168,15 @@ class Simulations:
         scenarios = np.concatenate([self._all.completed(part, self._middle) for part in given])
         scenarios = np.unique(scenarios, axis=0)  # facets of many steps are often worst at one
         scenarios = self._all.clipped(scenarios)
+        inside = self._inside(scenarios)
         for pull in PULLS:
-            inside = self._inside(scenarios)[:, None]
+            if inside.all():
+                break
             pulled = self._middle + pull * (scenarios - self._middle)
-            scenarios = np.where(inside, scenarios, self._all.clipped(pulled))
+            scenarios = np.where(inside[:, None], scenarios, self._all.clipped(pulled))
+            inside = self._inside(scenarios)
         found = self.simulated(scenarios)
-        kept = self._inside(scenarios) & np.isfinite(found).all(axis=(1, 2))
+        kept = inside & np.isfinite(found).all(axis=(1, 2))
         added = Runs(scenarios[kept], found[kept])
         self._scenarios = np.concatenate([self._scenarios, added.scenarios])
         self._trajectories = np.concatenate([self._trajectories, added.states])

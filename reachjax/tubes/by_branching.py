@@ -87,7 +87,7 @@ class Branching(AbstractMethod):
         for k in range(len(known) + 1, horizon + 1):
             share = budget.share(1 / (horizon - k + 1))
             steps.append(Step(setting, X, k - 1, tuple(steps)))
-            directions = problem.template.at(k).directions
+            directions = problem.facets.at(k).directions
             rows = np.asarray(jax.lax.stop_gradient(directions))
             ladder.advance(budget=share)
             target = self._target(problem, ladder, k, rows, scenarios.middle(around.center))

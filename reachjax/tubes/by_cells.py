@@ -6,9 +6,9 @@ bound is attained by a trajectory up to the gap that may stay open. Cells that h
 are halved first: the initial set is treated like any part of it.
 
 What forms leave out of units that switch falls slowly, and another method costs as much as many
-forms. It is tried on the whole set. Where it closes most of what forms leave open, the set is cut
-into as many cells as there is work for, the largest first, and each that decides a facet is bounded
-by it.
+forms. It is tried on the cell that decides most, once forms had their chance. Where it closes most
+of what they leave open, the set is cut into as many cells as there is work for, the largest first,
+and each that decides a facet is bounded by it.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.affine_steps import step_columns
 from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.proofs.cells import CellCertificate
+from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import Polytope
 from reachjax.tubes.by_forms import AffineForms
@@ -51,7 +52,7 @@ OVERHEAD = 2.5e7
 PER_WORK = 300.0
 """The products that take as long as a unit of the work of linear programs."""
 
-HORIZONS = 4
+HORIZONS = 6
 """A method that goes through the horizon with facts costs so many forms, its programs aside."""
 
 LOOKED = 8
@@ -66,10 +67,11 @@ what is open, or the facet is done: what disturbances leave open, no halving clo
 functions leave open falls by a factor of 64 meanwhile."""
 
 CLOSED = 0.5
-"""A method is used on cells if it closes this part of what forms leave open of the whole set."""
+"""A method is used on cells if it closes this part of what forms leave open of one."""
 
-TRIAL = 0.25
-"""The part of the work that this may take."""
+TRIAL, TRIED = 1 / 32, 1 / 8
+"""It is tried once forms have taken this part of the work, and may take as much; of a limited time
+it may take the other part."""
 
 SEARCHING = 0.9
 """The part of the time in which cells are halved: sets, proofs and witnesses take the rest, 0.7 s
@@ -112,7 +114,8 @@ class Cells(AbstractMethod):
             if not is_concrete(problem.loop, problem.X0, directions):
                 bounds = moved_by(bounds, slopes.of(k))
             facets, leaves = len(bounds), search.leaves
-            proofs = tuple(leaf.found.proof(k) for leaf in leaves)
+            first = 0 if k == len(known) else k  # of earlier ones nobody else has the proofs
+            proofs = tuple(leaf.found.proofs(first, k) for leaf in leaves)
             proof = CellCertificate(
                 loop=problem.loop,
                 X0=problem.X0,
@@ -138,26 +141,36 @@ class _Bounds(NamedTuple):
         offsets: `(N, f)`, upper bounds; infinite where there is none.
         lost: what has no bounds over it after these steps, if anything has not.
         sets: what another method says; nothing if that was not asked.
+        levels: `(N, f)`, below which nothing was asked of it.
     """
 
     steps: Sequence[ByForms]
     offsets: Float[np.ndarray, "N f"]
     lost: UnboundedError | None = None
     sets: Sequence[ReachSet] = ()
+    levels: Float[np.ndarray, "N f"] = np.zeros((0, 0))
 
     @property
     def is_bounded(self) -> bool:
         """Whether all facets have bounds."""
         return bool(np.isfinite(self.offsets).all())
 
-    def proof(self, k: int) -> Any:
-        """The other method's proof of what holds after `k + 1` steps; None if it was not asked."""
-        return self.sets[k].proof if self.sets else None
+    def proofs(self, first: int, k: int) -> tuple[AbstractProof, ...]:
+        """The other method's proofs from one step on until `k`; none if it was not asked."""
+        return tuple(each.proof for each in self.sets[first : k + 1])
 
-    def met(self, sets: Sequence[ReachSet]) -> _Bounds:
+    def by_method(self, k: int, facet: int) -> bool:
+        """Whether the other method proves more of a facet than forms do."""
+        if not self.sets:
+            return False
+        offsets = np.asarray(self.sets[k].region.facets[1])
+        return bool(offsets[facet] < self.steps[k].offsets[facet])
+
+    def met(self, sets: Sequence[ReachSet], levels: Float[np.ndarray, "N f"]) -> _Bounds:
         """What both forms and another method say."""
         offsets = np.array([np.asarray(each.region.facets[1]) for each in sets])
-        return self._replace(offsets=np.fmin(self.offsets, offsets), sets=sets)
+        both = np.fmin(self.offsets, offsets)
+        return self._replace(offsets=both, sets=sets, levels=levels)
 
 
 class _Search(AbstractSearch):
@@ -188,9 +201,10 @@ class _Search(AbstractSearch):
         self._deepest = 2 * math.ceil(math.log2(method.most))
         self._longest = self._slowest = 0.0
         root.found = self._by_forms(root)
-        self._left = affordable(self._loop, problem.horizon, problem.budget)
+        self._all = self._left = affordable(self._loop, problem.horizon, problem.budget)
         self._form = MULTIPLICATIONS / affordable(self._loop, problem.horizon, Budget())
         self._asks, self._price = method.inner.adds_to_forms(loop), 0.0
+        self._stuck = False
         self._planned, self._wanted, self._halvings, self._looked = False, 1, 0, -1
         self.end = SolverStatus.UNKNOWN_GAP
         self._open_parts: np.ndarray | None = None
@@ -214,13 +228,14 @@ class _Search(AbstractSearch):
             row[:] = np.where(np.isnan(step.offsets), np.inf, step.offsets)
         return _Bounds(steps, offsets, lost)
 
-    def _by_method(self, node: Node, part: float = 1.0) -> _Bounds:
-        """What forms and the other method say over a cell, within a part of the work."""
-        work = min(WORK, part * self._left * self._form / PER_WORK)
-        budget, began = self._budget.with_work(work), self._budget.elapsed
+    def _by_method(self, node: Node, trial: bool = False) -> _Bounds:
+        """What forms and the other method say over a cell, within a part of the work if tried."""
+        forms, share = (TRIAL * self._all, TRIED) if trial else (self._left, 1.0)
+        work, began = min(WORK, forms * self._form / PER_WORK), self._budget.elapsed
+        budget = self._budget.share(share).with_work(work)
         problem = dataclasses.replace(self._problem, loop=self._problem.fixed[0])
         inner = self._method.inner.sets(problem.over(node.part, self._levels, budget))
-        found = node.found.met(list(inner))
+        found = node.found.met(list(inner), self._levels)
         self._slowest = max(self._slowest, self._budget.elapsed - began)
         self._price = HORIZONS + (work - budget.work) * PER_WORK / self._form
         self._left -= self._price
@@ -245,11 +260,6 @@ class _Search(AbstractSearch):
         """Whether no time is left for two halves of a cell, as long as one took at most."""
         return self._budget.left < 2 * self._longest
 
-    @property
-    def _spent(self) -> bool:
-        """Whether there may be no more cells, or no work is left for two halves of one."""
-        return self.cells.is_full or self._left < 2
-
     def enclose(self) -> None:
         """Halve cells that have no bounds until all have.
 
@@ -259,7 +269,7 @@ class _Search(AbstractSearch):
         """
         while open_cells := [leaf for leaf in self.leaves if not leaf.found.is_bounded]:
             leaf = max(open_cells, key=lambda leaf: leaf.depth)  # soon the smallest
-            spent = self._spent or self._late or leaf.depth >= self._deepest
+            spent = self._left < 2 or self._late or leaf.depth >= self._deepest
             if spent or not (self._can_halve(leaf) and self._halved(leaf, self._halves(leaf))):
                 found = leaf.found
                 if found.lost is not None:
@@ -270,28 +280,39 @@ class _Search(AbstractSearch):
 
     def question(self, asked: int, workers: int) -> Question | None:
         """Which gap is closed next: by halves of a cell, or by another method over it."""
-        if self._problem.simulations is None or asked:
+        if self._problem.simulations is None or asked or self._stuck:
             return None
         self._look()
-        if self._late or (not (self._planned and self._asks) and self._spent):
+        if self._late or self._left < 2 or (self.cells.is_full and not self._asks):
             self.end = SolverStatus.TIME if self._late else SolverStatus.BUDGET
             return None
         self.end = SolverStatus.STALLED
         node = self._widest()
         if node is None:
             return None
-        if self._asks:
+        if self._asks and (self._planned or self._due):
             return self._with_method(node)
         return Question([node], self._halves, (node,)) if self._can_halve(node) else None
+
+    @property
+    def _due(self) -> bool:
+        """Whether forms had their chance."""
+        if self.cells.is_full:
+            return True
+        if self._budget.timed:
+            whole = self._budget.elapsed + self._budget.left
+            return self._budget.elapsed >= TRIAL * whole
+        return self._all - self._left >= TRIAL * self._all
 
     def _with_method(self, node: Node) -> Question | None:
         """The question about the cell that decides most, where another method may be asked."""
         if not self._planned:
-            return Question([node], self._by_method, (node, TRIAL))
-        if self.cells.count < self._wanted and not self._spent:
+            return Question([node], self._by_method, (node, True))
+        if self.cells.count < self._wanted:
             matter = [leaf for leaf in self.leaves if (leaf.found.offsets > self._levels).any()]
-            largest = max(filter(self._can_halve, matter), key=self.cells.volume, default=None)
-            if largest is not None:
+            plain = [leaf for leaf in matter if not leaf.found.sets and self._can_halve(leaf)]
+            if plain:
+                largest = max(plain, key=self.cells.volume)
                 return Question([largest], self._halves, (largest,))
         programs = self._slowest + self._longest
         if not node.found.sets:
@@ -299,6 +320,7 @@ class _Search(AbstractSearch):
             enough = self._left >= self._price and self._budget.left >= programs
             return Question([node], self._by_method, (node,)) if enough else None
         if not self._can_halve(node):
+            self.end = SolverStatus.BUDGET if self.cells.is_full else self.end
             return None
         self.end = SolverStatus.TIME if self._budget.left < 2 * programs else SolverStatus.BUDGET
         enough = self._left >= 2 + 2 * self._price and self._budget.left >= 2 * programs
@@ -314,16 +336,12 @@ class _Search(AbstractSearch):
                 node.found = answer
             self._note()
         elif not self._halved(node, answer):
-            self.ended = True
+            self._stuck = True
         return self.cells.count
 
     def _plan(self, node: Node, tried: _Bounds) -> None:
         """Ask the other method of cells if it closes most of what forms leave open; of how many."""
-        before, after = (
-            np.fmax(found.offsets - self._levels, 0.0) / self._ranges
-            for found in (node.found, tried)
-        )
-        before, after = before[self._known :], after[self._known :]
+        before, after = (self._beyond(found.offsets) for found in (node.found, tried))
         self._planned = True
         self._asks = bool(after.sum() <= (1 - CLOSED) * before.sum())
         if self._asks:
@@ -334,10 +352,14 @@ class _Search(AbstractSearch):
             gap = max(self._problem.gap, ROUNDED)
             self._wanted = int(min(most, 1 + float(after.max()) / gap))
 
+    def _beyond(self, offsets: Float[np.ndarray, "N f"]) -> Float[np.ndarray, "N f"]:
+        """What bounds leave open, in parts of ranges."""
+        return np.fmax(offsets - self._levels, 0.0) / self._ranges
+
     def finish(self) -> None:
         """Take stock, also where somebody stopped the search."""
         self._note()
-        if self._problem.simulations is not None and self._looked >= 0:
+        if self._looked >= 0:
             self._open()
 
     def _look(self) -> None:
@@ -434,6 +456,9 @@ class _Search(AbstractSearch):
             step = known.steps[k]
             drawn = [values[one] for values in step.drawn]
             found.append(self._scenarios.of_units(np.asarray(step.corners)[one], drawn))
+        if len({each.shape[1] for each in found}) > 1:  # those of forms end at the step
+            middle = self._scenarios.middle(np.asarray(self.cells.roots[0].box.center))
+            found = [self._scenarios.completed(each, middle) for each in found]
         return np.concatenate(found)
 
 
@@ -452,22 +477,19 @@ class _Slopes:
 
     def of(self, k: int) -> Float[Array, " f"]:
         """The numbers of the facets after `k + 1` steps."""
-        search, problem = self._search, self._problem
-        nodes = [search.leaves[i] for i in search.deciding[k]]
-        found = moving_offsets(problem, nodes, k)
-        for facet, node in enumerate(nodes):
-            if node.found.sets:
-                offset = np.asarray(node.found.sets[k].region.facets[1])[facet]
-                if offset < node.found.steps[k].offsets[facet]:
-                    found[facet] = self._moving(node)[k][facet]
-        return jnp.stack(found)
+        nodes = dict(enumerate(self._search.leaves[i] for i in self._search.deciding[k]))
+        better = {facet: node for facet, node in nodes.items() if node.found.by_method(k, facet)}
+        by_forms = {facet: node for facet, node in nodes.items() if facet not in better}
+        found = moving_offsets(self._problem, by_forms, k)
+        found |= {facet: self._moving(node)[k][facet] for facet, node in better.items()}
+        return jnp.stack([found[facet] for facet in nodes])
 
     def _moving(self, node: Node) -> list[Array]:
         """The offsets that the other method proves over a cell, with their derivatives."""
         if id(node) not in self._by_method:
             part, _ = moving_cell(self._problem, node)
-            levels = np.full(self._search.bounds.shape, -np.inf)
-            given = self._problem.over(part, levels, self._problem.budget.with_work(WORK))
+            budget = self._problem.budget.with_work(WORK)
+            given = self._problem.over(part, node.found.levels, budget)
             self._by_method[id(node)] = [each.region.facets[1] for each in self._inner.sets(given)]
         return self._by_method[id(node)]
 

@@ -20,7 +20,6 @@ from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
 from reachjax.proofs.linear import LinearCertificate
 from reachjax.proofs.proposal import SolverStatus
-from reachjax.sets import Template
 from reachjax.tubes.cell_slopes import moving_forms
 from reachjax.tubes.methods import AbstractMethod, Problem, ReachSet, at
 from reachjax.tubes.steps import overflow
@@ -55,21 +54,13 @@ class AffineForms(AbstractMethod):
         return False
 
     def _from_the_first(self, problem: Problem) -> Iterator[ReachSet]:
-        (loop, X0, template), horizon, start = problem.parts, problem.horizon, problem.start
+        (loop, X0, _), horizon, start = problem.parts, problem.horizon, problem.start
         box = problem.box
         held = X0 if self.programs else X0.closed_form(box)
-        if not isinstance(template, Template):
-            raise TypeError(
-                "LinearBounds() bounds facets, but the template is of kind "
-                f"{type(template).__name__}: give a Template, or for ellipsoids another "
-                "relaxation, such as CuttingPlanes() or LocalBounds()"
-            )
-        directions, scenarios = template.directions, None
+        directions, scenarios = problem.directions, None
         if loop.is_disturbed and is_concrete(loop, X0):
             scenarios = Scenarios.of(loop, X0, horizon, start)
-        if template.steps is None:
-            directions = jnp.broadcast_to(directions, (horizon, *directions.shape))
-        given = loop, held, box, directions[:horizon]
+        given = loop, held, box, directions
         fixed: tuple[Any, Any, Any, Any] = jax.lax.stop_gradient(given)
         cut = held.parts[0]
         if is_concrete(given):
@@ -81,7 +72,7 @@ class AffineForms(AbstractMethod):
         else:
             steps = _at_once(unrolled_at_once(*given, start))
         for k, (step, seconds) in enumerate(steps, start=1):
-            shaped, facets = template.at(k), len(template)
+            shaped, facets = problem.facets.at(k), len(problem.facets)
             proof = LinearCertificate(
                 loop=loop,
                 X0=X0,

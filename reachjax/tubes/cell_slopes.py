@@ -6,7 +6,7 @@ initial set; where facets of the set itself decide, they have the multipliers of
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -35,25 +35,27 @@ def moving_cell(problem: Problem, node: Node) -> tuple[AbstractSet, Box]:
     return X0.cut(around) if isinstance(X0, Polytope) else around, around
 
 
-def moving_offsets(problem: Problem, deciding: Sequence[Node], k: int) -> list[Float[Array, ""]]:
+def moving_offsets(
+    problem: Problem, deciding: Mapping[int, Node], k: int
+) -> dict[int, Float[Array, ""]]:
     """Numbers with the derivatives of what forms over the deciding cells prove.
 
     Args:
         problem: the problem, of a box or a polytope.
-        deciding: for each facet after `k + 1` steps, the cell in which its bound is largest.
+        deciding: for some facets after `k + 1` steps, the cell in which the bound is largest.
         k: the number of the step.
     """
-    offsets, known, directions = list[Array](), dict[int, Array](), problem.directions
+    offsets, known, directions = dict[int, Array](), dict[int, Array](), problem.directions
     fixed = jax.lax.stop_gradient((problem.loop, problem.X0, directions))
     loop, region, rows = jax.device_get(fixed)
     everywhere = jnp.zeros((len(rows), 2, rows.shape[2]))
-    for facet, node in enumerate(deciding):
+    for facet, node in deciding.items():
         if id(node) not in known:
             held = _held(loop, region, rows, node, k, problem.start)
             part, around = moving_cell(problem, node)
             parts = Moving(problem.loop, part, around, directions[k], everywhere)
             known[id(node)] = moving(parts, held, k + 1, problem.start)
-        offsets.append(known[id(node)][facet])
+        offsets[facet] = known[id(node)][facet]
     return offsets
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from reachjax.numerics.checks import is_concrete
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.proposal import AS_ASKED, SolverStatus
 from reachjax.proofs.witnesses import Simulations
-from reachjax.sets import AbstractSet, AbstractTemplate, Box
+from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
 from reachjax.tubes.steps import boxed
 
 
@@ -119,8 +119,25 @@ class Problem:
     @property
     def directions(self) -> Float[Array, "N f n_x"]:
         """The facets of each step."""
-        facets: Any = (self.template.at(k) for k in range(1, self.horizon + 1))
-        return jnp.stack([each.directions for each in facets])
+        rows = self.facets.directions
+        if self.facets.steps is None:
+            return jnp.broadcast_to(rows, (self.horizon, *rows.shape))
+        return rows[: self.horizon]
+
+    @property
+    def facets(self) -> Template:
+        """The template, of facets alone.
+
+        Raises:
+            TypeError: it has none, or more than these.
+        """
+        if not isinstance(self.template, Template):
+            raise TypeError(
+                "LinearBounds() bounds facets, as branches and cells do, but the template is of "
+                f"kind {type(self.template).__name__}: give a Template, or for ellipsoids another "
+                "relaxation, such as CuttingPlanes() or LocalBounds()"
+            )
+        return self.template
 
     def require_numbers(self) -> None:
         """Raise an error where a method needs numbers.

@@ -82,24 +82,21 @@ class _CellTube(NamedTuple):
         return found
 
 
-def _over_cell(proof: AbstractProof | None, number: int, axes: list[int]) -> AbstractProof | None:
-    """The proof over one of the cells that these axes leave; None if there is none."""
-    if not isinstance(proof, CellCertificate) or np.asarray(proof.axes).tolist() != axes:
-        return None
-    return proof.proofs[number] if number < len(proof.proofs) else None
-
-
 class Repeat:
     """The propagation of a tube, as its proofs say that it was.
 
     Args:
         tube: whose parts have the kinds that they should have.
-        sets: those that are proved so far; they grow from outside.
+        sets: those that are proved so far; they grow from outside, or, of a cell, by `until`.
+
+    Attributes:
+        again: of a cell, its proofs as they were made again.
     """
 
     def __init__(self, tube: ReachTube | _CellTube, sets: list[AbstractSet]):
         self._tube, self._sets = tube, sets
-        self._within: dict[int, Repeat] = {}
+        self._within: dict[tuple[int, ...], Repeat] = {}
+        self.again = list[AbstractProof]()
         self._forms = _Unrolled(None, [])
         self._windows: dict[Origin, Window] = {}
 
@@ -166,25 +163,34 @@ class Repeat:
         if len(proof.proofs) != len(cells):
             raise ValueError(f"it has {len(cells)} cells, but {len(proof.proofs)} proofs")
         again = list(proof.proofs)
-        for number, (cell, each) in enumerate(zip(cells, proof.proofs, strict=True)):
-            if each is not None:
-                again[number], bounds = self._over(number, axes, cell.part).of(k, each)
-                self._within[number].reached(self._directions(k), bounds)
-                found[number] = np.fmin(found[number], bounds)
+        for number, cell in enumerate(cells):
+            if again[number]:
+                own = self._over(number, axes, cell.part)
+                found[number] = np.fmin(found[number], own.until(k))
+                again[number] = tuple(own.again[k - len(again[number]) : k])
         return proof.replace(proofs=tuple(again)), found.max(axis=0)
 
     def _over(self, number: int, axes: list[int], part: AbstractSet) -> Repeat:
-        """The propagation over a cell of the initial set."""
-        if number not in self._within:
-            tube = self._tube
-            proofs = [None, *(_over_cell(p, number, axes) for p in tube.certificates[1:])]
+        """The propagation over one of the cells that these axes leave."""
+        key, tube = (number, *axes), self._tube
+        if key not in self._within:
+            proofs: list[AbstractProof | None] = [None] * (tube.horizon + 1)
+            for k, each in enumerate(tube.certificates):
+                if isinstance(each, CellCertificate) and np.asarray(each.axes).tolist() == axes:
+                    mine = each.proofs[number] if each.proofs else ()
+                    proofs[k + 1 - len(mine) : k + 1] = mine
             own = _CellTube(tube.loop, tube.template, (part,), tuple(proofs), tube.start)
-            self._within[number] = Repeat(own, [part])
-        return self._within[number]
+            self._within[key] = Repeat(own, [part])
+        return self._within[key]
 
-    def reached(self, directions: Any, bounds: Float[np.ndarray, " f"]) -> None:
-        """Note the set that is proved of the next step of a cell."""
-        self._sets.append(Polytope(directions, bounds))
+    def until(self, k: int) -> Float[np.ndarray, " f"]:
+        """The bounds of the step `k` of a cell, whose proofs so far are made again."""
+        while len(self.again) < k:
+            step = len(self.again) + 1
+            proof, bounds = self.of(step, self._tube.proof(step))
+            self.again.append(proof)
+            self._sets.append(Polytope(self._directions(step), bounds))
+        return np.asarray(self._sets[k].facets[1])
 
     @cached_property
     def _ladder(self) -> Ladder:

@@ -21,6 +21,7 @@ from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet, Polytope
 from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
 from reachjax.sets.polyhedra import is_empty
+from reachjax.tubes.methods import Span, at
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.times import AvoidSets, Region, Timed, timed_goals, timed_sets_to_avoid
 
@@ -67,6 +68,11 @@ class Requirement:
     inside: bool
     ball: Ellipsoid | None = None
     throughout: bool = False
+
+    @property
+    def span(self) -> Span:
+        """The times at which it is meant: one sample."""
+        return at(self.time)
 
     @property
     def looser(self) -> PolyhedralSet:

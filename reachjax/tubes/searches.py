@@ -40,11 +40,14 @@ class AbstractSearch(abc.ABC):
 
     Attributes:
         ahead: how many questions an executor is given for each of its workers.
-        ended: whether nothing more is to be found out.
     """
 
     ahead: int = 1
-    ended: bool = False
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more is to be found out, whatever was asked."""
+        return False
 
     @abc.abstractmethod
     def question(self, asked: int, workers: int) -> Question | None:

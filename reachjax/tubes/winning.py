@@ -229,7 +229,7 @@ class _Winning(AbstractSearch):
     def answered(self, question: Question, answer: Sequence[Sorted]) -> int:
         """How many cells are decided, as far as a bar is concerned."""
         last = question.given[0] is self._task
-        for node, found in zip(question.nodes, answer, strict=True):
+        for node, found in reversed(list(zip(question.nodes, answer, strict=True))):
             self._judge(node, found, last)
         return self._tree.count - len(self._open) - len(self._left)
 

@@ -53,3 +53,15 @@ def test_a_budget_that_is_sent_elsewhere_ends_at_the_same_moment():
     assert one.left == pytest.approx(budget.left, abs=1.0)
     assert one.left < 1000.0
     assert not other.timed
+
+
+def test_what_passes_is_counted_from_the_beginning_and_beyond_the_end(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    whole = Budget(8.0)
+    half = whole.share(1 / 2)
+    now[0] += 5.0
+    assert (whole.elapsed, half.elapsed) == (5.0, 5.0)
+    assert (whole.overrun, half.overrun) == (0.0, 1.0)
+    assert whole.share(1 / 3).elapsed == 0.0
+    assert Budget().overrun == 0.0

@@ -39,6 +39,16 @@ def branching(nodes: int = 20) -> Branching:
     return Branching(rj.BranchAndCut(nodes=nodes))
 
 
+@pytest.fixture(scope="module")
+def disturbed():
+    def pushed(x, u, w):
+        return swing(x, u) + jnp.array([0.0, 0.05]) * w
+
+    net = rj.MLP.from_layers(he_network((2, 6, 1), 5))
+    plant = rj.NonlinearPlant(pushed, 2, 1, disturbances=1)
+    return rj.ClosedLoop(plant, net, disturbance=rj.Box([-1.0], [1.0]))
+
+
 METHODS = {
     "forms": AffineForms(),
     "programs": Recursion(rj.LocalBounds(), 1),
@@ -50,7 +60,7 @@ METHODS = {
 
 
 @pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("kind", ["switching", "affine"])
+@pytest.mark.parametrize("kind", ["switching", "affine", "disturbed"])
 def test_sets_of_every_method_hold_what_is_simulated_and_are_proved_again(name, kind, request):
     loop = request.getfixturevalue(kind)
     tube = rj.reach(loop, X0, HORIZON, TEMPLATE, METHODS[name])
@@ -87,15 +97,26 @@ def test_cells_of_branches_are_tighter_than_both(switching, by_cells):
     for other in (AffineForms(), branching(), Cells(AffineForms(), 6)):
         tube = rj.reach(switching, X0, HORIZON, TEMPLATE, other, gap=1e-6)
         assert (np.asarray(by_cells.sets[3].b) <= np.asarray(tube.sets[3].b) + 1e-9).all()
-    assert any(proof is not None for proof in by_cells.proof(3).proofs)
+    assert any(by_cells.proof(3).proofs)
     assert 1 < by_cells.proof(3).cells <= 6
 
 
 def test_what_is_proved_of_cells_is_kept_and_proved_again(by_cells, tmp_path):
     by_cells.save(tmp_path / "tube")
-    again = rj.load(tmp_path / "tube", recheck=True)
+    again = rj.load(tmp_path / "tube", by_cells.loop, recheck=True)
     for t in (1, 2, 3):
         np.testing.assert_allclose(again.sets[t].b, by_cells.sets[t].b, rtol=0, atol=1e-9)
+
+
+def test_tubes_by_cells_that_went_on_are_proved_again(switching, tmp_path):
+    """Proofs of the first steps over later cells are kept as well."""
+    options = {"relaxation": Cells(branching(), 6), "gap": 1e-6}
+    tube = rj.reach(switching, X0, 1, TEMPLATE, **options).extended(2, **options)
+    assert len(tube.proof(2).proofs[0]) == 2 or not tube.proof(2).proofs[0]
+    tube.save(tmp_path / "tube")
+    again = rj.load(tmp_path / "tube", switching, recheck=True)
+    for t in (1, 2, 3):
+        np.testing.assert_allclose(again.sets[t].b, tube.sets[t].b, rtol=0, atol=1e-9)
 
 
 def test_proofs_of_other_cells_prove_nothing_of_use(by_cells, tmp_path):
@@ -106,7 +127,7 @@ def test_proofs_of_other_cells_prove_nothing_of_use(by_cells, tmp_path):
     forged = rj.ReachTube.sealed(by_cells.loop, TEMPLATE, sets, tuple(proofs), 0)
     forged.save(tmp_path / "forged")
     with pytest.raises(DisagreementError):
-        rj.load(tmp_path / "forged", recheck=True)
+        rj.load(tmp_path / "forged", by_cells.loop, recheck=True)
 
 
 @pytest.mark.costly

@@ -71,8 +71,8 @@ class Requirement:
 
     @property
     def span(self) -> Span:
-        """The times at which it is meant: one sample."""
-        return at(self.time)
+        """The times at which it is meant: one sample, or those since the sample before."""
+        return Span(self.time - 1, self.time) if self.throughout else at(self.time)
 
     @property
     def looser(self) -> PolyhedralSet:

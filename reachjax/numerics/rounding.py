@@ -135,7 +135,8 @@ class Ball(AbstractNumber):
         if len(parts) == 1:
             return parts[0]  # type: ignore[return-value]
         xp = namespace(*(part.mid for part in parts))
-        return cls(*(xp.concatenate(each) for each in zip(*((y.mid, y.rad) for y in parts))))
+        mid, rad = (xp.concatenate([getattr(y, name) for y in parts]) for name in ("mid", "rad"))
+        return cls(mid, rad)
 
     @property
     def lower(self):

@@ -72,7 +72,9 @@ def test_points_inside_stay_where_they_are(inputs):
 def test_compiled_mapped_and_in_batches_on_the_host_it_is_the_same(inputs):
     C, d = inputs
     y = points(C, d, 40)
-    on_host = projected(Batch(y), C, d, lambda unit, *y: Batch(unit(*(each.values for each in y)))).values
+    on_host = projected(
+        Batch(y), C, d, lambda unit, *y: Batch(unit(*(each.values for each in y)))
+    ).values
     np.testing.assert_allclose(jax.jit(partial(on_all, C))(d, y), on_host, atol=1e-12)
 
 

@@ -17,6 +17,11 @@ def network(function, inputs=2):
     return rj.Network(function, inputs, shape[0])
 
 
+def on_batches(unit, *y):
+    """Units at many points at once."""
+    return Batch(unit(*(each.values for each in y)))
+
+
 def by_interval(unit, *given):
     """Units by the intervals of their inputs, which are rounded."""
     y = Ball.joined(given)
@@ -43,7 +48,9 @@ def assert_sound(function, lower=LOWER, upper=UPPER):
     np.testing.assert_allclose(jax.vmap(net)(x), expected, rtol=1e-13, atol=1e-14)
     steps = jax.vmap(lambda x: net.propagate(x, lambda unit, *y: unit(*y)))(x)
     np.testing.assert_allclose(steps, expected, rtol=1e-12, atol=1e-13)
-    at_once = jax.device_get(net).propagate(Batch(x), lambda unit, *y: Batch(unit(*(each.values for each in y))))
+    at_once = jax.device_get(net).propagate(
+        Batch(x), lambda unit, *y: Batch(unit(*(each.values for each in y)))
+    )
     found = np.broadcast_to(at_once.values, expected.shape)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13)
     low, high = interval(net, lower, upper)

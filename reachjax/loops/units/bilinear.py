@@ -95,33 +95,34 @@ class Bilinear(AbstractUnit):
 
         Where bounds of a factor are not finite, they are infinitely far from each other.
         """
-        slope, offset, gap = self.plane(lower, upper)
-        error = gamma(self.terms + 4) * constant(abs(offset) + gap) + TINY
-        return Lines(Line(slope, offset - gap - error), Line(slope, offset + gap + error))
+        slope, offset, gap = self.planes(lower, upper)
+        xp, count = namespace(slope, gap), self.terms
+        offset, size, gap = (summed(each, count) for each in (offset, abs(offset), gap))
+        known = gap < math.inf
+        gap = (gap + gamma(count + 4) * constant(size + gap) + TINY) * (1 + gamma(4))
+        slope = xp.where(xp.concatenate([known] * self.inputs), slope, 0.0)
+        offset, gap = xp.where(known, offset, 0.0), xp.where(known, gap, math.inf)
+        return Lines(Line(slope, offset - gap), Line(slope, offset + gap))
 
     @np.errstate(all="ignore")
-    def plane(self, lower: Array, upper: Array) -> tuple[Array, Array, Array]:
-        """Slopes, offsets and gaps: values are as far from the planes as gaps say, at most.
+    def planes(self, lower: Array, upper: Array) -> tuple[Array, Array, Array]:
+        """Slopes of all factors, and offsets and gaps of each product.
 
-        Offsets are those of these slopes but for a few roundings, `terms + 2` at most, which gaps
-        leave out, as `lines` does not.
+        A product is as far from its plane as the gap says, at most, if the offset is not rounded:
+        that is one product of floats. Where bounds are not finite, gaps are infinite.
         """
         xp = namespace(lower, upper)
         known = (abs(lower) < math.inf) & (abs(upper) < math.inf)
         lower, upper = (xp.where(known, end, 0.0) for end in (lower, upper))
         middle = lower / 2 + upper / 2
         radius = larger(upper - middle, middle - lower) * (1 + gamma(2))
-        radius = xp.where(known, xp.where(radius > 0, radius + TINY, radius), math.inf)
         (one, other), (near, far) = self.halves(middle), self.halves(radius)
-        fixed = (near == 0) | (far == 0)
-        products = xp.where(fixed, 0.0, xp.where(fixed, 0.0, near) * far * (1 + gamma(2)) + TINY)
-        products = xp.where((near < math.inf) & (far < math.inf), products, math.inf)
-        gap = summed(products, self.terms) * (1 + gamma(self.terms))
-        known = (gap < math.inf) & (abs(summed(one * other, self.terms)) < math.inf)
-        offset = xp.where(known, -summed(one * other, self.terms), 0.0)
-        whole = xp.concatenate([known] * (2 * self.terms))
-        slope = xp.where(whole, xp.concatenate([other, one]), 0.0)
-        return slope, offset, xp.where(known, gap, math.inf)
+        fixed, (known, also) = (near == 0) | (far == 0), self.halves(known)
+        gap = xp.where(fixed, 0.0, near * far * (1 + gamma(2)) + TINY)
+        offset = -(one * other)
+        known = known & also & (gap < math.inf) & (abs(offset) < math.inf)
+        slope = xp.where(xp.concatenate([known, known]), xp.concatenate([other, one]), 0.0)
+        return slope, xp.where(known, offset, 0.0), xp.where(known, gap, math.inf)
 
     @np.errstate(all="ignore")
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:

@@ -9,6 +9,7 @@ tells.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -398,20 +399,20 @@ def _recorded(structure: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> tuple
         layers.append(UnitLayer(unit.kind, len(z), sum(map(len, y))))
         return z
 
-    def passed(tree: Any, *given: Array) -> Array:
+    def passed(tree: Any, given: Sequence[Array]) -> Array:
         if isinstance(tree, ClosedLoop):
-            return tree.step(*given, 0, record)
+            return tree.step(given[0], 0, record)
         if isinstance(tree, AbstractPlant):
             x, u, *w = given
             return tree.propagate(x, u, 0, record, *w)
-        return tree.propagate(*given, record)
+        return tree.propagate(given[0], record)
 
     tree = jax.tree.unflatten(structure, leaves)
     sizes = [tree.inputs] if isinstance(tree, AbstractNetwork) else [tree.states]
     if isinstance(tree, AbstractPlant):
         sizes += [tree.inputs, *([tree.disturbances] if tree.disturbances else [])]
-    given = (jax.ShapeDtypeStruct((size,), float) for size in sizes)
-    jax.eval_shape(passed, tree, *given)
+    given = [jax.ShapeDtypeStruct((size,), float) for size in sizes]
+    jax.eval_shape(passed, tree, given)
     return tuple(layers)
 
 

@@ -411,18 +411,18 @@ class Recorder:
             each.source or (each, np.arange(each.size)) for each in factors
         )
         alike = np.reshape(numbers == others, pairs[0].shape) & (first.place == second.place)
-        squares = alike.all(axis=0)
+        squares = np.asarray(alike.all(axis=0))
         if len(alike) == 1:
             return self.reshaped(self.product(*factors), shape)
         if squares.all():
             sums = np.tile(np.eye(len(squares)), len(alike))
             return self.mapped(self.product(*factors), sums, shape)
         if not squares.any():
-            return self._bilinear(Bilinear(len(alike)), *factors, shape)
+            return self._bilinear(Bilinear(len(alike)), factors[0], factors[1], shape)
         parts, places = [], []
         for here in map(np.flatnonzero, (squares, ~squares)):
-            own = (index[:, here] for index in pairs)
-            parts.append(self.inner_products(one, other, (len(here),), tuple(own)))
+            own = pairs[0][:, here], pairs[1][:, here]
+            parts.append(self.inner_products(one, other, (len(here),), own))
             places.append(here)
         order = np.argsort(np.concatenate(places))
         return self.reshaped(self.picked(self.joined(parts), order), shape)

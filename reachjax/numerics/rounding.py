@@ -210,7 +210,7 @@ class Ball(AbstractNumber):
         """The numbers up to an error of so much each."""
         return self._rebuilt(self.mid, self.rad, by)
 
-    def met(self, held: Callable[..., Ball], *given: Ball) -> Self:
+    def met(self, held: Callable[..., Self], *given: Self) -> Self:
         """What these hold and what others say of them."""
         return self.meeting(held(*given))
 

@@ -344,7 +344,8 @@ def _bilinear(
     form = xp.concatenate([xp.stack([middle, values.mid], axis=1), *parts], axis=1)
     sizes = _folded(abs(slope) * (abs(center) + own + rest), 2 * count)
     sizes = sizes + _folded(abs(slope[:half] * slope[half:]) + S * S_other, count)
-    error = gamma(size + 2 * count + 16) * sizes + (size + 8) * (w + 1) * count * TINY
+    flushed = (size + 8) * (w + 1) * TINY * (1 + _folded(abs(center) + own + rest, 2 * count))
+    error = gamma(size + 2 * count + 16) * sizes + count * flushed
     radius = _folded(abs(slope) * y.radii[:, 0], 2 * count) * (1 + gamma(2 * count + 4))
     z = AffineForms(form, xp.stack([constant(radius + error), values.rad], axis=1))
     z, places = z.with_own(gap, place)

@@ -21,7 +21,7 @@ import operator
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark, Product
 from reachjax.numerics.numbers import summed
@@ -70,7 +70,7 @@ class Bilinear(AbstractUnit):
         half = y.shape[-1] // 2
         return y[..., :half], y[..., half:]
 
-    def derivative(self, y: Float[Array, "*c k"]) -> Float[Array, "*c k"]:
+    def derivative(self, y: Any) -> Any:
         """The derivative by each factor, which is the other one."""
         one, other = self.halves(y)
         return namespace(y).concatenate([other, one], axis=-1)
@@ -83,10 +83,11 @@ class Bilinear(AbstractUnit):
         corners = xp.stack([low * least, low * most, high * least, high * most])
         ends = functools.reduce(smaller, corners), functools.reduce(larger, corners)
         unknown = functools.reduce(operator.or_, xp.isnan(corners))
-        rounded = self._rounded(abs(corners).max(axis=0), (low, high), (least, most))
-        error = constant(xp.where(unknown, math.inf, rounded))
+        size = functools.reduce(larger, abs(corners))
+        error = gamma(self.terms) * size + self._flushed(lower, upper)
+        error = constant(xp.where(unknown, math.inf, error))
         below, above = (summed(xp.where(unknown, 0.0, end), self.terms) for end in ends)
-        error = summed(error, self.terms)
+        error = summed(error, self.terms) * (1 + gamma(self.terms))
         return below - error, above + error
 
     @np.errstate(all="ignore")
@@ -97,9 +98,13 @@ class Bilinear(AbstractUnit):
         """
         slope, offset, gap = self.planes(lower, upper)
         xp, count = namespace(slope, gap), self.terms
-        offset, size, gap = (summed(each, count) for each in (offset, abs(offset), gap))
+        flushed = self._flushed(lower, upper)
+        offset, size, gap, flushed = (
+            summed(each, count) for each in (offset, abs(offset), gap, flushed)
+        )
         known = gap < math.inf
-        gap = (gap + gamma(count + 4) * constant(size + gap) + TINY) * (1 + gamma(4))
+        gap = gap + gamma(count + 4) * constant(size + gap) + flushed + TINY
+        gap = gap * (1 + gamma(4))
         slope = xp.where(xp.concatenate([known] * self.inputs), slope, 0.0)
         offset, gap = xp.where(known, offset, 0.0), xp.where(known, gap, math.inf)
         return Lines(Line(slope, offset - gap), Line(slope, offset + gap))
@@ -108,8 +113,9 @@ class Bilinear(AbstractUnit):
     def planes(self, lower: Array, upper: Array) -> tuple[Array, Array, Array]:
         """Slopes of all factors, and offsets and gaps of each product.
 
-        A product is as far from its plane as the gap says, at most, if the offset is not rounded:
-        that is one product of floats. Where bounds are not finite, gaps are infinite.
+        A product is as far from its plane as the gap says, at most, if the offset is not rounded,
+        which is a product of floats, and nothing is lost that is too small for these. Where bounds
+        are not finite, gaps are infinite.
         """
         xp = namespace(lower, upper)
         known = (abs(lower) < math.inf) & (abs(upper) < math.inf)
@@ -139,16 +145,19 @@ class Bilinear(AbstractUnit):
             for name, (a, b) in zip(names, corners, strict=True):
                 a, b = (xp.where(whole, end, 0.0) for end in (a, b))
                 plane = summed(b * one + a * other, self.terms)
-                spare = gamma(self.terms + 4) * summed(abs(a * b), self.terms)
-                spare = xp.where(known, spare + TINY * self.terms, math.inf)
+                spare = gamma(self.terms + 4) * abs(a * b) + self._flushed(lower, upper)
+                spare = xp.where(known, summed(spare, self.terms) + TINY, math.inf)
                 row = sign * (z - plane) + (sign * summed(a * b, self.terms) + spare)
                 blocks.append(Block(row, name, Mark.BOUND))
         below, above = CORNERS
         products = (Product(left, right, Mark.BOUND) for left in below for right in above)
         return Facts(tuple(blocks), (), tuple(products))
 
-    def _rounded(self, size: Any, one: Any, other: Any) -> Any:
-        """What products of ends of this size are off by, and sums of them."""
-        xp = namespace(size)
-        some = [xp.where((low == 0) & (high == 0), 0.0, 1.0) for low, high in (one, other)]
-        return gamma(self.terms) * size + TINY * some[0] * some[1]
+    def _flushed(self, lower: Array, upper: Array) -> Any:
+        """What is lost of each product where it, or a factor, is too small for compiled code.
+
+        On the host that keeps such factors nothing is, where one is known.
+        """
+        (one, other), xp = self.halves(larger(abs(lower), abs(upper))), namespace(lower, upper)
+        lost = TINY * (1 + constant(one + other))
+        return lost if xp is not np else np.where((one == 0) | (other == 0), 0.0, lost)

@@ -12,6 +12,7 @@ import reachjax as rj
 from reachjax.loops.limits import Limits
 from reachjax.loops.units import Bilinear, Lines
 from reachjax.numerics.rounding import Ball
+from reachjax.programs.bounds import successor_box
 from tests.loops.traced import interval, network
 
 mpmath.mp.dps = 60
@@ -207,6 +208,19 @@ def offsets(p, X0):
     template = rj.Template(np.vstack([np.eye(2), -np.eye(2)]))
     tube = rj.reach(rj.ClosedLoop(plant, net), X0, 3, template, rj.LinearBounds())
     return jnp.stack([X.facets[1] for X in tube.sets[1:]])
+
+
+def test_successors_of_points_are_enclosed_closely():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        p, x = rng.normal(size=(4, 2)), rng.normal(size=2)
+        plant = rj.NonlinearPlant(jax.tree_util.Partial(polynomial, p), 2, 2)
+        net = rj.MLP.from_layers([(np.zeros((2, 2)), np.zeros(2))])
+        found = successor_box(rj.ClosedLoop(plant, net), rj.Box(x, x), 0)
+        (((successor,),),) = (exact_runs(p, [x], 1),)
+        assert np.all(exactly(found.lower) <= successor)
+        assert np.all(successor <= exactly(found.upper))
+        assert np.all(found.upper - found.lower <= 1e-12)
 
 
 @pytest.mark.costly

@@ -9,6 +9,7 @@ tells.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -192,10 +193,9 @@ class ClosedLoop(Replaceable):
         return _recorded(*_shaped(self.controller))
 
     @property
-    def smooth_controller(self) -> bool:
-        """Whether the controller has units, and all of them are smooth."""
-        layers = self.controller_layers
-        return bool(layers) and all(layer.unit.curved for layer in layers)
+    def plant_layers(self) -> tuple[UnitLayer, ...]:
+        """The layers of units of the plant, which come last."""
+        return _recorded(*_shaped(self.plant))
 
     @property
     def curved(self) -> bool:
@@ -264,11 +264,15 @@ class ClosedLoop(Replaceable):
             unit: what is done at each layer of units.
             w: the disturbances; None for any that there may be, or with plain numbers the middle.
         """
+        return self.plant.propagate(x, u, t, unit, *self.pushed(x, t, unit, w))
+
+    def pushed(
+        self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
+    ) -> tuple[Any, ...]:
+        """The disturbances as an argument of the plant; none of a loop without."""
         if self.disturbance is None:
-            return self.plant.propagate(x, u, t, unit)
-        if w is None:
-            w = drawn(self.disturbance, x, self.states, t, unit)
-        return self.plant.propagate(x, u, t, unit, w)
+            return ()
+        return (drawn(self.disturbance, x, self.states, t, unit) if w is None else w,)
 
     def step(
         self,
@@ -382,10 +386,10 @@ def _shaped(tree: Any) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
 
 @lru_cache(maxsize=256)
 def _recorded(structure: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> tuple[UnitLayer, ...]:
-    """The layers of units that the forward pass of a loop or a network of this structure meets.
+    """The layers of units that the forward pass of a loop, or of a part of it, meets.
 
     Args:
-        structure: of the loop as a tree.
+        structure: of the loop, the plant or the controller as a tree.
         leaves: their shapes and kinds.
     """
     layers = []
@@ -395,13 +399,20 @@ def _recorded(structure: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> tuple
         layers.append(UnitLayer(unit.kind, len(z), sum(map(len, y))))
         return z
 
-    def passed(tree: Any, x: Array) -> Array:
-        return tree.step(x, 0, record) if loops else tree.propagate(x, record)
+    def passed(tree: Any, given: Sequence[Array]) -> Array:
+        if isinstance(tree, ClosedLoop):
+            return tree.step(given[0], 0, record)
+        if isinstance(tree, AbstractPlant):
+            x, u, *w = given
+            return tree.propagate(x, u, 0, record, *w)
+        return tree.propagate(given[0], record)
 
     tree = jax.tree.unflatten(structure, leaves)
-    loops = isinstance(tree, ClosedLoop)
-    state = jax.ShapeDtypeStruct((tree.states if loops else tree.inputs,), float)
-    jax.eval_shape(passed, tree, state)
+    sizes = [tree.inputs] if isinstance(tree, AbstractNetwork) else [tree.states]
+    if isinstance(tree, AbstractPlant):
+        sizes += [tree.inputs, *([tree.disturbances] if tree.disturbances else [])]
+    given = [jax.ShapeDtypeStruct((size,), float) for size in sizes]
+    jax.eval_shape(passed, tree, given)
     return tuple(layers)
 
 

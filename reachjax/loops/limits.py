@@ -96,7 +96,8 @@ class Limits(AbstractNumber):
         )
         return self._outward(least, most, *off)
 
-    __rmul__ = __mul__
+    def __rmul__(self, factor: Any) -> Limits:
+        return self * factor
 
     @np.errstate(invalid="ignore", over="ignore")
     def __rmatmul__(self, matrix: Any) -> Limits:

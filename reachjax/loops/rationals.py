@@ -128,7 +128,8 @@ class Rationals(AbstractNumber):
             ]
         )
 
-    __rmul__ = __mul__
+    def __rmul__(self, factor: Any) -> Rationals:
+        return self * factor
 
     def __rmatmul__(self, matrix: Any) -> Rationals:
         return Rationals([None])

@@ -391,15 +391,53 @@ class Recorder:
             if value.place in below:
                 square = self.reshaped(self.unit(Square(), value), one.shape)
                 return self.rescaled(square, (*terms, *below[value.place]))
+        return self._bilinear(Bilinear(), one, other, one.shape)
+
+    def inner_products(
+        self, one: Value, other: Value, shape: Shape, pairs: tuple[np.ndarray, np.ndarray]
+    ) -> Value:
+        """Sums of products of entries of two values.
+
+        Args:
+            one: the first factors are its entries.
+            other: the second ones.
+            shape: of the result.
+            pairs: `(terms, k)`, the numbers of the entries, of each of its `k` entries.
+        """
+        factors = [
+            self.picked(each, index) for each, index in zip((one, other), pairs, strict=True)
+        ]
+        (first, numbers), (second, others) = (
+            each.source or (each, np.arange(each.size)) for each in factors
+        )
+        alike = np.reshape(numbers == others, pairs[0].shape) & (first.place == second.place)
+        squares = np.asarray(alike.all(axis=0))
+        if len(alike) == 1:
+            return self.reshaped(self.product(*factors), shape)
+        if squares.all():
+            sums = np.tile(np.eye(len(squares)), len(alike))
+            return self.mapped(self.product(*factors), sums, shape)
+        if not squares.any():
+            return self._bilinear(Bilinear(len(alike)), factors[0], factors[1], shape)
+        parts, places = [], []
+        for here in map(np.flatnonzero, (squares, ~squares)):
+            own = pairs[0][:, here], pairs[1][:, here]
+            parts.append(self.inner_products(one, other, (len(here),), own))
+            places.append(here)
+        order = np.argsort(np.concatenate(places))
+        return self.reshaped(self.picked(self.joined(parts), order), shape)
+
+    def _bilinear(self, unit: Bilinear, one: Value, other: Value, shape: Shape) -> Value:
+        """A layer of sums of products."""
         one, other = sorted((one, other), key=lambda value: value.place)
-        unit = Bilinear()
         step = Step(
             self._applied(unit),
             (one.place, other.place),
+            entrywise=unit.terms == 1,
             unit=unit,
-            again=self.product,
+            again=lambda y, z: self._bilinear(unit, y, z, shape),
         )
-        return self.layer(one.shape, step, ("product", one.place, other.place))
+        return self.layer(shape, step, (unit, one.place, other.place))
 
     def replaced(self, wanted: Value, old: Value, new: Value, passing: dict[int, bool]) -> Value:
         """A value as it is where another one, of which alone it is made, is changed.

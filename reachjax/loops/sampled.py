@@ -85,7 +85,9 @@ class AbstractSampledPlant(AbstractPlant):
                 "relaxation=LinearBounds() or BranchAndCut(), and a template of facets"
             )
         given = (x, u) if w is None else (x, u, w)
-        if isinstance(x, np.ndarray | jax.Array) or hasattr(x, "values"):
+        if isinstance(x, np.ndarray | jax.Array):  # units of the equation are none of the loop
+            return self.flow.simulated(given, evaluate)
+        if hasattr(x, "values"):
             return self.flow.simulated(given, unit)
         try:
             with np.errstate(all="ignore"):  # what overflows has no bounds

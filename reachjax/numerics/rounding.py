@@ -135,7 +135,8 @@ class Ball(AbstractNumber):
         if len(parts) == 1:
             return parts[0]  # type: ignore[return-value]
         xp = namespace(*(part.mid for part in parts))
-        return cls(*(xp.concatenate(each) for each in zip(*((y.mid, y.rad) for y in parts))))
+        mid, rad = (xp.concatenate([getattr(y, name) for y in parts]) for name in ("mid", "rad"))
+        return cls(mid, rad)
 
     @property
     def lower(self):
@@ -209,7 +210,7 @@ class Ball(AbstractNumber):
         """The numbers up to an error of so much each."""
         return self._rebuilt(self.mid, self.rad, by)
 
-    def met(self, held: Callable[..., Ball], *given: Ball) -> Self:
+    def met(self, held: Callable[..., Self], *given: Self) -> Self:
         """What these hold and what others say of them."""
         return self.meeting(held(*given))
 

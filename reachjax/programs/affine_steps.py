@@ -6,9 +6,9 @@ the initial state and `|g w| <= S`, `|h| <= R` for what else there is,
     f(y) = p + s d + q (g w)^2 + e v,    |v| <= 1,    e = (error of the model) + |q| (2 S R + R^2),
 
 and `(g w)^2` is a row over products of the `w`, which are columns too (`initial`). Where `h` is so
-large that lines leave less out, it is these. What the units of a smooth controller leave out is
-summed up at its outputs, one column for each: a step adds as many columns for ten neurons as for a
-thousand. They stay columns, which the feedback contracts.
+large that lines leave less out, it is these. What the units of a smooth part leave out, that is of
+the controller or of the plant, is summed up at its outputs, one column for each: a step adds as
+many columns for ten neurons as for a thousand. They stay columns, which the feedback contracts.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.closed_loop import UnitLayer
 from reachjax.loops.flows.flow import AbstractFlow
 from reachjax.loops.limits import Limits
 from reachjax.loops.units import AbstractUnit, Bilinear, Quadratic, SmoothUnit, UnboundedError
@@ -60,19 +61,19 @@ class UnitForms(NamedTuple):
     outputs: AffineForms
 
 
-class ControllerColumns(NamedTuple):
-    """What the units of a smooth controller leave out, as one column for each of its outputs.
+class PartColumns(NamedTuple):
+    """What the units of a smooth part of a step leave out, as one column for each of its outputs.
 
     Attributes:
         outputs: forms of the outputs.
-        gap: `(n_u,)`, how much each has of its column.
-        places: `(n_u,)`, the columns; -1 where none is needed.
+        gap: `(m,)`, how much each has of its column.
+        places: `(m,)`, the columns; -1 where none is needed.
         layers: those of the step that it sums up.
     """
 
     outputs: AffineForms
-    gap: Float[Array | np.ndarray, " n_u"]
-    places: Int[Array | np.ndarray, " n_u"]
+    gap: Float[Array | np.ndarray, " m"]
+    places: Int[Array | np.ndarray, " m"]
     layers: range
 
 
@@ -82,12 +83,12 @@ class StepForms(NamedTuple):
     Attributes:
         successor: of the state.
         units: of each layer of units.
-        merged: of the controller's outputs, if it is smooth.
+        merged: of the outputs of the controller and of the plant, those whose units are summed up.
     """
 
     successor: AffineForms
     units: tuple[UnitForms, ...]
-    merged: ControllerColumns | None
+    merged: tuple[PartColumns, ...]
 
 
 Ranges = Callable[[AbstractUnit | None, AffineForms, Ends, Sequence[UnitForms]], Ends]
@@ -100,12 +101,27 @@ def states_facts(unit: AbstractUnit) -> bool:
     return not (unit.free or unit.curved)
 
 
+def merges(layers: Sequence[UnitLayer], outputs: int) -> bool:
+    """Whether what the units of a part leave out is summed up at its outputs.
+
+    That is so if all of them are smooth, and more than the outputs.
+    """
+    return all(layer.unit.curved for layer in layers) and _count(layers) > outputs
+
+
+def _count(layers: Sequence[UnitLayer]) -> int:
+    """How many units layers have."""
+    return sum(layer.size for layer in layers)
+
+
 def step_columns(loop: ClosedLoop) -> tuple[int, int]:
     """How many columns a step adds, and how many it needs in between."""
-    merging = loop.smooth_controller
-    between = sum(layer.size for layer in loop.controller_layers) if merging else 0
-    kept = loop.units - between + (loop.plant.inputs if merging else 0)
-    return kept + loop.states, between
+    kept, between = loop.units + loop.states, 0
+    parts = (loop.controller_layers, loop.plant.inputs), (loop.plant_layers, loop.states)
+    for layers, outputs in parts:
+        if merges(layers, outputs):
+            kept, between = kept - _count(layers) + outputs, max(between, _count(layers))
+    return kept, between
 
 
 def step_forms(
@@ -173,18 +189,26 @@ def step_forms(
         found.append(forms)
         return z
 
-    measured, merged = loop.measured(state, t, apply), None
-    if loop.smooth_controller:
+    def part(
+        layers: Sequence[UnitLayer], outputs: int, run: Callable[..., AffineForms], *given: Any
+    ) -> AffineForms:
+        """The outputs of a part of the loop."""
+        nonlocal width, free
+        if not merges(layers, outputs):
+            return run(*given)
         first, kept, own = len(found), free, width
         free = None if place is None else scratch
-        u = loop.controller.propagate(measured, apply)
-        u, (gap, places) = _merged(u, own, kept, scratch)
-        merged = ControllerColumns(u, gap, places, range(first, len(found)))
-        width = u.columns.shape[1]
-        free = None if kept is None else kept + len(u.rows)
-    else:
-        u = loop.controller.propagate(measured, apply)
-    successor = loop.moved(state, loop.projected(u, t, apply), t, apply)
+        z, gap, places = _merged(run(*given), own, kept, scratch)
+        merged.append(PartColumns(z, gap, places, range(first, len(found))))
+        width = z.columns.shape[1]
+        free = None if kept is None else kept + outputs
+        return z
+
+    merged: list[PartColumns] = []
+    measured, (plant, net) = loop.measured(state, t, apply), (loop.plant, loop.controller)
+    u = part(loop.controller_layers, plant.inputs, net.propagate, measured, apply)
+    u, w = loop.projected(u, t, apply), loop.pushed(state, t, apply)
+    successor = part(loop.plant_layers, plant.states, plant.propagate, state, u, t, apply, *w)
     if place is None:
         successor = successor.padded(width)
     successor = _spilled(successor, free)
@@ -193,7 +217,7 @@ def step_forms(
         ends = met(ends, (known.lower, known.upper))
     if ranges is not None:
         ends = ranges(None, successor, ends, found)
-    return StepForms(successor.within(Ball.between(*ends)), tuple(found), merged)
+    return StepForms(successor.within(Ball.between(*ends)), tuple(found), tuple(merged))
 
 
 def _is_lost(line: Quadratic, ends: Ends) -> bool:
@@ -239,8 +263,8 @@ def _require_bounds(forms: UnitForms, t: int) -> None:
 
 def _merged(
     forms: AffineForms, width: int, place: Place, scratch: int
-) -> tuple[AffineForms, tuple[Any, Any]]:
-    """The forms with all columns from some on as one for each number."""
+) -> tuple[AffineForms, Any, Any]:
+    """The forms with all columns from some on as one for each number, how much, and where."""
     xp, first = namespace(forms.rows), 2 + (width if place is None else scratch)
     last = forms.rows[:, first:]
     gap = abs(last).sum(axis=1) * (1 + gamma(last.shape[1]))
@@ -249,7 +273,7 @@ def _merged(
     else:
         rows = xp.concatenate([forms.rows[:, :first], xp.zeros_like(last)], axis=1)
     forms, places = AffineForms(rows, forms.radii).with_own(gap, place)
-    return forms, (gap, places)
+    return forms, gap, places
 
 
 def _smooth(
@@ -306,30 +330,31 @@ def _bilinear(
     xp, (lower, upper), w = namespace(y.rows), ends, start.spread.shape[1]
     count, values = unit.terms, Ball.between(*unit.interval(lower, upper))
     center, rows, size = y.rows[:, 0], y.rows[:, 2:], y.rows.shape[1]
-    plane, offset, gap = unit.plane(lower, upper)
+    planes, offset, gap = unit.planes(lower, upper)
     rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(size)) + y.radii[:, 0]
     own, half = start.norms(rows[:, :w]), len(center) // 2
     (S, S_other), (R, R_other), (r, r_other) = map(unit.halves, (own, rest, y.radii[:, 0]))
     one, other = rows[:half], rows[half:]
     lost = start.mixed_norms(one, other) + S * r_other + S_other * r + R * R_other
     lost = lost + constant(gamma(w + 8) * (S * R_other + S_other * R))
-    lost = _folded(lost, count) * (1 + gamma(size + count + 16))
+    lost = lost * (1 + gamma(size + 16))
     better = lost <= gap
-    slope = xp.where(xp.concatenate([better] * (2 * count)), unit.derivative(center), plane)
-    offset = xp.where(better, -_folded(center[:half] * center[half:], count), offset)
+    slope = xp.where(xp.concatenate([better, better]), unit.derivative(center), planes)
+    offset = _folded(xp.where(better, -(center[:half] * center[half:]), offset), count)
     slope, offset = settled((slope, offset))
-    gap = settled(xp.where(better, lost, gap) * (1 + gamma(8)))
+    gap = settled(_folded(xp.where(better, lost, gap), count) * (1 + gamma(count + 8)))
     level, products = (
-        xp.where(better.reshape(-1, *[1] * (part.ndim - 1)), _folded(part, count), 0.0)
+        _folded(xp.where(better.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0), count)
         for part in start.multiplied(one[:, :w], other[:, :w])
     )
     linear = _folded(slope[:, None] * rows, 2 * count)
     middle = _folded(slope * center, 2 * count) + offset + level
     parts = linear[:, :w], linear[:, w : start.count] + products, linear[:, start.count :]
     form = xp.concatenate([xp.stack([middle, values.mid], axis=1), *parts], axis=1)
-    sizes = _folded(abs(slope) * (abs(center) + own + rest), 2 * count) + abs(offset)
-    sizes = sizes + _folded(S * S_other, count)
-    error = gamma(size + 2 * count + 16) * sizes + (size + 8) * (w + 1) * count * TINY
+    sizes = _folded(abs(slope) * (abs(center) + own + rest), 2 * count)
+    sizes = sizes + _folded(abs(slope[:half] * slope[half:]) + S * S_other, count)
+    flushed = (size + 8) * (w + 1) * TINY * (1 + _folded(abs(center) + own + rest, 2 * count))
+    error = gamma(size + 2 * count + 16) * sizes + count * flushed
     radius = _folded(abs(slope) * y.radii[:, 0], 2 * count) * (1 + gamma(2 * count + 4))
     z = AffineForms(form, xp.stack([constant(radius + error), values.rad], axis=1))
     z, places = z.with_own(gap, place)

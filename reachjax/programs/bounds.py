@@ -100,9 +100,9 @@ def _image(unit: AbstractUnit, y: Ball) -> tuple[Ball, Ball]:
     """
     rounding = gamma(8) * (abs(y.mid) + y.rad)
     if not unit.nonexpansive:
-        y, rounding = Ball(y.mid, y.rad + 2 * rounding), 0.0 * rounding
+        y = Ball(y.mid, y.rad + 2 * rounding)
     z = Ball.between(*unit.interval(y.lower, y.upper))
-    return y, Ball(z.mid, z.rad + rounding)
+    return y, Ball(z.mid, z.rad + rounding) if unit.nonexpansive else z
 
 
 def _value(unit: AbstractUnit, *given: Ball) -> Ball:

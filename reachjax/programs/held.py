@@ -261,20 +261,20 @@ def _layers(horizon: Horizon, steps: int) -> tuple[list[_Layer], list[Int[np.nda
     end, found, after = start.count + steps * more, list[_Layer](), list[np.ndarray]()
     for step, (layers, merged) in enumerate(zip(horizon.steps, horizon.merged, strict=True)):
         place, scratch, before = start.count + step * more, end, 0
-        summed = range(0) if merged is None else merged.layers
+        of_parts = {number: part for part in merged for number in part.layers}
         for number, layer in enumerate(layers):
             found.append(_Layer(step, number, before, layer, places.copy()))
             here, before = np.flatnonzero(layer.places >= 0), before + len(layer.lower)
-            if number not in summed:
+            if number not in of_parts:
                 places[layer.places[here]] = place + here
                 place += len(layer.places)
                 continue
             places[layer.places[here]] = scratch + here
-            scratch += len(layer.places)
-            if merged is not None and number == summed[-1]:  # what is in between is gone
-                places[places >= end] = -1
-                here = np.flatnonzero(merged.places >= 0)
-                places[merged.places[here]] = place + here
-                place += len(merged.places)
+            scratch, part = scratch + len(layer.places), of_parts[number]
+            if number == part.layers[-1]:  # what is in between is gone
+                places[places >= end], scratch = -1, end
+                here = np.flatnonzero(part.places >= 0)
+                places[part.places[here]] = place + here
+                place += len(part.places)
         after.append(places.copy())
     return found, after

@@ -26,7 +26,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine import AffineForms, joined
-from reachjax.programs.affine_steps import ControllerColumns, UnitForms, states_facts, step_forms
+from reachjax.programs.affine_steps import PartColumns, UnitForms, states_facts, step_forms
 from reachjax.programs.flows import Between
 from reachjax.programs.initial import Ends, InitialColumns, met, product_facts
 from reachjax.sets import AbstractSet, Box
@@ -83,7 +83,7 @@ class Horizon:
         gaps: `(p,)`, how much of its column a unit's value has.
         origins: `(m, 3)`, of each fact the step, the unit's number among those of a step, and which
             of its facts it is; `OF_SET` or `OF_PRODUCTS` for what is of no unit.
-        merged: of each step, what a smooth controller leaves out.
+        merged: of each step, what smooth parts leave out.
         states: forms of the states after each step, with intervals of the step's own arithmetic.
         ends: bounds of the states after each step, the best that are known.
         better: ends of ranges that are better known than by forms and intervals.
@@ -110,7 +110,7 @@ class Horizon:
         self.start = InitialColumns.of(X0, box, loop.curved)
         self.state = AffineForms.beginning(self.start)
         self.steps: list[tuple[UnitForms, ...]] = []
-        self.merged: list[ControllerColumns | None] = []
+        self.merged: list[tuple[PartColumns, ...]] = []
         self.states: list[AffineForms] = []
         self.ends: list[Ends] = []
         self.better: list[RangeEnd] = []
@@ -210,10 +210,10 @@ class Horizon:
         self.ends.append(self.state.ends_by_interval())
         self.steps.append(units)
         self.merged.append(merged)
-        # those of units of a smooth controller are summed up in the merged ones
-        summed = range(0) if merged is None else merged.layers
+        # those of units of smooth parts are summed up in the merged ones
+        summed = _summed(merged)
         own = (layer for number, layer in enumerate(units) if number not in summed)
-        for each in (*own, *([merged] if merged else [])):
+        for each in (*own, *merged):
             if _left_out(each):
                 self._varying = np.append(self._varying, each.places[each.places >= 0])
 
@@ -249,11 +249,11 @@ class Horizon:
     ) -> Float[np.ndarray, " n_x"]:
         """The state after one step more of a trajectory, whose columns are set."""
         (layers, merged), loop, t = (self.steps[k], self.merged[k]), self.loop, self._t + k
-        summed = range(0) if merged is None else merged.layers
-        numbers = itertools.count()
+        summed, count = _summed(merged), 0
 
         def apply(unit: AbstractUnit, *y: Any) -> Any:
-            number, z = next(numbers), unit(*y)
+            nonlocal count
+            (number, count), z = (count, count + 1), unit(*y)
             if unit.free:
                 z = z + np.array([next(values, 0.0) for _ in range(len(z))])
             if number not in summed:
@@ -261,10 +261,17 @@ class Horizon:
                 _fill(found, layer.outputs, layer.gap, layer.places, z)
             return z
 
-        u = loop.controller.propagate(loop.measured(x, t, apply), apply)
-        if merged is not None:
-            _fill(found, merged.outputs, merged.gap, merged.places, u)
-        return loop.moved(x, loop.projected(u, t, apply), t, apply)
+        def part(run: Callable[..., Any], *given: Any) -> Any:
+            """The outputs of a part of the loop, whose columns are set."""
+            first, z = count, run(*given)
+            for each in merged:
+                if each.layers == range(first, count):
+                    _fill(found, each.outputs, each.gap, each.places, z)
+            return z
+
+        u = part(loop.controller.propagate, loop.measured(x, t, apply), apply)
+        u, w = loop.projected(u, t, apply), loop.pushed(x, t, apply)
+        return part(loop.plant.propagate, x, u, t, apply, *w)
 
     def drawn_at(self, columns: Float[np.ndarray, "c n"]) -> list[Float[np.ndarray, "c m"]]:
         """The values of the disturbances of each step, in the order in which they are drawn."""
@@ -352,9 +359,14 @@ class Horizon:
         self._count += len(rows.rows)
 
 
-def _left_out(each: UnitForms | ControllerColumns) -> bool:
+def _summed(merged: Sequence[PartColumns]) -> set[int]:
+    """The layers of a step that are summed up."""
+    return {number for part in merged for number in part.layers}
+
+
+def _left_out(each: UnitForms | PartColumns) -> bool:
     """Whether columns are of what smooth units leave out."""
-    return isinstance(each, ControllerColumns) or each.unit.curved
+    return isinstance(each, PartColumns) or each.unit.curved
 
 
 def _fill(

@@ -155,18 +155,22 @@ class InitialColumns(Replaceable):
     def mixed_norms(self, one: Rows, other: Rows) -> Any:
         """What `(g . w) (h' . v) + (g' . w) (h . v)` does not exceed for each pair of rows.
 
-        With rows `[g, h]` over the `w` and all other columns `v` that is the sum of the norms of
-        `h'_j g + h_j g'`, but for rounding.
+        With rows `[g, h]` over the `w` and all other columns `v` that is the sum of the 1-norms of
+        `h'_j g + h_j g'`, but for rounding; in a round ball no more than each alone allows.
         """
         xp, n = namespace(one, other), self.spread.shape[1]
         (g, h), (also, rest) = ((rows[:, :n], rows[:, n:]) for rows in (one, other))
-        if xp is not np and not self.round:  # it is one loop where it is compiled
-            return abs(g[:, None] * rest[..., None] + also[:, None] * h[..., None]).sum((1, 2))
-        total = xp.zeros_like(h)
-        for i in range(n):
-            entry = g[:, i, None] * rest + also[:, i, None] * h
-            total = total + (entry * entry if self.round else abs(entry))
-        return (xp.sqrt(total) if self.round else total).sum(axis=1)
+        if xp is not np:  # it is one loop where it is compiled
+            found = abs(g[:, None] * rest[..., None] + also[:, None] * h[..., None]).sum((1, 2))
+        else:
+            found = np.zeros(len(one))
+            for i in range(n):
+                found = found + abs(g[:, i, None] * rest + also[:, i, None] * h).sum(axis=1)
+        if not self.round:
+            return found
+        sizes = (abs(part).sum(axis=1) for part in (rest, h))
+        alone = (self.norms(part) * size for part, size in zip((g, also), sizes, strict=True))
+        return smaller(found, sum(alone))
 
     def farthest(self, rows: Rows) -> Rows:
         """Initial states at which `r . w` is largest for each row, whatever the cut; rounded."""

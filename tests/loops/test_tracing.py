@@ -12,6 +12,7 @@ import reachjax as rj
 from reachjax.loops.batches import Batch
 from reachjax.loops.units import ReLU, evaluate
 from reachjax.numerics.rounding import Ball
+from tests.loops.traced import on_batches
 
 W = np.random.default_rng(0).normal(size=(3, 2))
 
@@ -78,9 +79,7 @@ def test_every_kind_of_number_has_the_values_of_the_function(traced):
     np.testing.assert_allclose(jax.vmap(net)(x), expected, atol=1e-15)
     seen = jax.vmap(lambda x: net.propagate(x, lambda unit, *y: unit(*y)))(x)
     np.testing.assert_allclose(seen, expected, atol=1e-14)
-    on_host = jax.device_get(net).propagate(
-        Batch(x), lambda unit, *y: Batch(unit(*(each.values for each in y)))
-    )
+    on_host = jax.device_get(net).propagate(Batch(x), on_batches)
     assert isinstance(on_host.values, np.ndarray)
     np.testing.assert_allclose(
         np.broadcast_to(on_host.values, expected.shape), expected, atol=1e-14

@@ -17,6 +17,11 @@ def network(function, inputs=2):
     return rj.Network(function, inputs, shape[0])
 
 
+def on_batches(unit, *y):
+    """Units at many points at once."""
+    return Batch(unit(*(each.values for each in y)))
+
+
 def by_interval(unit, *given):
     """Units by the intervals of their inputs, which are rounded."""
     y = Ball.joined(given)

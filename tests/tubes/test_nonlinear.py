@@ -56,6 +56,7 @@ def loops():
         "sigmoid": (rj.ClosedLoop(line, tanh_net(2, 1, 1, (5, 4), rj.Sigmoid())), small),
         "rectified": (rj.ClosedLoop(swing, tanh_net(2, 1, 2, (4, 3), rj.ReLU()), unit), small),
         "ball": (rj.ClosedLoop(swing, tanh_net(2, 1)), ball),
+        "oscillator": (rj.ClosedLoop(oscillator, tanh_net(2, 1, 3)), small),
         "polytope": (rj.ClosedLoop(oscillator, tanh_net(2, 1, 3)), corner),
         "car": (
             rj.ClosedLoop(rj.NonlinearPlant(car, 3, 1), tanh_net(3, 1, 4, (4,), rj.ReLU())),
@@ -94,7 +95,7 @@ def outside(tube, runs):
     return worst
 
 
-COMPILED = ["pendulum", "rectified", "ball", "tank"]
+COMPILED = ["pendulum", "rectified", "ball", "tank", "oscillator"]
 """Loops whose steps are compiled; those of the others are too where a person asks for it."""
 
 RELAXATIONS = [rj.LinearBounds(), rj.BranchAndCut(), rj.LocalBounds(repeated=False)]
@@ -149,6 +150,7 @@ def test_compiled_sets_are_those_of_the_host(name):
         ("sigmoid", 1.01),
         ("boxed", 1.03),
         ("tank", 1.01),
+        ("oscillator", 1.01),
         ("car", 1.25),
     ],
 )
@@ -166,8 +168,15 @@ def test_sets_are_tight(name, most):
 @pytest.mark.parametrize(
     ("name", "relaxation"),
     some(
-        product(["pendulum", "boxed", "ball", "tank"], RELAXATIONS[:2]),
-        lambda *case: case in (("boxed", rj.BranchAndCut()), ("tank", rj.LinearBounds())),
+        product(["pendulum", "boxed", "ball", "tank", "oscillator"], RELAXATIONS[:2]),
+        lambda *case: (
+            case
+            in (
+                ("boxed", rj.BranchAndCut()),
+                ("tank", rj.LinearBounds()),
+                ("oscillator", rj.LinearBounds()),
+            )
+        ),
     ),
     ids=lambda each: each if isinstance(each, str) else type(each).__name__,
 )

@@ -62,15 +62,13 @@ def _contracted(recorder: Recorder, equation: Equation, operands: Sequence[Opera
         sizes = [math.prod(value.shape[k] for k in axes) for axes in (batch, free, over)]
         return index.transpose(*batch, *free, *over).reshape(sizes)
 
-    one, other = (
+    one, other = np.broadcast_arrays(
         arranged(left, batch_left, over_left)[:, :, None],
         arranged(right, batch_right, over_right)[:, None],
     )
-    one, other = np.broadcast_arrays(one, other)
-    products = recorder.product(recorder.picked(left, one), recorder.picked(right, other))
-    count = math.prod(equation.shape)
-    sums = np.kron(np.eye(count), np.ones((1, one.shape[-1])))
-    return recorder.mapped(products, sums, equation.shape)
+    terms = one.shape[-1]
+    pairs = one.reshape(-1, terms).T, other.reshape(-1, terms).T
+    return recorder.inner_products(left, right, equation.shape, pairs)
 
 
 @entrywise

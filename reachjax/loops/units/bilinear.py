@@ -21,7 +21,7 @@ import operator
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark, Product
 from reachjax.numerics.numbers import summed
@@ -70,7 +70,7 @@ class Bilinear(AbstractUnit):
         half = y.shape[-1] // 2
         return y[..., :half], y[..., half:]
 
-    def derivative(self, y: Float[Array, "*c k"]) -> Float[Array, "*c k"]:
+    def derivative(self, y: Any) -> Any:
         """The derivative by each factor, which is the other one."""
         one, other = self.halves(y)
         return namespace(y).concatenate([other, one], axis=-1)
@@ -83,10 +83,11 @@ class Bilinear(AbstractUnit):
         corners = xp.stack([low * least, low * most, high * least, high * most])
         ends = functools.reduce(smaller, corners), functools.reduce(larger, corners)
         unknown = functools.reduce(operator.or_, xp.isnan(corners))
-        rounded = self._rounded(abs(corners).max(axis=0), (low, high), (least, most))
-        error = constant(xp.where(unknown, math.inf, rounded))
+        size = functools.reduce(larger, abs(corners))
+        error = gamma(self.terms) * size + self._flushed(lower, upper)
+        error = constant(xp.where(unknown, math.inf, error))
         below, above = (summed(xp.where(unknown, 0.0, end), self.terms) for end in ends)
-        error = summed(error, self.terms)
+        error = summed(error, self.terms) * (1 + gamma(self.terms))
         return below - error, above + error
 
     @np.errstate(all="ignore")
@@ -95,33 +96,39 @@ class Bilinear(AbstractUnit):
 
         Where bounds of a factor are not finite, they are infinitely far from each other.
         """
-        slope, offset, gap = self.plane(lower, upper)
-        error = gamma(self.terms + 4) * constant(abs(offset) + gap) + TINY
-        return Lines(Line(slope, offset - gap - error), Line(slope, offset + gap + error))
+        slope, offset, gap = self.planes(lower, upper)
+        xp, count = namespace(slope, gap), self.terms
+        flushed = self._flushed(lower, upper)
+        offset, size, gap, flushed = (
+            summed(each, count) for each in (offset, abs(offset), gap, flushed)
+        )
+        known = gap < math.inf
+        gap = gap + gamma(count + 4) * constant(size + gap) + flushed + TINY
+        gap = gap * (1 + gamma(4))
+        slope = xp.where(xp.concatenate([known] * self.inputs), slope, 0.0)
+        offset, gap = xp.where(known, offset, 0.0), xp.where(known, gap, math.inf)
+        return Lines(Line(slope, offset - gap), Line(slope, offset + gap))
 
     @np.errstate(all="ignore")
-    def plane(self, lower: Array, upper: Array) -> tuple[Array, Array, Array]:
-        """Slopes, offsets and gaps: values are as far from the planes as gaps say, at most.
+    def planes(self, lower: Array, upper: Array) -> tuple[Array, Array, Array]:
+        """Slopes of all factors, and offsets and gaps of each product.
 
-        Offsets are those of these slopes but for a few roundings, `terms + 2` at most, which gaps
-        leave out, as `lines` does not.
+        A product is as far from its plane as the gap says, at most, if the offset is not rounded,
+        which is a product of floats, and nothing is lost that is too small for these. Where bounds
+        are not finite, gaps are infinite.
         """
         xp = namespace(lower, upper)
         known = (abs(lower) < math.inf) & (abs(upper) < math.inf)
         lower, upper = (xp.where(known, end, 0.0) for end in (lower, upper))
         middle = lower / 2 + upper / 2
         radius = larger(upper - middle, middle - lower) * (1 + gamma(2))
-        radius = xp.where(known, xp.where(radius > 0, radius + TINY, radius), math.inf)
         (one, other), (near, far) = self.halves(middle), self.halves(radius)
-        fixed = (near == 0) | (far == 0)
-        products = xp.where(fixed, 0.0, xp.where(fixed, 0.0, near) * far * (1 + gamma(2)) + TINY)
-        products = xp.where((near < math.inf) & (far < math.inf), products, math.inf)
-        gap = summed(products, self.terms) * (1 + gamma(self.terms))
-        known = (gap < math.inf) & (abs(summed(one * other, self.terms)) < math.inf)
-        offset = xp.where(known, -summed(one * other, self.terms), 0.0)
-        whole = xp.concatenate([known] * (2 * self.terms))
-        slope = xp.where(whole, xp.concatenate([other, one]), 0.0)
-        return slope, offset, xp.where(known, gap, math.inf)
+        fixed, (known, also) = (near == 0) | (far == 0), self.halves(known)
+        gap = xp.where(fixed, 0.0, near * far * (1 + gamma(2)) + TINY)
+        offset = -(one * other)
+        known = known & also & (gap < math.inf) & (abs(offset) < math.inf)
+        slope = xp.where(xp.concatenate([known, known]), xp.concatenate([other, one]), 0.0)
+        return slope, xp.where(known, offset, 0.0), xp.where(known, gap, math.inf)
 
     @np.errstate(all="ignore")
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:
@@ -138,16 +145,19 @@ class Bilinear(AbstractUnit):
             for name, (a, b) in zip(names, corners, strict=True):
                 a, b = (xp.where(whole, end, 0.0) for end in (a, b))
                 plane = summed(b * one + a * other, self.terms)
-                spare = gamma(self.terms + 4) * summed(abs(a * b), self.terms)
-                spare = xp.where(known, spare + TINY * self.terms, math.inf)
+                spare = gamma(self.terms + 4) * abs(a * b) + self._flushed(lower, upper)
+                spare = xp.where(known, summed(spare, self.terms) + TINY, math.inf)
                 row = sign * (z - plane) + (sign * summed(a * b, self.terms) + spare)
                 blocks.append(Block(row, name, Mark.BOUND))
         below, above = CORNERS
         products = (Product(left, right, Mark.BOUND) for left in below for right in above)
         return Facts(tuple(blocks), (), tuple(products))
 
-    def _rounded(self, size: Any, one: Any, other: Any) -> Any:
-        """What products of ends of this size are off by, and sums of them."""
-        xp = namespace(size)
-        some = [xp.where((low == 0) & (high == 0), 0.0, 1.0) for low, high in (one, other)]
-        return gamma(self.terms) * size + TINY * some[0] * some[1]
+    def _flushed(self, lower: Array, upper: Array) -> Any:
+        """What is lost of each product where it, or a factor, is too small for compiled code.
+
+        On the host that keeps such factors nothing is, where one is known.
+        """
+        (one, other), xp = self.halves(larger(abs(lower), abs(upper))), namespace(lower, upper)
+        lost = TINY * (1 + constant(one + other))
+        return lost if xp is not np else np.where((one == 0) | (other == 0), 0.0, lost)

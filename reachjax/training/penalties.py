@@ -29,6 +29,7 @@ from reachjax.tubes.requirements import (
     Region,
     Timed,
     check_margin,
+    period_of,
     requirements,
     shortfall,
 )
@@ -147,7 +148,8 @@ def specification_penalty(
     """
     check_margin(margin)
     if isinstance(loop, ClosedLoop):  # mistakes are named before anything is solved
-        requirements(loop.states, whole_number("horizon", horizon, 1), goal, avoid, safe)
+        steps = whole_number("horizon", horizon, 1)
+        requirements(loop.states, steps, goal, avoid, safe, period_of(loop))
 
     def missing(tube: ReachTube) -> Float[Array, ""]:
         return shortfall(tube, goal, avoid, safe, margin=margin)

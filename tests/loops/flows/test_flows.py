@@ -213,7 +213,7 @@ def test_disturbances_take_states_nowhere_else_than_is_said(held, steps):
 def test_compiled_flows_hold_what_flows_in_numpy_do():
     rng = np.random.default_rng(5)
     own = field(rng, "trigonometric", 2)
-    plant = rj.SampledPlant(own, 2, 1, period=0.3)
+    plant = rj.SampledPlant(own, 2, 1, period=0.05)
     box = rj.Box(np.full(2, -0.1), np.full(2, 0.1))
     gain = rng.uniform(-1, 1, size=(1, 2))
 

@@ -67,13 +67,13 @@ def decided_by_cells(
         search.findings.simulate(simulations.runs)
     try:
         search.run(executor, progress)
+        return search.verdict()
     except KeyboardInterrupt:
         message = (
             "interrupted: this exception's `found` is the verdict so far, whose `cells` that "
             "are not undecided need not be decided again"
         )
         raise Interrupted(message, search.verdict(interrupted=True)) from None
-    return search.verdict()
 
 
 @lenient

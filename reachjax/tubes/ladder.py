@@ -222,7 +222,7 @@ class Ladder:
     @property
     def width(self) -> int:
         """The columns of the horizon."""
-        return self.horizon.facts.columns.shape[1]
+        return self.horizon.facts.rows.shape[1] - 2
 
     def spend(self, programs: int) -> None:
         """Take so many linear programs of the size that they have now from the work."""
@@ -375,7 +375,7 @@ class Ladder:
     ) -> StepBounds:
         """The bounds that the leaves prove."""
         horizon, count = self.horizon, len(found)
-        width = horizon.facts.columns.shape[1]
+        width = self.width
         owner = np.repeat(np.arange(count), [len(each.phases) for each in found])
         multipliers = np.concatenate([each.multipliers for each in found])
         leaves = Branches(

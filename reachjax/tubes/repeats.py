@@ -76,9 +76,9 @@ class _CellTube(NamedTuple):
 
     def proof(self, k: int) -> AbstractProof:
         """What is said of the states after `k` steps."""
-        found = self.certificates[k]
+        found = self.certificates[k] if k <= self.horizon else None
         if found is None:
-            raise ValueError(f"nothing is said of the cell after {k} steps")
+            raise ValueError(f"nothing is said of a cell after {k} steps")
         return found
 
 
@@ -165,20 +165,26 @@ class Repeat:
         again = list(proof.proofs)
         for number, cell in enumerate(cells):
             if again[number]:
-                own = self._over(number, axes, cell.part)
+                own = self._over(k, number, axes, cell.part)
                 found[number] = np.fmin(found[number], own.until(k))
                 again[number] = tuple(own.again[k - len(again[number]) : k])
         return proof.replace(proofs=tuple(again)), found.max(axis=0)
 
-    def _over(self, number: int, axes: list[int], part: AbstractSet) -> Repeat:
-        """The propagation over one of the cells that these axes leave."""
-        key, tube = (number, *axes), self._tube
+    def _over(self, k: int, number: int, axes: list[int], part: AbstractSet) -> Repeat:
+        """The propagation up to the step `k` over one of the cells that these axes leave.
+
+        Its proofs begin with a certificate that has those of all steps before.
+        """
+        tube, leaves = self._tube, dict[int, tuple[AbstractProof, ...]]()
+        for step, each in enumerate(tube.certificates):
+            if isinstance(each, CellCertificate) and np.asarray(each.axes).tolist() == axes:
+                leaves[step] = each.proofs[number] if each.proofs else ()
+        first = max((step for step in leaves if step <= k and len(leaves[step]) == step), default=0)
+        key = (number, first, *axes)
         if key not in self._within:
-            proofs: list[AbstractProof | None] = [None] * (tube.horizon + 1)
-            for k, each in enumerate(tube.certificates):
-                if isinstance(each, CellCertificate) and np.asarray(each.axes).tolist() == axes:
-                    mine = each.proofs[number] if each.proofs else ()
-                    proofs[k + 1 - len(mine) : k + 1] = mine
+            proofs = [None, *leaves.get(first, ())]
+            while len(leaves.get(len(proofs), ())) == 1:
+                proofs.append(leaves[len(proofs)][0])
             own = _CellTube(tube.loop, tube.template, (part,), tuple(proofs), tube.start)
             self._within[key] = Repeat(own, [part])
         return self._within[key]

@@ -180,6 +180,7 @@ def winning_set(
     search = _Winning(task, CellTree(domain, roots, most), Budget.of(time_limit))
     try:
         search.run(executor, progress)
+        require_unbroken_cells(loop, domain, horizon, start, required, search.cells)
     except KeyboardInterrupt:
         found = WinningSet(domain, search.cells, seal)
         message = (
@@ -187,7 +188,6 @@ def winning_set(
             "set so far, and winning_set(..., known=found) goes on"
         )
         raise Interrupted(message, found) from None
-    require_unbroken_cells(loop, domain, horizon, start, required, search.cells)
     return WinningSet(domain, search.cells, seal)
 
 

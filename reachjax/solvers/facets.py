@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple, Self
 import jax
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.generators import Generators
@@ -19,7 +19,7 @@ from reachjax.programs.presolve import NormalProgram, presolved
 from reachjax.programs.relaxations import Products
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import Proposal, SolverStatus
-from reachjax.proofs.recheck import clipped, interval_offsets, sound_offsets
+from reachjax.proofs.recheck import clipped, interval_offsets
 from reachjax.proofs.reported import Judged, judged_offsets
 from reachjax.proofs.slopes import held_offsets
 from reachjax.sets import Polytope
@@ -88,18 +88,71 @@ class Facets(AbstractGoal):
     ) -> tuple[Products, Judged]:
         """Each facet has its own products, and begins with those that the one before used."""
         pool = CutPool(program, rounds.layout)
-        found, used = [], pool.addable(rounds.warm_start)
+        found, pairs = list[_Round](), pool.addable(rounds.warm_start)
         for facet in range(len(program.objective.mid)):
             one = program.with_objective(slice(facet, facet + 1))
-            attained = None if rounds.witness is None else partial(rounds.witness, facet)
             if rounds.budget.late:
                 given = one.replace(products=joint(pool.core, NONE))
                 late = judged_offsets(given, Proposal.blank(given, self))
-                found.append(_Round(NONE, late))
+                found.append(_Round(NONE, late, np.zeros(0, dtype=bool)))
             else:
-                found.append(_facet(self, one, pool, solver, rounds, attained, used))
-            used = found[-1].in_use
-        return _joined(self, program, pool, found)
+                attained = None if rounds.witness is None else partial(rounds.witness, facet)
+                found.append(self._best(one, pool, solver, rounds, attained, pairs))
+            pairs = found[-1].pairs[~found[-1].idle]
+        return self._joined(program, pool, found)
+
+    def _best(
+        self,
+        program: Program,
+        pool: CutPool,
+        solver: AbstractSolver,
+        rounds: Rounds,
+        attained: Callable[[Float[np.ndarray, " n"]], float] | None,
+        pairs: Int[np.ndarray, "p 2"],
+    ) -> _Round:
+        """The best round of one facet, that begins with these pairs."""
+        size = float(interval_offsets(program)[0] - program.objective.mid[0, -1])
+        enough = (rounds.cuts.gap or 0.0) * size
+        found: list[_Round] = []
+
+        def solve(pairs: np.ndarray) -> Shown:
+            judged = self.judged(program.replace(products=joint(pool.core, pairs)), solver)
+            resting = idle(judged.proposal.multipliers[0], len(pairs))
+            found.append(_Round(pairs, judged, resting))
+            moment = judged.proposal.moments[0]
+            if attained is None:
+                return Shown(moment, resting)
+            gap = min(each.offset for each in found) - attained(program.transform @ moment[:, -1])
+            return Shown(moment, resting, gap <= enough)
+
+        in_rounds(pool, rounds, pairs, solve)
+        least = min(each.offset for each in found)
+        near = [each for each in found if each.offset <= least + NEAR * size]
+        best = max(near, key=lambda each: each.is_optimal)  # the first that is, if any is
+        seconds = np.sum([each.judged.proposal.seconds for each in found], axis=0)
+        proposal = best.judged.proposal._replace(seconds=seconds)
+        return best._replace(judged=best.judged._replace(proposal=proposal))
+
+    def _joined(
+        self, program: Program, pool: CutPool, found: list[_Round]
+    ) -> tuple[Products, Judged]:
+        """All facets over the products that any of them has."""
+        pairs = np.unique(np.concatenate([each.pairs for each in found]), axis=0)
+        number = {tuple(pair): i for i, pair in enumerate(pairs)}
+        products, core, own = joint(pool.core, pairs), len(pool.core.free), []
+        for added, judged, _ in found:
+            places = np.array([number[tuple(pair)] for pair in added], dtype=int)
+            multipliers = np.zeros((1, len(products.free)))
+            there = np.r_[np.arange(core), core + places]
+            multipliers[:, there] = judged.proposal.multipliers
+            proposal = judged.proposal._replace(multipliers=multipliers)
+            own.append(judged._replace(proposal=proposal))
+        judged = jax.tree.map(lambda *parts: np.concatenate(parts), *own)
+        # proved with all products, which are in another order and so round otherwise
+        whole = program.replace(products=products)
+        proved = sound_offsets(whole, judged.proposal.multipliers)
+        again = np.fmin(proved, interval_offsets(whole))
+        return products, judged._replace(value=np.fmax(judged.value, again))
 
     def slopes(
         self, program: Program, judged: Judged, cotangent: Float[np.ndarray, " f"]
@@ -131,10 +184,11 @@ class Facets(AbstractGoal):
 
 
 class _Round(NamedTuple):
-    """One round of one facet: the products added, and what was proved with them."""
+    """One round of one facet: the products added, what was proved, and which are at zero."""
 
     pairs: Int[np.ndarray, "p 2"]
     judged: Judged
+    idle: Bool[np.ndarray, " p"]
 
     @property
     def offset(self) -> float:
@@ -146,72 +200,3 @@ class _Round(NamedTuple):
         """Whether the offset is the solver's optimum, to its tolerance."""
         solved = int(self.judged.proposal.statuses[0]) == SolverStatus.SOLVED
         return solved and bool(self.judged.optimal[0])
-
-    @property
-    def idle(self) -> np.ndarray:
-        """Which of the products added have a multiplier at zero."""
-        return idle(np.asarray(self.judged.proposal.multipliers[0]), len(self.pairs))
-
-    @property
-    def in_use(self) -> Int[np.ndarray, "q 2"]:
-        """The products added that have a multiplier."""
-        return self.pairs[~self.idle]
-
-    @property
-    def moment(self) -> Float[np.ndarray, "n n"]:
-        """What trajectories the solver thinks of."""
-        return np.asarray(self.judged.proposal.moments[0])
-
-
-def _facet(
-    goal: Facets,
-    program: Program,
-    pool: CutPool,
-    solver: AbstractSolver,
-    rounds: Rounds,
-    attained: Callable[[Float[np.ndarray, " n"]], float] | None,
-    pairs: Int[np.ndarray, "p 2"],
-) -> _Round:
-    """The best round of one facet."""
-    size = float(interval_offsets(program)[0] - program.objective.mid[0, -1])
-    transform = np.asarray(program.transform)
-    found: list[_Round] = []
-
-    def solve(pairs: np.ndarray) -> Shown:
-        given = program.replace(products=joint(pool.core, pairs))
-        found.append(last := _Round(pairs, goal.judged(given, solver)))
-        if attained is None:
-            return Shown(last.moment, last.idle)
-        least = min(each.offset for each in found)
-        gap = least - attained(transform @ last.moment[:, -1])
-        return Shown(last.moment, last.idle, enough=gap <= (rounds.cuts.gap or 0.0) * size)
-
-    in_rounds(pool, rounds, pairs, solve)
-    least = min(each.offset for each in found)
-    near = [each for each in found if each.offset <= least + NEAR * size]
-    best = max(near, key=lambda each: each.is_optimal)  # the first that is, if any is
-    seconds = np.sum([each.judged.proposal.seconds for each in found], axis=0)
-    proposal = best.judged.proposal._replace(seconds=seconds)
-    return best._replace(judged=best.judged._replace(proposal=proposal))
-
-
-def _joined(
-    goal: Facets, program: Program, pool: CutPool, found: list[_Round]
-) -> tuple[Products, Judged]:
-    """All facets over the products that any of them has."""
-    pairs = np.unique(np.concatenate([each.pairs for each in found]), axis=0)
-    number = {tuple(pair): i for i, pair in enumerate(pairs)}
-    products, core = joint(pool.core, pairs), len(pool.core.free)
-    whole = program.replace(products=products)
-    multipliers = Proposal.blank(whole, goal).multipliers
-    for each, row in zip(found, multipliers, strict=True):
-        places = np.array([number[tuple(pair)] for pair in each.pairs], dtype=int)
-        row[np.r_[np.arange(core), core + places]] = each.judged.proposal.multipliers[0]
-    # proved with all products, which are in another order and so round otherwise
-    again = np.fmin(sound_offsets(whole, multipliers), interval_offsets(whole))
-    own = [
-        each.judged._replace(proposal=each.judged.proposal._replace(multipliers=row[None]))
-        for each, row in zip(found, multipliers, strict=True)
-    ]
-    judged = jax.tree.map(lambda *parts: np.concatenate(parts), *own)
-    return products, judged._replace(value=np.fmax(judged.value, again))

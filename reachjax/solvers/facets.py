@@ -19,7 +19,7 @@ from reachjax.programs.presolve import NormalProgram, presolved
 from reachjax.programs.relaxations import Products
 from reachjax.proofs.facets import Certificate
 from reachjax.proofs.proposal import Proposal, SolverStatus
-from reachjax.proofs.recheck import clipped, interval_offsets
+from reachjax.proofs.recheck import clipped, interval_offsets, sound_offsets
 from reachjax.proofs.reported import Judged, judged_offsets
 from reachjax.proofs.slopes import held_offsets
 from reachjax.sets import Polytope

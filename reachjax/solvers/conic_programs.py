@@ -7,13 +7,15 @@ second-order cone.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import ENDLESS, Budget
+from reachjax.programs.affine import AffineForms
 from reachjax.solvers.linear_programs import AbstractPrograms, Vertex
 
 ANSWERS = "Solved", "AlmostSolved"
@@ -33,29 +35,38 @@ class ConicPrograms(AbstractPrograms):
         self._settings = self._clarabel.DefaultSettings()
         self._settings.verbose = False
         self._settings.presolve_enable = False
-        self._facts = np.zeros((0, states))
+        self._facts, self._constants = np.zeros((0, states)), np.zeros(0)
+        self._size = np.zeros(0)
 
-    def _grown(
-        self, columns: int, rows: Float[np.ndarray, "m v"], constants: Float[np.ndarray, " m"]
-    ) -> None:
-        self._facts = np.vstack([np.pad(self._facts, ((0, 0), (0, columns))), rows])
+    def grow(self, facts: AffineForms, columns: Int[np.ndarray, " v"]) -> None:
+        """Add the columns and the facts that are new."""
+        self._columns, self._width = columns, facts.columns.shape[1]
+        rows, constants = facts.columns[:, columns], facts.rows[:, 0]
+        size = np.maximum(abs(rows).max(axis=1, initial=0.0), abs(constants))
+        known = np.isfinite(size)
+        rows, constants = np.where(known[:, None], rows, 0.0), np.where(known, constants, 0.0)
+        self._size = np.where((size > 0) & known, size, 1.0)
+        self._facts, self._constants = rows / self._size[:, None], constants / self._size
 
-    def _largest(
+    def largest(
         self,
-        rows: Float[np.ndarray, "r v"],
+        rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
-        held: set[int],
-        budget: Budget,
-        reach: float | Float[np.ndarray, " n"],
-        basis: Any,
+        zero: Iterable[int],
+        budget: Budget = ENDLESS,
+        reach: float | Float[np.ndarray, " n"] = 1.0,
+        basis: Any = None,
     ) -> Vertex | None:
-        n = len(self._columns)
+        """The largest value of a row, or of the least of several; None where there is no answer."""
+        given = np.zeros((len(rows), self._width))
+        given[:, : rows.shape[1]] = rows
+        rows, n = given[:, self._columns], len(self._columns)
         size = abs(rows).max(initial=0.0) or 1.0
-        zero = np.array(sorted(held), dtype=int)
-        others = np.setdiff1d(np.arange(len(self._facts)), zero)
+        held = np.array(sorted({int(fact) for fact in zero}), dtype=int)
+        others = np.setdiff1d(np.arange(len(self._facts)), held)
         # the last variable is the least of the rows
         fixed, signed = (
-            np.c_[self._facts[which], np.zeros(len(which))] for which in (zero, others)
+            np.c_[self._facts[which], np.zeros(len(which))] for which in (held, others)
         )
         compared = np.c_[rows / size, -np.ones(len(rows))]
         units = np.eye(n, n + 1)[self._states :]
@@ -63,7 +74,7 @@ class ConicPrograms(AbstractPrograms):
         ends_of_units = np.broadcast_to(reach, self._width)[self._columns[self._states :]]
         parts = fixed, compared, signed, units, -units, ball
         ends = (
-            self._constants[zero],
+            self._constants[held],
             constants / size,
             self._constants[others],
             ends_of_units,
@@ -90,7 +101,7 @@ class ConicPrograms(AbstractPrograms):
         duals = np.split(np.array(found.z), np.cumsum([*map(len, parts)])[:-1])
         of_fixed, weights, of_signed, of_upper, of_lower, _ = duals
         multipliers = np.zeros(len(self._facts))
-        multipliers[zero], multipliers[others] = of_fixed, of_signed
+        multipliers[held], multipliers[others] = of_fixed, of_signed
         if str(found.status) in EMPTY:
             return Vertex(-np.inf, np.zeros(0), multipliers / self._size, np.zeros(0), np.zeros(0))
         if str(found.status) not in ANSWERS:

@@ -64,8 +64,8 @@ class AbstractPrograms(abc.ABC):
     def __init__(self, states: int):
         self._states = states
         self._columns, self._width = np.arange(states), states
-        self._size, self._constants = np.zeros(0), np.zeros(0)
 
+    @abc.abstractmethod
     def grow(self, facts: AffineForms, columns: Int[np.ndarray, " v"]) -> None:
         """Add the columns and the facts that are new.
 
@@ -74,23 +74,8 @@ class AbstractPrograms(abc.ABC):
             columns: the numbers of those that matter, the first ones as before; remainders that
                 are left out are so small that they change no program.
         """
-        added = len(columns) - len(self._columns)
-        self._columns, self._width, old = columns, facts.columns.shape[1], len(self._size)
-        constants, rows = facts.rows[old:, 0], facts.columns[old:, columns]
-        size = np.maximum(abs(rows).max(axis=1, initial=0.0), abs(constants))
-        known = np.isfinite(size)
-        rows, constants = np.where(known[:, None], rows, 0.0), np.where(known, constants, 0.0)
-        size = np.where((size > 0) & known, size, 1.0)
-        self._size = np.append(self._size, size)
-        self._constants = np.append(self._constants, constants / size)
-        self._grown(added, rows / size[:, None], constants / size)
 
     @abc.abstractmethod
-    def _grown(
-        self, columns: int, rows: Float[np.ndarray, "m v"], constants: Float[np.ndarray, " m"]
-    ) -> None:
-        """Add so many columns, and facts of unit size."""
-
     def largest(
         self,
         rows: Float[np.ndarray, "r n"],
@@ -110,24 +95,6 @@ class AbstractPrograms(abc.ABC):
             reach: what bounds the columns of units, of all or of each column.
             basis: where the search begins; None where the last one ended.
         """
-        if not (np.isfinite(rows).all() and np.isfinite(constants).all()):
-            return None
-        given = np.zeros((len(rows), self._width))
-        given[:, : rows.shape[1]] = rows
-        held = {int(fact) for fact in zero}
-        return self._largest(given[:, self._columns], constants, held, budget, reach, basis)
-
-    @abc.abstractmethod
-    def _largest(
-        self,
-        rows: Float[np.ndarray, "r v"],
-        constants: Float[np.ndarray, " r"],
-        held: set[int],
-        budget: Budget,
-        reach: float | Float[np.ndarray, " n"],
-        basis: Any,
-    ) -> Vertex | None:
-        """The largest value, of rows over the columns that matter."""
 
     @abc.abstractmethod
     def forget(self) -> None:
@@ -166,25 +133,39 @@ class LinearPrograms(AbstractPrograms):
         self._add_columns(states, 1.0 if bounded else highspy.kHighsInf)
         self._held: set[int] = set()
         self._rows = np.zeros(0, dtype=int)  # numbers of the facts among the model's rows
+        self._size, self._constant = np.zeros(0), np.zeros(0)
         self._count = 0
 
-    def _grown(
-        self, columns: int, rows: Float[np.ndarray, "m v"], constants: Float[np.ndarray, " m"]
-    ) -> None:
-        self._add_columns(columns, 1.0)
+    def grow(self, facts: AffineForms, columns: Int[np.ndarray, " v"]) -> None:
+        """Add the columns and the facts that are new."""
+        self._add_columns(len(columns) - len(self._columns), 1.0)
+        self._columns, self._width, old = columns, facts.columns.shape[1], len(self._rows)
+        constants, rows = facts.rows[old:, 0], facts.columns[old:, columns]
+        size = np.maximum(abs(rows).max(axis=1, initial=0.0), abs(constants))
+        known = np.isfinite(size)
+        rows, constants = np.where(known[:, None], rows, 0.0), np.where(known, constants, 0.0)
+        size = np.where((size > 0) & known, size, 1.0)
         self._rows = np.append(self._rows, self._count + np.arange(len(rows)))
-        self._add_rows(-constants, rows, 0.0)
+        self._size = np.append(self._size, size)
+        self._constant = np.append(self._constant, constants / size)
+        self._add_rows(-constants / size, rows / size[:, None], 0.0)
 
-    def _largest(
+    def largest(
         self,
-        rows: Float[np.ndarray, "r v"],
+        rows: Float[np.ndarray, "r n"],
         constants: Float[np.ndarray, " r"],
-        held: set[int],
-        budget: Budget,
-        reach: float | Float[np.ndarray, " n"],
-        basis: Any,
+        zero: Iterable[int],
+        budget: Budget = ENDLESS,
+        reach: float | Float[np.ndarray, " n"] = 1.0,
+        basis: Any = None,
     ) -> Vertex | None:
-        self._hold(held)
+        """The largest value of a row, or of the least of several; None where there is no answer."""
+        if not (np.isfinite(rows).all() and np.isfinite(constants).all()):
+            return None
+        self._hold({int(fact) for fact in zero})
+        given = np.zeros((len(rows), self._width))
+        given[:, : rows.shape[1]] = rows
+        rows = given[:, self._columns]
         size = abs(rows).max(initial=0.0) or 1.0
         width = len(self._columns) + 1
         objective = np.zeros(width)
@@ -262,11 +243,11 @@ class LinearPrograms(AbstractPrograms):
         for fact in self._held - zero:
             self._bound(fact, highspy.kHighsInf)
         for fact in zero - self._held:
-            self._bound(fact, -self._constants[fact])
+            self._bound(fact, -self._constant[fact])
         self._held = zero
 
     def _bound(self, fact: int, upper: float) -> None:
-        self._model.changeRowBounds(int(self._rows[fact]), -self._constants[fact], upper)
+        self._model.changeRowBounds(int(self._rows[fact]), -self._constant[fact], upper)
 
     def _bound_units(self, reach: float | Float[np.ndarray, " n"]) -> None:
         ends = np.broadcast_to(reach, self._width)[self._columns]

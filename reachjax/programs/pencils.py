@@ -43,7 +43,7 @@ class Pencil(NamedTuple):
     units: Float[np.ndarray, " f"]
 
     @property
-    def count(self) -> int:
+    def multipliers(self) -> int:
         """How many multipliers there are."""
         return len(self.normal.kept)
 

@@ -50,8 +50,8 @@ class Certificate(AbstractCertificate):
         program = jax.device_get(self.program)
         back = _left_inverse(np.asarray(program.transform))
         moments = back @ np.asarray(self.moments) @ back.T
-        claimed = np.asarray(self.solver_offsets)[:, None]
-        proposal = Proposal(claimed, proposed, moments, self.codes, self.seconds)
+        claims, codes = np.asarray(self.solver_offsets)[:, None], np.asarray(self.codes)
+        proposal = Proposal(claims, proposed, moments, codes, np.asarray(self.seconds))
         return judged_offsets(program, proposal).value
 
 

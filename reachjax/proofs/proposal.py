@@ -12,7 +12,7 @@ import enum
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from reachjax.programs.lmi import Program
 from reachjax.programs.pencils import AbstractInequality
@@ -83,7 +83,7 @@ _ADVICE = {
 
 
 class Proposal(NamedTuple):
-    """What a solver proposes for the programs of a goal; arrays only.
+    """What a solver proposes for the programs of a goal; arrays only, numpy's on the host.
 
     Attributes:
         unknowns: `(f, u)`, what is sought as the solver has it (the offset of each facet; the form
@@ -95,11 +95,11 @@ class Proposal(NamedTuple):
         seconds: `(f,)`, wall time of each program.
     """
 
-    unknowns: Float[Array | np.ndarray, "f u"]
-    multipliers: Float[Array | np.ndarray, "f K"]
-    moments: Float[Array | np.ndarray, "f N N"]
-    statuses: Int[Array | np.ndarray, " f"]
-    seconds: Float[Array | np.ndarray, " f"]
+    unknowns: Float[np.ndarray, "f u"]
+    multipliers: Float[np.ndarray, "f K"]
+    moments: Float[np.ndarray, "f N N"]
+    statuses: Int[np.ndarray, " f"]
+    seconds: Float[np.ndarray, " f"]
 
     @classmethod
     def blank(cls, program: Program, goal: AbstractInequality) -> Proposal:

@@ -59,7 +59,10 @@ class Sized(NamedTuple):
     @property
     def log_volume(self) -> float:
         """The logarithm of the volume, but for that of the unit ball; infinite without a level."""
-        return log_volume(self.scaled, self.level)
+        if not np.isfinite(self.level):
+            return np.inf
+        A, b = self.scaled
+        return float(len(b) * np.log(max(self.level, 1e-300)) - np.linalg.slogdet(A)[1])
 
 
 def judged_offsets(program: Program, proposal: Proposal) -> Judged:
@@ -189,13 +192,6 @@ def _smaller(program: Program, proposal: Proposal, one: Sized, form: NormalForm)
     level = max(sound_level(program, np.asarray(proposal.multipliers), form), least)
     other = Sized(form, np.array(level))
     return one if one.log_volume <= other.log_volume else other
-
-
-def log_volume(form: NormalForm, level: float | np.ndarray) -> float:
-    """The logarithm of the volume of `|A x + b| <= level`, but for that of the unit ball."""
-    if not np.isfinite(level):
-        return np.inf
-    return float(len(form.b) * np.log(max(level, 1e-300)) - np.linalg.slogdet(form.A)[1])
 
 
 def _interval_form(program: Program) -> NormalForm:

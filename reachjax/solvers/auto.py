@@ -72,7 +72,7 @@ class Auto(AbstractSolver):
         if not goal.logarithmic:
             return self.choice(program).solve(program, goal)
         pencil = goal.pencil(program)
-        if _is_lean(pencil.count, pencil.size):
+        if _is_lean(pencil.multipliers, pencil.size):
             first, second, enough = self.large, self.small, (SolverStatus.SOLVED,)
         else:  # an inaccurate ellipsoid is centred anyhow
             first, second, enough = self.small, self.large, ANSWERS

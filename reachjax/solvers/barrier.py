@@ -79,7 +79,7 @@ class Barrier:
     """
 
     def __init__(self, pencil: Pencil):
-        self.n, self.count = len(pencil.normal.columns), pencil.count
+        self.n, self.count = len(pencil.normal.columns), pencil.multipliers
         self.sizes, beyond = pencil.sizes, pencil.size - self.n
         self.signed = np.r_[np.flatnonzero(~pencil.normal.free), self.count]
         self.rows, self.left, self.right, sharing = pencil.terms

@@ -124,7 +124,7 @@ class Cone:
     def __init__(self, pencil: Pencil, options: Mapping[str, Any]):
         self._clarabel: Any = importlib.import_module("clarabel")  # only where it is needed
         unknowns, generators, self._sizes = unit_columns(pencil)
-        n, count = pencil.size, pencil.count
+        n, count = pencil.size, pencil.multipliers
         # Clarabel has upper triangles column by column, their inner products those of matrices
         self._column, self._row = np.tril_indices(n)
         self._weight = np.where(self._row == self._column, 1.0, np.sqrt(2.0))

@@ -71,7 +71,7 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
 def unit_columns(pencil: Pencil) -> tuple[sp.csc_array, sp.csc_array, Float[np.ndarray, " k"]]:
     """The flattened `-H_j`, `(N * N, u)`, and the `G_k` at unit size and the sizes they had."""
     columns = sp.csc_array(-pencil.terms.columns())
-    unknowns, generators = columns[:, pencil.count :], columns[:, : pencil.count]
+    unknowns, generators = columns[:, pencil.multipliers :], columns[:, : pencil.multipliers]
     sizes = np.sqrt(np.asarray(generators.multiply(generators).sum(axis=0)).ravel())
     sizes = np.where(sizes > 0, sizes, 1.0)
     return unknowns, sp.csc_array(generators @ sp.diags_array(1 / sizes)), sizes
@@ -89,13 +89,13 @@ class Model:
         import cvxpy as cp
 
         unknowns, generators, self._sizes = unit_columns(pencil)
-        self._free = pencil.normal.free
+        self._free: Any = pencil.normal.free
         free, signed = generators[:, self._free], generators[:, ~self._free]
         size = pencil.size
         self._y_free = cp.Variable(free.shape[1]) if free.shape[1] else None
         self._y_signed = cp.Variable(signed.shape[1], nonneg=True)
         self._constant = cp.Parameter(size * size)
-        self._sought = cp.Variable(unknowns.shape[1])
+        self._sought = cp.Variable(len(pencil.sizes))
         weighted = signed @ self._y_signed
         if self._y_free is not None:
             weighted = weighted + free @ self._y_free
@@ -103,7 +103,7 @@ class Model:
         self._lmi = cp.reshape(matrix, (size, size), order="F") << 0
         self.is_linear, s = len(pencil.sizes) == 1, pencil.sizes.shape[1]
         flat = pencil.sizes.reshape(len(pencil.sizes), s * s)
-        constraints = [self._lmi]
+        constraints: list[Any] = [self._lmi]
         if self.is_linear:
             enlarged = flat[:, 0] @ self._sought
         else:

@@ -4,7 +4,7 @@ shape. That of least volume is in `least_volume`.
 
 from __future__ import annotations
 
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +51,7 @@ class AbstractEllipsoid(AbstractGoal):
         return EllipsoidCertificate.of(program, proposal, **own)
 
 
-def _with_level_held(value: Sized) -> tuple[NormalForm, Array]:
+def _with_level_held(value: Sized) -> tuple[NormalForm, Any]:
     """`A` and `b`, which alone have a derivative and take on that of the level, and the level."""
     form, level, factor = value
     held = jax.lax.stop_gradient(level)
@@ -60,7 +60,7 @@ def _with_level_held(value: Sized) -> tuple[NormalForm, Array]:
 
 
 def ellipsoid_pencil(
-    normal: NormalProgram, forms: NormalForm, sizes: Float[np.ndarray, "u s s"]
+    normal: NormalProgram, forms: NormalForm, sizes: Float[Array | np.ndarray, "u s s"]
 ) -> Pencil:
     """`Z = [e e' - F' Gamma F, V'; V, I]`, with `V = R W + r e'` and `W` the successor's rows.
 
@@ -82,7 +82,7 @@ def ellipsoid_pencil(
         normal=normal,
         terms=normal.generators.below(Generators(rows, q + 1 + i, j, sharing)),
         constant=lambda _: np.diag(np.r_[np.zeros(n - 1), 1.0, np.ones(q)]),
-        sizes=sizes,
+        sizes=np.asarray(sizes),
         units=np.ones(1),
     )
 
@@ -96,8 +96,8 @@ def level_slopes(program: Program, value: Sized, proposal: Proposal) -> tuple[Sl
 
 def form_slopes(
     program: Program,
-    multipliers: Float[np.ndarray, " K"],
-    moments: Float[np.ndarray, "N N"],
+    multipliers: Float[Array | np.ndarray, " K"],
+    moments: Float[Array | np.ndarray, "N N"],
     form: NormalForm,
 ) -> tuple[Slopes, NormalForm]:
     """The derivative of `<X, Z>` in rows and in `A` and `b`, where `V = A x+ + b`."""

@@ -67,7 +67,7 @@ class InteriorPoint(AbstractSolver):
 
     def _by_iterates(self, pencil: Pencil) -> Attempt:
         """By the primal-dual method, whose matrices are half of the pencil's."""
-        count, pairs = pencil.count, len(pencil.normal.generators.left)
+        count, pairs = pencil.multipliers, len(pencil.normal.generators.left)
         named = f"a program of {count:,} multipliers and {pairs:,} products"
         require_memory(named, count * (pairs + 2 * count), 8 * pairs**2 + count**3 / 3)
         generators = pencil.terms.scaled(np.r_[np.full(count, -1.0), -0.5])
@@ -99,7 +99,7 @@ def _along_path(pencil: Pencil) -> Attempt:
         moments = end.weight * barrier.inverse(end.y)
         return (
             SolverStatus.SOLVED if solved else SolverStatus.INACCURATE,
-            Found(y, end.y[: pencil.count], moments),
+            Found(y, end.y[: pencil.multipliers], moments),
         )
 
     return attempt

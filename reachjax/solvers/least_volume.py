@@ -113,8 +113,8 @@ class LeastVolume(AbstractEllipsoid):
 
     def _unscaled(self, pencil: Pencil, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Multipliers of the whole program, and `A` and `b`, from a barrier's variables; linear."""
-        unknowns = self.absolute(pencil.normal, 0, y[pencil.count + 1 :])
-        return pencil.normal.multipliers_of(y[: pencil.count]), unknowns
+        unknowns = self.absolute(pencil.normal, 0, y[pencil.multipliers + 1 :])
+        return pencil.normal.multipliers_of(y[: pencil.multipliers]), unknowns
 
     def slopes(self, program: Program, judged: Judged, cotangent: Sized) -> tuple[Slopes, Self]:
         """Slopes of the point on the central path, or of the level that is proved."""

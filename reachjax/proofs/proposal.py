@@ -53,6 +53,9 @@ AS_ASKED = (SolverStatus.SOLVED, SolverStatus.AFFINE_FORM)
 ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
 """The ends after which there is a proposal."""
 
+CLAIMING = (*ANSWERS, SolverStatus.LIMIT)
+"""The ends after which there should be multipliers."""
+
 _ADVICE = {
     SolverStatus.SOLVED: "solved to the tolerance asked for",
     SolverStatus.INACCURATE: "the tolerance was not reached: the bound is sound, perhaps loose; "

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from reachjax.numerics.budget import MOST_BYTES, clock, require_memory
 from reachjax.programs.lmi import Program
 from reachjax.programs.pencils import AbstractInequality, Pencil
-from reachjax.proofs.proposal import Proposal, SolverStatus
+from reachjax.proofs.proposal import CLAIMING, Proposal, SolverStatus
 from reachjax.solvers.base import RESCALINGS, Found, proposed_by, require_positive
-from reachjax.solvers.conic import AbstractConicSolver, require_panic, unit_columns
+from reachjax.solvers.conic import LEAST, AbstractConicSolver, require_panic, unit_columns
 
 STATUSES = {
     "Solved": SolverStatus.SOLVED,
@@ -30,11 +30,6 @@ STATUSES = {
     "MaxTime": SolverStatus.LIMIT,
 }
 """Clarabel's words for how it ended; any other is a failure."""
-
-LEAST = 1e-3
-"""Seconds: Clarabel takes no limit of zero."""
-
-ANSWERS = SolverStatus.SOLVED, SolverStatus.INACCURATE, SolverStatus.LIMIT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,7 +163,7 @@ class Cone:
             return SolverStatus.FAILED, None
         status = STATUSES.get(str(found.status), SolverStatus.FAILED)
         values = np.array(found.x)
-        if status not in ANSWERS or not np.isfinite(values).all():
+        if status not in CLAIMING or not np.isfinite(values).all():
             return status, None
         moments = np.zeros((self._size, self._size))
         moments[self._row, self._column] = np.array(found.z)[self._signed :] / self._weight

@@ -1,10 +1,12 @@
-"""Semidefinite programs by cvxpy, with a solver that it calls by name."""
+"""Semidefinite programs by cvxpy, with a solver that it calls by name: SCS, and any other."""
 
 from __future__ import annotations
 
 import abc
+import dataclasses
 import threading
 import warnings
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -12,11 +14,12 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
+from reachjax.numerics.budget import clock
 from reachjax.programs.lmi import Program
 from reachjax.programs.pencils import AbstractInequality, Pencil
 from reachjax.programs.presolve import THINNEST
 from reachjax.proofs.proposal import Proposal, SolverStatus
-from reachjax.solvers.base import RESCALINGS, AbstractSolver, Found, proposed_by
+from reachjax.solvers.base import RESCALINGS, AbstractSolver, Found, proposed_by, require_positive
 from reachjax.solvers.faults import UnknownOptionError, UnknownSolverError
 
 STATUSES = {
@@ -31,6 +34,9 @@ STATUSES = {
     "solver_error": SolverStatus.FAILED,
 }
 """cvxpy's words for how a solver ended."""
+
+LEAST = 1e-3
+"""Seconds that a solver is given at least: zero is no limit to some, and an error to others."""
 
 ONE_AT_A_TIME = threading.RLock()
 """Threads share cvxpy's count of variables, and the filters of warnings that are set around it."""
@@ -66,6 +72,51 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
             # an ellipsoid has its own scale
             scales = RESCALINGS[: None if model.is_linear else 1]
             return proposed_by(attempt, program, goal, pencil, scales=scales)
+
+
+@dataclasses.dataclass(frozen=True)
+class SCS(AbstractConicSolver):
+    """The splitting conic solver: many cheap iterations, few digits.
+
+    Args:
+        tolerance: of feasibility and of the gap, relative and absolute.
+        max_iterations: a facet that needs more is reported with status `LIMIT` or `INACCURATE`.
+    """
+
+    tolerance: float = 1e-7
+    max_iterations: int = 50_000
+
+    def __post_init__(self):
+        require_positive(self)
+
+    def settings(self) -> tuple[str, dict[str, Any]]:
+        """SCS's own names."""
+        return "SCS", {
+            "eps_abs": self.tolerance,
+            "eps_rel": self.tolerance,
+            "max_iters": self.max_iterations,
+        } | ({"time_limit_secs": max(clock().left, LEAST)} if clock().timed else {})
+
+
+@dataclasses.dataclass(frozen=True)
+class CvxpySolver(AbstractConicSolver):
+    """Any other solver that cvxpy knows, by cvxpy's name for it.
+
+    Args:
+        name: such as `cvxpy.MOSEK`.
+        options: keyword arguments of `cvxpy.Problem.solve` for this solver.
+
+    Example:
+        >>> CvxpySolver("SCS", {"eps_abs": 1e-6}).settings()
+        ('SCS', {'eps_abs': 1e-06})
+    """
+
+    name: str
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
+
+    def settings(self) -> tuple[str, dict[str, Any]]:
+        """The settings as given; the names cvxpy has are in capitals."""
+        return self.name.upper(), dict(self.options)
 
 
 def unit_columns(pencil: Pencil) -> tuple[sp.csc_array, sp.csc_array, Float[np.ndarray, " k"]]:

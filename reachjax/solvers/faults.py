@@ -21,11 +21,8 @@ from reachjax.numerics.budget import TimeOverError, clock
 from reachjax.numerics.checks import described
 from reachjax.programs.lmi import Program
 from reachjax.programs.pencils import AbstractInequality
-from reachjax.proofs.proposal import ANSWERS, OF_SOLVERS, Proposal, SolverStatus
+from reachjax.proofs.proposal import CLAIMING, OF_SOLVERS, Proposal, SolverStatus
 from reachjax.solvers.base import AbstractSolver
-
-CLAIMING = (*ANSWERS, SolverStatus.LIMIT)
-"""The ends after which there should be multipliers."""
 
 
 class SetupError(Exception):

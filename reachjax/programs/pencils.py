@@ -19,7 +19,6 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.numerics.pytrees import Replaceable
 from reachjax.programs.generators import Generators
 from reachjax.programs.lmi import Program
 from reachjax.programs.presolve import NormalProgram
@@ -61,7 +60,7 @@ class Shape(NamedTuple):
     size: int
 
 
-class AbstractInequality(Replaceable, abc.ABC):
+class AbstractInequality(abc.ABC):
     """What is sought of a program, as a matrix inequality: what a solver sees of a goal.
 
     Attributes:

@@ -97,15 +97,6 @@ class Barrier:
         work = len(self.cost) ** 3 / 3 + len(self.left) ** 2
         self.unasked = max(1, int(PACE / 10 / work))
 
-    @property
-    def price(self) -> float:
-        """The price of `t`, in units of the trace that the moments may have."""
-        return self.cost[self.count] / self.unit
-
-    @price.setter
-    def price(self, price: float) -> None:
-        self.cost[self.count] = price * self.unit
-
     def weighted(self, y: np.ndarray) -> np.ndarray:
         """What `Z` changes by: linear."""
         weights = self.sharing.T @ y
@@ -236,7 +227,7 @@ class Barrier:
         for price in prices if self.count <= MOST_MULTIPLIERS else ():
             if clock().late:
                 return None
-            self.price = price
+            self.cost[self.count] = price * self.unit
             y, found = start(), None
             for weight in weights if y is not None else ():
                 assert y is not None

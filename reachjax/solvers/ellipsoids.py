@@ -168,4 +168,4 @@ class GivenShape(AbstractEllipsoid):
         slopes = Slopes(weight * rows.facts, weight * rows.objective)
         weight, own = weight * factor, cotangent.form
         form = NormalForm(own.A + weight * sought.A, own.b + weight * sought.b)
-        return slopes, self.replace(form=form)
+        return slopes, GivenShape(form)

@@ -169,7 +169,7 @@ class Facets(AbstractGoal):
             slopes = inequality_slopes(program, multipliers[i], moments[i], corner)
             facts -= cotangent[i] / 2 * slopes.facts
             objective[i] = cotangent[i] / 2 * slopes.objective[0]
-        return Slopes(facts, objective), self.replace(directions=np.zeros_like(self.directions))
+        return Slopes(facts, objective), Facets(np.zeros_like(self.directions))
 
     def region(self, value: Float[Array, " f"]) -> Polytope:
         """`directions x <= b`."""

@@ -468,7 +468,8 @@ def test_the_barrier_s_derivatives_are_its_differences(shape, monkeypatch):
     monkeypatch.setattr(barrier, "DAMPING", 0.3)
     goal = LeastVolume() if shape is None else GivenShape(NormalForm(shape, np.array([0.1, -0.2])))
     function = Barrier(goal.pencil(program(n_x=2, X=round_of, rows=np.eye(2))))
-    function.price, weight, rng = 7.0, 0.1, np.random.default_rng(0)
+    function.cost[function.count] = 7.0 * function.unit
+    weight, rng = 0.1, np.random.default_rng(0)
     y = function.inside()
     for _ in range(5):  # away from the edge
         gradient, hessian = function.derivatives(y, weight)

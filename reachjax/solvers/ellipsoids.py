@@ -4,7 +4,7 @@ shape. That of least volume is in `least_volume`.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -152,7 +152,9 @@ class GivenShape(AbstractEllipsoid):
         value, optimal = judged_shape(program, proposal, self.form)
         return Judged(value, np.array(optimal), (), proposal)
 
-    def slopes(self, program: Program, judged: Judged, cotangent: Sized) -> tuple[Slopes, Self]:
+    def slopes(
+        self, program: Program, judged: Judged, cotangent: Sized
+    ) -> tuple[Slopes, GivenShape]:
         """Slopes of the factor, an optimal value; or of the level, the factor being held."""
         n, value, factor = len(program.transform), judged.value, judged.value.factor
         if judged.optimal:

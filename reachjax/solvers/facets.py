@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import jax
 import numpy as np
@@ -156,7 +156,7 @@ class Facets(AbstractGoal):
 
     def slopes(
         self, program: Program, judged: Judged, cotangent: Float[np.ndarray, " f"]
-    ) -> tuple[Slopes, Self]:
+    ) -> tuple[Slopes, Facets]:
         """Slopes of the Lagrangian; the rows carry what the directions do."""
         multipliers = clipped(program, np.asarray(judged.proposal.multipliers))
         moments, held = np.array(judged.proposal.moments), np.flatnonzero(~judged.held)

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import abc
 from functools import partial
-from typing import Any, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +92,9 @@ class AbstractGoal(AbstractInequality):
         return products, judged(self, program.replace(products=products), solver)
 
     @abc.abstractmethod
-    def slopes(self, program: Program, judged: Judged, cotangent: Any) -> tuple[Slopes, Self]:
+    def slopes(
+        self, program: Program, judged: Judged, cotangent: Any
+    ) -> tuple[Slopes, AbstractGoal]:
         """The derivative of `<cotangent, value>` in the program's rows, and in the goal.
 
         Args:

@@ -10,7 +10,6 @@ derivative is exact.
 from __future__ import annotations
 
 from functools import partial
-from typing import Self
 
 import numpy as np
 from jaxtyping import Float
@@ -116,7 +115,9 @@ class LeastVolume(AbstractEllipsoid):
         unknowns = self.absolute(pencil.normal, 0, y[pencil.multipliers + 1 :])
         return pencil.normal.multipliers_of(y[: pencil.multipliers]), unknowns
 
-    def slopes(self, program: Program, judged: Judged, cotangent: Sized) -> tuple[Slopes, Self]:
+    def slopes(
+        self, program: Program, judged: Judged, cotangent: Sized
+    ) -> tuple[Slopes, LeastVolume]:
         """Slopes of the point on the central path, or of the level that is proved."""
         slopes = None
         if judged.optimal:

@@ -17,7 +17,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import Program, form_rows
@@ -26,10 +26,8 @@ from reachjax.proofs.recheck import (
     bordered,
     clipped,
     half_square_by_intervals,
-    interval_offsets,
     matrix,
     sound_level,
-    sound_offsets,
     squared,
 )
 from reachjax.sets import NormalForm
@@ -47,15 +45,19 @@ class Held(NamedTuple):
     moments: Float[Array | np.ndarray, "f N N"]
 
 
-def held_offsets(program: Program, multipliers: Float[np.ndarray, "f K"]) -> Held:
-    """Multipliers and moments of the bound of each offset, by multipliers or by intervals.
+def held_offsets(
+    program: Program,
+    multipliers: Float[np.ndarray, "f K"],
+    by_multipliers: Bool[np.ndarray, " f"],
+) -> Held:
+    """Multipliers and moments of the bound of each offset.
 
     Args:
         program: of finite numbers.
         multipliers: of each facet.
+        by_multipliers: where these prove the offset; elsewhere it is that of intervals.
     """
     rows = program.objective
-    by_multipliers = sound_offsets(program, multipliers) < interval_offsets(program)
     moments = np.zeros((*rows.mid.shape, rows.mid.shape[1]))
     for i, (mid, rad) in enumerate(zip(rows.mid, rows.rad, strict=True)):
         if by_multipliers[i]:

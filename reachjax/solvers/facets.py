@@ -160,16 +160,12 @@ class Facets(AbstractGoal):
         """Slopes of the Lagrangian; the rows carry what the directions do."""
         multipliers = clipped(program, np.asarray(judged.proposal.multipliers))
         moments, held = np.array(judged.proposal.moments), np.flatnonzero(~judged.held)
-        own = program.with_objective(held)
-        multipliers[held], moments[held] = held_offsets(own, multipliers[held])
-        corner = slice(len(program.transform) - 1, None)
-        facts, objective = np.zeros_like(program.facts.mid), np.zeros_like(program.objective.mid)
-        for i in np.flatnonzero(cotangent):
-            # with `Z` zero at its moments, the offset moves by half of what `Z` misses
-            slopes = inequality_slopes(program, multipliers[i], moments[i], corner)
-            facts -= cotangent[i] / 2 * slopes.facts
-            objective[i] = cotangent[i] / 2 * slopes.objective[0]
-        return Slopes(facts, objective), Facets(np.zeros_like(self.directions))
+        if len(held):
+            own, weights = program.with_objective(held), multipliers[held]
+            used = sound_offsets(own, weights) < interval_offsets(own)
+            multipliers[held], moments[held] = held_offsets(own, weights, used)
+        slopes = offset_slopes(program, multipliers, moments, cotangent)
+        return slopes, Facets(np.zeros_like(self.directions))
 
     def region(self, value: Float[Array, " f"]) -> Polytope:
         """`directions x <= b`."""
@@ -181,6 +177,25 @@ class Facets(AbstractGoal):
         """The proof of the offsets."""
         claims = proposal.unknowns[:, 0]
         return Certificate.of(program, proposal, bounds=value, solver_offsets=claims)
+
+
+def offset_slopes(
+    program: Program,
+    multipliers: Float[np.ndarray, "f K"],
+    moments: Float[np.ndarray, "f n n"],
+    weights: Float[np.ndarray, " f"],
+) -> Slopes:
+    """The derivative of `<weights, offsets>`, multipliers and moments being held.
+
+    An offset moves by half of what its matrix `Z` misses at the moments.
+    """
+    corner = slice(len(program.transform) - 1, None)
+    facts, objective = np.zeros_like(program.facts.mid), np.zeros_like(program.objective.mid)
+    for i in np.flatnonzero(weights):
+        slopes = inequality_slopes(program, multipliers[i], moments[i], corner)
+        facts -= weights[i] / 2 * slopes.facts
+        objective[i] = weights[i] / 2 * slopes.objective[0]
+    return Slopes(facts, objective)
 
 
 class _Round(NamedTuple):

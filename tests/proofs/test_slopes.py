@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.proofs.proposal import Proposal
 from reachjax.proofs.recheck import interval_offsets, sound_level, sound_offsets
 from reachjax.proofs.reported import Sized, judged_offsets
 from reachjax.proofs.slopes import held_level, held_offsets
 from reachjax.sets import NormalForm
 from reachjax.solvers import Facets, LeastVolume
 from reachjax.solvers.ellipsoids import level_slopes
+from reachjax.solvers.facets import offset_slopes
 from reachjax.solvers.least_volume import form_of
 from tests.closed_loops import proposal_of
 from tests.solvers.test_enclosures import case, program
@@ -45,14 +45,10 @@ def along(slopes, direction):
     return sum(np.sum(slope * part) for slope, part in zip(slopes, direction, strict=True))
 
 
-def offsets_along(program, multipliers, direction):
-    """The derivatives of all offsets that no claim is made for, one after the other."""
-    goal = Facets(program.objective.mid)
-    proposal = Proposal.blank(program, goal)._replace(multipliers=multipliers)
-    judged = judged_offsets(program, proposal)
-    assert not judged.held.any()
+def offsets_along(program, held, direction):
+    """The derivatives of all offsets, one after the other."""
     facets = np.eye(len(program.objective.mid))
-    return [along(goal.slopes(program, judged, facet)[0], direction) for facet in facets]
+    return [along(offset_slopes(program, *held, facet), direction) for facet in facets]
 
 
 def difference(f):
@@ -62,8 +58,8 @@ def difference(f):
 def test_offsets_that_multipliers_prove_have_the_derivative_of_what_is_proved(held):
     held, multipliers = held
     moved, direction = moves(held)
-    assert (sound_offsets(held, multipliers) < interval_offsets(held)).all()
-    mine = offsets_along(held, multipliers, direction)
+    slopes = held_offsets(held, multipliers, np.full(len(multipliers), True))
+    mine = offsets_along(held, slopes, direction)
     proved = difference(lambda h: sound_offsets(moved(h), multipliers))
     np.testing.assert_allclose(mine, proved, rtol=1e-5, atol=1e-6)
 
@@ -71,7 +67,8 @@ def test_offsets_that_multipliers_prove_have_the_derivative_of_what_is_proved(he
 def test_offsets_by_intervals_have_theirs(held):
     held, multipliers = held
     moved, direction = moves(held)
-    mine = offsets_along(held, 0 * multipliers, direction)
+    slopes = held_offsets(held, multipliers, np.full(len(multipliers), False))
+    mine = offsets_along(held, slopes, direction)
     proved = difference(lambda h: interval_offsets(moved(h)))
     np.testing.assert_allclose(mine, proved, rtol=1e-5, atol=1e-6)
 
@@ -110,9 +107,9 @@ def test_where_the_ball_alone_bounds_a_direction_the_derivative_holds_too():
     )
     multipliers = np.where(np.arange(len(held.products.free)) == k, 1.0, 0.0)[None]
     moved, direction = moves(bare)
-    X = held_offsets(bare, multipliers).moments[0]
-    assert X[0, 0] == pytest.approx(bare.used.sum() - 1, abs=0.1)  # the ball's radius
-    mine = offsets_along(bare, multipliers, direction)
+    slopes = held_offsets(bare, multipliers, np.array([True]))
+    assert slopes[1][0, 0, 0] == pytest.approx(bare.used.sum() - 1, abs=0.1)  # the ball's radius
+    mine = offsets_along(bare, slopes, direction)
     proved = difference(lambda h: sound_offsets(moved(h), multipliers))
     np.testing.assert_allclose(mine, proved, rtol=1e-5, atol=1e-6)
 

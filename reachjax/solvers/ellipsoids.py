@@ -122,7 +122,7 @@ class GivenShape(AbstractEllipsoid):
         return Shape(1, 1, n + q)
 
     def pencil(self, program: Program) -> Pencil:
-        """That of ellipsoids, whose only unknown is the factor, of unit size."""
+        """The pencil of ellipsoids whose only unknown is the factor, of unit size."""
         normal = presolved(program)
         normal = normal.with_units(normal.widths)
         form, unit = normal.to_unit_box(self.form), self._unit(normal)

@@ -47,7 +47,7 @@ class LeastVolume(AbstractEllipsoid):
         return Shape(1, q * q + q, n + q)
 
     def pencil(self, program: Program) -> Pencil:
-        """That of ellipsoids, in units in which the successor varies by one.
+        """The pencil of ellipsoids, in units in which the successor varies by one.
 
         The unknowns are the entries of a symmetric `R` on and above the diagonal, and `r`.
         """

@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
-from reachjax.numerics.budget import ENDLESS, PACE, TimeOverError, clock
+from reachjax.numerics.budget import ENDLESS, PACE, Budget, TimeOverError, clock
 from reachjax.programs.generators import CHUNK
 from reachjax.programs.pencils import Pencil
 from reachjax.programs.presolve import THINNEST
@@ -93,9 +93,8 @@ class Barrier:
         self.cost, signed = np.zeros((2, self.unknowns.stop))
         signed[self.signed] = 1.0
         self.spread = 1 + np.linalg.norm(self.weighted(signed), 2)
-        # Newton steps that are taken before the clock is asked again
         work = len(self.cost) ** 3 / 3 + len(self.left) ** 2
-        self.unasked = max(1, int(PACE / 10 / work))
+        self._every, self._steps = max(1, int(PACE / 10 / work)), 0
 
     def weighted(self, y: np.ndarray) -> np.ndarray:
         """What `Z` changes by: linear."""
@@ -128,17 +127,19 @@ class Barrier:
             value -= 2 * each * np.sum(np.log(np.diag(factor)))
         return float(value)
 
-    def derivatives(self, y: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
+    def derivatives(
+        self, y: np.ndarray, weight: float, budget: Budget = ENDLESS
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and Hessian.
 
         Raises:
-            TimeOverError: the time in force is over.
+            TimeOverError: the time of the budget is over.
         """
         factor = triangular_inverse(self.constant + self.weighted(y))
         inverse = factor.T @ factor
         moved = inverse @ self.states @ inverse
         gradient = self.cost - weight * self.paired(inverse)
-        hessian = weight * self._crossed(factor)
+        hessian = weight * self._crossed(factor, budget)
         t, each = self.count, np.arange(self.count)
         gradient[t] -= weight * np.sum(self.states * inverse)
         hessian[t] = hessian[:, t] = weight * self.paired(moved)
@@ -155,7 +156,7 @@ class Barrier:
             hessian[self.unknowns, self.unknowns] += each * flat @ flat.T
         return gradient, hessian
 
-    def _crossed(self, factor: np.ndarray) -> np.ndarray:
+    def _crossed(self, factor: np.ndarray, budget: Budget) -> np.ndarray:
         """`<T_k, W T_l W>` of the terms `T_k` for `W = factor' factor`."""
         half = self.rows @ factor.T
         gram = half @ half.T
@@ -163,7 +164,7 @@ class Barrier:
         shared = np.zeros((len(self.cost), len(self.left)))
         for first in range(0, len(self.left), CHUNK):
             if first:
-                clock().require()
+                budget.require()
             here = slice(first, first + CHUNK)
             crossed = by_left[self.left[here]] * by_right[self.right[here]]
             crossed += by_right[self.left[here]] * by_left[self.right[here]]
@@ -214,24 +215,21 @@ class Barrier:
         return None
 
     def path_end(
-        self,
-        start: Callable[[], np.ndarray | None],
-        weights: tuple[float, ...],
-        prices: tuple[float, ...] = PRICES,
+        self, start: Callable[[], np.ndarray | None], weights: tuple[float, ...]
     ) -> Centre | None:
         """The last centre that is reached, from one weight to the next; None if there is none.
 
         At too low a price `t` stays, and what is found is smaller than the relaxation itself
         allows.
         """
-        for price in prices if self.count <= MOST_MULTIPLIERS else ():
-            if clock().late:
-                return None
+        budget = clock()
+        for price in PRICES if self.count <= MOST_MULTIPLIERS else ():
             self.cost[self.count] = price * self.unit
-            y, found = start(), None
-            for weight in weights if y is not None else ():
-                assert y is not None
-                centre = self.minimiser(y, weight)
+            y, found = None if budget.late else start(), None
+            if y is None:
+                return None
+            for weight in weights:
+                centre = self.minimiser(y, weight, budget)
                 if centre is None:
                     break
                 found, y = Centre(*centre, weight), centre[0]
@@ -241,14 +239,20 @@ class Barrier:
                 return found
         return None
 
-    def minimiser(self, y: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Newton's method from a point inside: the minimiser and the Hessian there."""
+    def minimiser(
+        self, y: np.ndarray, weight: float, budget: Budget
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Newton's method from a point inside: the minimiser and the Hessian there.
+
+        The clock is asked each tenth of a second.
+        """
         value, before = self.value(y, weight), np.inf
-        for number in range(NEWTON_STEPS if np.isfinite(value) else 0):
-            if number % self.unasked == 0 and clock().late:
+        for _ in range(NEWTON_STEPS if np.isfinite(value) else 0):
+            self._steps += 1
+            if self._steps % self._every == 0 and budget.late:
                 return None
             try:
-                gradient, hessian = self.derivatives(y, weight)
+                gradient, hessian = self.derivatives(y, weight, budget)
             except TimeOverError:
                 return None
             step = -solved(hessian, gradient)
@@ -257,8 +261,7 @@ class Barrier:
             if decrement <= CENTRED * weight or stagnant:
                 better = y + step  # by the square of the decrement; the Hessian is to match
                 y = better if np.isfinite(self.value(better, weight)) else y
-                with ENDLESS.in_force():  # it is found
-                    return y, self.derivatives(y, weight)[1]
+                return y, self.derivatives(y, weight)[1]
             if not np.isfinite(decrement):
                 return None
             length, near = 1.0, decrement <= QUADRATIC * weight

@@ -16,12 +16,17 @@ from tests.networks import box_region
 STATES = [1, 2, 3, 6]
 
 
-@pytest.fixture(scope="module", params=STATES)
-def program(request):
-    n, region = request.param, box_region(request.param, request.param)
+def program_of(n):
+    """The program of a step of a small loop, with the successor for an objective."""
+    region = box_region(n, n)
     X = rj.Box(region.corners.min(axis=0), region.corners.max(axis=0))
     loop = closed_loop(random_loop(n, seed=n))
     return jax.device_get(step_program(loop, X, X, jnp.eye(n), 0, rj.LocalBounds()))
+
+
+@pytest.fixture(scope="module", params=STATES)
+def program(request):
+    return program_of(request.param)
 
 
 def of_facet(program, i, offset):

@@ -51,9 +51,7 @@ class LeastVolume(AbstractEllipsoid):
 
         The unknowns are the entries of a symmetric `R` on and above the diagonal, and `r`.
         """
-        normal = presolved(program)
-        forms = _free_forms(len(normal.objective))
-        return ellipsoid_pencil(normal.with_units(normal.widths), forms, forms.A)
+        return _pencil(presolved(program))
 
     def absolute(
         self, normal: NormalProgram, i: int, unknowns: Float[np.ndarray, " u"]
@@ -81,7 +79,7 @@ class LeastVolume(AbstractEllipsoid):
             normal = presolved(framed)
             if attempt and (normal.is_flat or clock().late):
                 break
-            proposal, on_path = self._centred(solver, framed)
+            proposal, on_path = self._centred(proposed(solver, framed, self), normal)
             form = form_of(proposal.unknowns[0])
             value, optimal = judged_least(program, proposal, form.of(frame), on_path)
             optimal &= int(proposal.statuses[0]) == SolverStatus.SOLVED
@@ -93,12 +91,11 @@ class LeastVolume(AbstractEllipsoid):
                 break
         return min(attempts, key=lambda judged: judged.value.log_volume)
 
-    def _centred(self, solver: AbstractSolver, program: Program) -> tuple[Proposal, bool]:
+    def _centred(self, proposal: Proposal, normal: NormalProgram) -> tuple[Proposal, bool]:
         """The solver's ellipsoid, moved to the central path, and whether that was reached."""
-        proposal = proposed(solver, program, self)
         if int(proposal.statuses[0]) not in ANSWERS or not np.isfinite(proposal.unknowns).all():
             return proposal, False
-        pencil = self.pencil(program)
+        pencil = _pencil(normal)
         barrier = Barrier(pencil)
         found = _centre(barrier, pencil, proposal.multipliers[0], form_of(proposal.unknowns[0]))
         if found is None:
@@ -152,6 +149,12 @@ class LeastVolume(AbstractEllipsoid):
             halves.append(form_slopes(program, multipliers, moments, part)[0])
         (facts, objective), other = halves
         return Slopes(facts - other.facts, objective - other.objective)
+
+
+def _pencil(normal: NormalProgram) -> Pencil:
+    """The pencil of a normal program, in units in which the successor varies by one."""
+    forms = _free_forms(len(normal.objective))
+    return ellipsoid_pencil(normal.with_units(normal.widths), forms, forms.A)
 
 
 def flat(form: NormalForm) -> Float[np.ndarray, " u"]:

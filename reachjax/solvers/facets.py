@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
@@ -164,8 +164,8 @@ class Facets(AbstractGoal):
             own, weights = program.with_objective(held), multipliers[held]
             used = sound_offsets(own, weights) < interval_offsets(own)
             multipliers[held], moments[held] = held_offsets(own, weights, used)
-        slopes = offset_slopes(program, multipliers, moments, cotangent)
-        return slopes, Facets(np.zeros_like(self.directions))
+        nothing: Any = np.zeros_like(self.directions)
+        return offset_slopes(program, multipliers, moments, cotangent), Facets(nothing)
 
     def region(self, value: Float[Array, " f"]) -> Polytope:
         """`directions x <= b`."""

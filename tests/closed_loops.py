@@ -10,6 +10,8 @@ import numpy as np
 import reachjax as rj
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.windows import Window
+from reachjax.proofs.proposal import Proposal
+from reachjax.solvers import Facets
 from tests.networks import (
     LoopData,
     box_region,
@@ -126,6 +128,11 @@ def one_step(
 ) -> tuple[Any, Any]:
     """A step of `recursion`."""
     return rj.reach_step(loop, X, template, relaxation=relaxation, **options)
+
+
+def proposal_of(solver: rj.AbstractSolver, program: Any, goal: Any = None) -> Proposal:
+    """What a solver proposes for a goal; for the offsets of a program's facets if none is given."""
+    return solver.solve(program, Facets(program.objective.mid) if goal is None else goal)
 
 
 def step_program(loop, X, box, directions, t, relaxation):

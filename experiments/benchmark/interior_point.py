@@ -69,9 +69,9 @@ class Recorded(rj.AbstractSolver):
     solver: rj.AbstractSolver
     answers: list[tuple[Any, Any]] = field(default_factory=list)
 
-    def solve(self, program):
+    def solve(self, program, goal):
         """As the solver does."""
-        self.answers.append((program, self.solver.solve(program)))
+        self.answers.append((program, self.solver.solve(program, goal)))
         return self.answers[-1][1]
 
 
@@ -171,7 +171,7 @@ def _merit(program, answer) -> tuple[float, bool]:
     """
     objective, moments = np.asarray(program.objective.mid), np.asarray(answer.moments)
     values = np.einsum("fi,fi->f", objective, moments[:, :, -1])
-    gaps = abs(np.asarray(answer.offsets) - values) / (1 + abs(values))
+    gaps = abs(np.asarray(answer.unknowns)[:, 0] - values) / (1 + abs(values))
     return float(gaps.max()), bool(np.all(answer.statuses == rj.SolverStatus.SOLVED))
 
 

@@ -18,6 +18,7 @@ import pytest
 
 import reachjax as rj
 from experiments.benchmark.cases import random_case
+from reachjax.solvers import Facets
 
 PROGRAMS = {
     "local bounds, 2x10": (10, rj.LocalBounds(), rj.Clarabel()),
@@ -46,7 +47,7 @@ def parts(
     gradient = jax.jit(jax.value_and_grad(size))
     ready = (
         step,
-        lambda: solver.solve(program),
+        lambda: solver.solve(program, Facets(template.directions)),
         certificate.recheck,
         lambda: gradient(case.loop),
     )

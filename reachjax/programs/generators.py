@@ -1,7 +1,7 @@
 """Symmetric matrices that are sums of products of two rows, on the host.
 
-`G_k = sum w sym(l' r)` over the pairs that belong to `k`. Sums, inner products and Hessians of
-log-determinants need Gram matrices of the rows alone; only conic solvers ask for the `G_k`.
+`G_k = sum w sym(l' r)` over the pairs that belong to `k`. Sums and inner products need Gram
+matrices of the rows alone; only conic solvers ask for the `G_k`.
 """
 
 from __future__ import annotations
@@ -47,20 +47,6 @@ class Generators(NamedTuple):
         """`<G_k, M>` `(K,)` for a symmetric matrix."""
         return self.sharing @ np.sum((self.rows @ matrix)[self.left] * self.rows[self.right], 1)
 
-    def hessian(self, factor: np.ndarray) -> np.ndarray:
-        """`<G_k, W G_l W>` `(K, K)` for `W = factor' factor`."""
-        half = self.rows @ factor.T
-        gram = half @ half.T
-        by_left, by_right = gram[:, self.left], gram[:, self.right]
-        shared = np.zeros((self.size, len(self.left)))
-        for first in range(0, len(self.left), CHUNK):
-            clock().require()
-            here = slice(first, first + CHUNK)
-            crossed = by_left[self.left[here]] * by_right[self.right[here]]
-            crossed += by_right[self.left[here]] * by_left[self.right[here]]
-            shared += self.sharing[:, here] @ crossed
-        return (self.sharing @ shared.T) / 2
-
     def schur(self, X: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`<G_k, X>` and `<G_k, W>` `(K,)`, and `<G_k, X G_l W>` `(K, K)`, for symmetric `X`, `W`.
 
@@ -85,15 +71,23 @@ class Generators(NamedTuple):
         paired, paired_W = (self.sharing @ gram[left, right] for gram in (A, B))
         return paired, paired_W, (self.sharing @ shared.T) / 4
 
-    def with_square(self, row: np.ndarray, weight: float) -> Generators:
-        """With one more matrix, `weight` times a row's square."""
-        m = len(self.rows)
+    def below(self, others: Generators) -> Generators:
+        """The matrices `-G_k`, and then those of others, which may have more columns."""
+        m, n = self.rows.shape
+        rows = np.zeros((m + len(others.rows), others.rows.shape[1]))
+        rows[:m, :n], rows[m:] = self.rows, others.rows
         return Generators(
-            rows=np.vstack([self.rows, row]),
-            left=np.append(self.left, m),
-            right=np.append(self.right, m),
-            sharing=sp.csr_array(sp.block_diag([self.sharing, [[weight]]])),
+            rows=rows,
+            left=np.r_[self.left, m + others.left],
+            right=np.r_[self.right, m + others.right],
+            sharing=sp.csr_array(sp.block_diag([-self.sharing, others.sharing])),
         )
+
+    def scaled(self, weights: np.ndarray) -> Generators:
+        """Each matrix times a weight."""
+        sharing = self.sharing.copy()
+        sharing.data *= np.repeat(weights, np.diff(sharing.indptr))
+        return self._replace(sharing=sharing)
 
     def columns(self) -> sp.csc_array:
         """The flattened matrices, sparse `(n * n, K)`."""

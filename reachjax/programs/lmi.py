@@ -129,49 +129,29 @@ class Slopes(NamedTuple):
     objective: Float[Array | np.ndarray, "f n"]
 
 
-def lagrangian_slopes(
+def inequality_slopes(
     program: Program,
-    multipliers: Float[Array | np.ndarray, "f K"],
-    moments: Float[Array | np.ndarray, "f n n"],
-    weights: Float[np.ndarray, " f"],
+    multipliers: Float[Array | np.ndarray, " K"],
+    moments: Float[Array | np.ndarray, "N N"],
+    where: slice,
 ) -> Slopes:
-    """The derivative of `sum_i weights_i <X_i / 2, F' Gamma_i F + p_i e' + e p_i'>` on the host.
+    """The derivative of `<X, Z>`, `Z` being what is to be positive semidefinite, on the host.
 
-    With multipliers and moments held at their optimal values, each term's derivative is that of the
-    optimal offset (the envelope theorem).
+    Facets have `Z = 2 b e e' - p e' - e p' - F' Gamma F`, ellipsoids
+    `Z = [e e' - F' Gamma F, V'; V, I]` with `V = A x+ + b`. With multipliers and moments `X` held
+    at their optimal values, this is the derivative of the optimum (the envelope theorem), times
+    that of `<X, Z>` in what is sought.
+
+    Args:
+        program: of numpy arrays.
+        multipliers: of its products.
+        moments: `X`, over the basis and what `Z` has beyond it.
+        where: the rows of `Z` in which `V` stands, or `-p`.
+
+    Returns:
+        The derivative in the facts `F`, and in `V` or `-p`.
     """
-    facts = np.zeros_like(program.facts.mid)
-    for each, X, weight in zip(multipliers, moments, weights, strict=True):
-        if weight != 0:
-            facts += weight / 2 * _products_slope(program, each, X)
-    return Slopes(facts, weights[:, None] * moments[:, :, -1])
-
-
-def schur_slopes(
-    program: Program,
-    multipliers: Float[Array | np.ndarray, " K"],
-    form: NormalForm,
-    moments: Float[Array | np.ndarray, "n+q n+q"],
-) -> tuple[Slopes, NormalForm]:
-    """The derivative of `<X, [e e' - F' Gamma F, V'; V, I]>` in rows and in `A` and `b`.
-
-    With `V = A x+ + b` that matrix is positive semidefinite where `V' V - e e' + F' Gamma F <= 0`:
-    theorem 1 for the ellipsoid `|A x + b| <= 1`. It is affine in the multipliers, `A` and `b`. On
-    the host.
-    """
-    n, P = len(program.transform), program.objective.mid
-    V = 2 * moments[n:, :n]
-    facts = -_products_slope(program, multipliers, moments[:n, :n])
-    return Slopes(facts, form.A.T @ V), NormalForm(V @ P.T, V[:, -1])
-
-
-def _products_slope(
-    program: Program,
-    multipliers: Float[Array | np.ndarray, " K"],
-    X: Float[Array | np.ndarray, "n n"],
-) -> Float[np.ndarray, "m n"]:
-    """The derivative of `<X, F' Gamma F>` in `F`."""
-    products, F = program.products, program.facts.mid
+    n, products, F = len(program.transform), program.products, program.facts.mid
     weights = products.sign * multipliers[products.multiplier]
     pairs = sp.coo_array((weights, (products.left, products.right)), shape=(len(F), len(F)))
-    return (pairs + pairs.T) @ (F @ X)
+    return Slopes(-((pairs + pairs.T) @ (F @ moments[:n, :n])), 2 * moments[where, :n])

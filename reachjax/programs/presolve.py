@@ -1,5 +1,7 @@
 """Presolve: the program as a solver should see it, with nothing empty, no noise, nothing implied.
 
+`presolved` applies it, and `NormalProgram.invert` leads back from what a solver finds.
+
 Rows whose coefficients are rounding noise are dropped (one of size 1e-16 scaled up to 1 made a
 solver report "solved" for an offset below the true support), so are columns that the others use at
 that level or not at all, and products that say nothing beyond an ellipsoid's own fact. What stays
@@ -47,6 +49,7 @@ class NormalProgram(NamedTuple):
         columns: `(n,)`, numbers of the columns kept.
         kept: `(K',)`, numbers of the multipliers kept.
         norms: `(K',)`: the program's multiplier is `y_k / norms_k`.
+        whole: how many multipliers and columns the program has.
     """
 
     generators: Generators
@@ -57,6 +60,39 @@ class NormalProgram(NamedTuple):
     columns: np.ndarray
     kept: np.ndarray
     norms: np.ndarray
+    whole: tuple[int, int]
+
+    def invert(
+        self, multipliers: Float[np.ndarray, " k"], moments: Float[np.ndarray, "m m"]
+    ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "M M"]]:
+        """Multipliers and moments of the program itself, from those that were found for this one.
+
+        Args:
+            multipliers: the `y_k`.
+            moments: over the columns kept, and over what a goal's matrix has beyond them; of any
+                scale.
+
+        Returns:
+            Multipliers, and moments whose corner is one; NaN where there are none.
+        """
+        corner = moments[len(self.columns) - 1, len(self.columns) - 1]
+        whole = self.moments_of(moments)
+        there = corner > 0 and np.isfinite(moments).all()
+        return self.multipliers_of(multipliers), whole / (corner if there else np.nan)
+
+    def multipliers_of(self, multipliers: Float[np.ndarray, " k"]) -> Float[np.ndarray, " K"]:
+        """Multipliers of the program itself, zero where they are not kept: linear."""
+        whole = np.zeros(self.whole[0])
+        whole[self.kept] = multipliers / self.norms
+        return whole
+
+    def moments_of(self, moments: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "M M"]:
+        """Moments of the program itself, and of what is beyond its columns: linear."""
+        n, size = len(self.columns), self.whole[1]
+        beyond = np.arange(size, size + len(moments) - n)
+        whole, used = np.zeros((size + len(beyond),) * 2), np.r_[self.columns, beyond]
+        whole[np.ix_(used, used)] = moments
+        return whole
 
     @property
     def widths(self) -> np.ndarray:
@@ -125,6 +161,7 @@ def presolved(program: Program) -> NormalProgram:
         columns=columns,
         kept=kept,
         norms=norms,
+        whole=(len(sizes), len(used)),
     )
 
 
@@ -153,7 +190,7 @@ def _implied_by_cone(products: Products, facts: np.ndarray) -> Bool[np.ndarray, 
     Products of neurons that are affine on the set are of this kind; kept, hundreds of them made a
     solver stall at its second digit. So are those of facets that do not cut the ellipsoid.
     """
-    cone, count = products.sign < 0, len(products.free)
+    cone, count = products.of_cone, len(products.free)
     if not cone.any():
         return np.zeros(count, dtype=bool)
     own = np.bincount(products.multiplier, cone, count) > 0
@@ -170,11 +207,11 @@ def _least_on_ellipsoid(
     """A lower bound `(m,)` of each fact on the ellipsoid; `-inf` if it is not one of the state.
 
     Args:
-        products: whose negative pairs are those of the rows `R` with `|R x| <= s`.
+        products: whose pairs of a cone are those of the rows `R` with `|R x| <= s`.
         facts: `(m, n)`.
         own: `(K,)`, the multiplier of the ellipsoid's own fact.
     """
-    cone, (left, right) = products.sign < 0, (facts[products.left], facts[products.right])
+    cone, (left, right) = products.of_cone, (facts[products.left], facts[products.right])
     of_level = own[products.multiplier] & ~cone
     level = np.sqrt(np.where(of_level, left[:, -1] * right[:, -1], 0.0).sum())
     R, linear = np.where(cone[:, None], left, 0.0), facts[:, :-1]

@@ -46,6 +46,14 @@ class Products(Replaceable):
     multiplier: Int[Array, " p"]
     free: Bool[Array, " K"]
 
+    @property
+    def of_cone(self) -> Bool[Array, " p"]:
+        """Which pairs are the squares of a cone's rows `R`, `s^2 - |R x|^2 >= 0`.
+
+        No other products are subtracted.
+        """
+        return self.sign < 0
+
 
 class AbstractRelaxation(abc.ABC):
     """A choice of products. Hashable and immutable: it is static where code is compiled.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import abc
 from collections import Counter
 from collections.abc import Mapping
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -18,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from reachjax.numerics.checks import floats_of, is_concrete, require_double_precision
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.lmi import Program
-from reachjax.proofs.proposal import SolverStatus
+from reachjax.proofs.proposal import Proposal, SolverStatus
 
 
 def told(ends: Mapping[SolverStatus, int]) -> str:
@@ -85,6 +86,40 @@ class AbstractCertificate(AbstractProof):
     program: Program
     multipliers: Float[Array | np.ndarray, "f K"]
     moments: Float[Array | np.ndarray, "f n n"]
+
+    @classmethod
+    def of(cls, program: Program, proposal: Proposal, **own: Any) -> Self:
+        """What was proved with what a solver proposed; witnesses are not known yet (NaN).
+
+        Args:
+            program: of the step.
+            proposal: for it.
+            own: the bounds, and what else a certificate of this kind has.
+        """
+        T, programs = program.transform, len(proposal.statuses)
+        moments = proposal.moments[:, : len(T), : len(T)]
+        return cls(
+            program=program,
+            multipliers=proposal.multipliers,
+            moments=T @ moments @ T.T,
+            codes=proposal.statuses,
+            witnesses=np.full(programs, np.nan),
+            witness_states=np.full((programs, 0), np.nan),
+            seconds=proposal.seconds,
+            **own,
+        )
+
+    def of_programs(self, which: slice = slice(None)) -> dict[str, Any]:
+        """What there is one of for each program, of some of them, by name."""
+        return {
+            "multipliers": self.multipliers[which],
+            "moments": self.moments[which],
+            "codes": self.codes[which],
+            "bounds": self.bounds[which],
+            "witnesses": self.witnesses[which],
+            "witness_states": self.witness_states[which],
+            "seconds": self.seconds[which],
+        }
 
     @property
     def products_in_use(self) -> Int[np.ndarray, "p 2"]:

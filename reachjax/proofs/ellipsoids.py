@@ -7,9 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.pytrees import pytree
-from reachjax.programs.lmi import Program
 from reachjax.proofs.certificates import AbstractCertificate
-from reachjax.proofs.proposal import Enclosure
 from reachjax.proofs.recheck import sound_level
 from reachjax.sets import NormalForm
 
@@ -29,26 +27,6 @@ class EllipsoidCertificate(AbstractCertificate):
 
     form: NormalForm
     level: Float[Array | np.ndarray, ""]
-
-    @classmethod
-    def from_enclosure(
-        cls, program: Program, form: NormalForm, level: Array, enclosure: Enclosure
-    ) -> EllipsoidCertificate:
-        """What was proved with what a solver proposed; witnesses are not known yet (NaN)."""
-        T, n = program.transform, len(program.transform)
-        moments = enclosure.moments[:n, :n] / enclosure.moments[n - 1, n - 1]
-        return cls(
-            program=program,
-            form=form,
-            level=level,
-            multipliers=enclosure.multipliers[None],
-            moments=(T @ moments @ T.T)[None],
-            codes=enclosure.status[None],
-            bounds=np.ones(1),
-            witnesses=np.full(1, np.nan),
-            witness_states=np.full((1, 0), np.nan),
-            seconds=enclosure.seconds[None],
-        )
 
     def __repr__(self) -> str:
         return f"EllipsoidCertificate(products={self.multipliers.shape[-1]})"
@@ -74,4 +52,4 @@ class EllipsoidCertificate(AbstractCertificate):
         """
         proposed = self._proposed(multipliers)
         program, form, level = jax.device_get((self.program, self.form, self.level))
-        return np.array([sound_level(program, proposed[0], form) / level])
+        return np.array([sound_level(program, proposed, form) / level])

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.pytrees import pytree
-from reachjax.programs.lmi import Program
 from reachjax.proofs.certificates import AbstractCertificate
-from reachjax.proofs.proposal import Solution
+from reachjax.proofs.proposal import Proposal
 from reachjax.proofs.reported import judged_offsets
 
 
@@ -22,25 +21,6 @@ class Certificate(AbstractCertificate):
     """
 
     solver_offsets: Float[Array | np.ndarray, " f"]
-
-    @classmethod
-    def from_solution(
-        cls, program: Program, bounds: Float[Array, " f"], solution: Solution
-    ) -> Certificate:
-        """What was proved with what a solver proposed; witnesses are not known yet (NaN)."""
-        facets = len(solution.offsets)
-        T = program.transform
-        return cls(
-            program=program,
-            multipliers=solution.multipliers,
-            moments=T @ solution.moments @ T.T,
-            codes=solution.statuses,
-            solver_offsets=solution.offsets,
-            bounds=bounds,
-            witnesses=np.full(facets, np.nan),
-            witness_states=np.full((facets, 0), np.nan),
-            seconds=solution.seconds,
-        )
 
     def __repr__(self) -> str:
         return f"Certificate(facets={len(self.bounds)}, products={self.multipliers.shape[-1]})"
@@ -70,8 +50,9 @@ class Certificate(AbstractCertificate):
         program = jax.device_get(self.program)
         back = _left_inverse(np.asarray(program.transform))
         moments = back @ np.asarray(self.moments) @ back.T
-        solution = Solution(self.solver_offsets, proposed, moments, self.codes, self.seconds)
-        return judged_offsets(program, solution).value
+        claims, codes = np.asarray(self.solver_offsets)[:, None], np.asarray(self.codes)
+        proposal = Proposal(claims, proposed, moments, codes, np.asarray(self.seconds))
+        return judged_offsets(program, proposal).value
 
 
 def _left_inverse(T: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "m n"]:

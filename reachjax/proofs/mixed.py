@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,17 +13,6 @@ from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.ellipsoids import EllipsoidCertificate
 from reachjax.proofs.facets import Certificate
 from reachjax.sets import NormalForm
-
-STACKED = (
-    "multipliers",
-    "moments",
-    "codes",
-    "bounds",
-    "witnesses",
-    "witness_states",
-    "seconds",
-)
-"""What both parts have, one row for each semidefinite program; they share the rest, the program."""
 
 
 @pytree
@@ -58,13 +45,10 @@ class MixedCertificate(AbstractCertificate):
         """
         if facets.program.products is not ellipsoid.program.products:
             program, facets, ellipsoid = _with_all_products(program, facets, ellipsoid)
-        stacked: dict[str, Any] = {
-            name: jnp.concatenate([getattr(facets, name), getattr(ellipsoid, name)])
-            for name in STACKED
-        }
+        each = facets.of_programs(), ellipsoid.of_programs()
         return cls(
             program=program,
-            **stacked,
+            **jax.tree.map(lambda *both: jnp.concatenate(both), *each),
             solver_offsets=facets.solver_offsets,
             form=ellipsoid.form,
             level=ellipsoid.level,
@@ -74,17 +58,19 @@ class MixedCertificate(AbstractCertificate):
     def parts(self) -> tuple[Certificate, EllipsoidCertificate]:
         """The proof of the facets, and that of the ellipsoid."""
         m = len(self.solver_offsets)
-        first, second = (
-            {
-                "program": self.program.with_objective(rows),
-                **{name: getattr(self, name)[rows] for name in STACKED},
-            }
-            for rows in (slice(m), slice(m, None))
+        first, second = slice(m), slice(m, None)
+        facets = Certificate(
+            program=self.program.with_objective(first),
+            **self.of_programs(first),
+            solver_offsets=self.solver_offsets,
         )
-        return (
-            Certificate(**first, solver_offsets=self.solver_offsets),
-            EllipsoidCertificate(**second, form=self.form, level=self.level),
+        ellipsoid = EllipsoidCertificate(
+            program=self.program.with_objective(second),
+            **self.of_programs(second),
+            form=self.form,
+            level=self.level,
         )
+        return facets, ellipsoid
 
     def __repr__(self) -> str:
         facets, products = len(self.solver_offsets), self.multipliers.shape[-1]

@@ -1,8 +1,8 @@
-"""What a solver gives back: how it ended, and a proposal for facets or for an ellipsoid.
+"""What a solver gives back: how it ended, and a proposal.
 
 Bounds that no semidefinite program is solved for end in other ways, and say so too.
 
-Whatever the status, a solution is only a proposal: bounds come from `recheck`. A solver that fails
+Whatever the status, it is only a proposal: bounds come from `recheck`. A solver that fails
 proposes zero multipliers, which prove the interval bound and no more.
 """
 
@@ -12,10 +12,10 @@ import enum
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from reachjax.programs.lmi import Program
-from reachjax.sets import NormalForm
+from reachjax.programs.pencils import AbstractInequality
 
 
 class SolverStatus(enum.IntEnum):
@@ -53,6 +53,9 @@ AS_ASKED = (SolverStatus.SOLVED, SolverStatus.AFFINE_FORM)
 ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
 """The ends after which there is a proposal."""
 
+CLAIMING = (*ANSWERS, SolverStatus.LIMIT)
+"""The ends after which there should be multipliers."""
+
 _ADVICE = {
     SolverStatus.SOLVED: "solved to the tolerance asked for",
     SolverStatus.INACCURATE: "the tolerance was not reached: the bound is sound, perhaps loose; "
@@ -82,68 +85,33 @@ _ADVICE = {
 }
 
 
-class Solution(NamedTuple):
-    """What a solver proposes for the facets of one program; arrays only.
+class Proposal(NamedTuple):
+    """What a solver proposes for the programs of a goal; arrays only, numpy's on the host.
 
     Attributes:
-        offsets: `(f,)`, its own optimal values, NaN where it has none. Not bounds.
+        unknowns: `(f, u)`, what is sought as the solver has it (the offset of each facet; the form
+            of an ellipsoid, or the factor on a given one), NaN where it has none. Not bounds.
         multipliers: `(f, K)`, zero where it has none.
-        moments: `(f, n, n)`, the dual matrices over the scaled basis with corner 1, NaN where
-            it has none.
+        moments: `(f, N, N)`, dual matrices of the goal's matrix over the scaled basis with corner
+            1, NaN where it has none.
         statuses: `(f,)`, values of `SolverStatus`.
-        seconds: `(f,)`, wall time of each facet.
+        seconds: `(f,)`, wall time of each program.
     """
 
-    offsets: Float[Array | np.ndarray, " f"]
-    multipliers: Float[Array | np.ndarray, "f K"]
-    moments: Float[Array | np.ndarray, "f n n"]
-    statuses: Int[Array | np.ndarray, " f"]
-    seconds: Float[Array | np.ndarray, " f"]
+    unknowns: Float[np.ndarray, "f u"]
+    multipliers: Float[np.ndarray, "f K"]
+    moments: Float[np.ndarray, "f N N"]
+    statuses: Int[np.ndarray, " f"]
+    seconds: Float[np.ndarray, " f"]
 
     @classmethod
-    def blank(cls, facets: int, multipliers: int, size: int) -> Solution:
-        """No proposal yet: zero multipliers, everything else missing."""
+    def blank(cls, program: Program, goal: AbstractInequality) -> Proposal:
+        """No proposal yet for a goal: zero multipliers, everything else missing."""
+        programs, unknowns, size = goal.shape(program)
         return cls(
-            offsets=np.full(facets, np.nan),
-            multipliers=np.zeros((facets, multipliers)),
-            moments=np.full((facets, size, size), np.nan),
-            statuses=np.full(facets, int(SolverStatus.FAILED)),
-            seconds=np.zeros(facets),
-        )
-
-    @classmethod
-    def blank_for(cls, program: Program) -> Solution:
-        """No proposal yet for the facets of a program."""
-        facets, size = program.objective.mid.shape
-        return cls.blank(facets, len(program.products.free), size)
-
-
-class Enclosure(NamedTuple):
-    """What a solver proposes for an ellipsoid around the successors; arrays only.
-
-    Attributes:
-        form: `A (q, q)` and `b (q,)`: it proposes `|A x + b| <= 1`; NaN where it has none.
-        multipliers: `(K,)`, zero where it has none.
-        moments: `(n + q, n + q)`, the dual matrix of the Schur complement over the scaled basis,
-            NaN where it has none.
-        status: a value of `SolverStatus`.
-        seconds: wall time.
-    """
-
-    form: NormalForm
-    multipliers: Float[Array | np.ndarray, " K"]
-    moments: Float[Array | np.ndarray, "n+q n+q"]
-    status: Int[Array | np.ndarray, ""]
-    seconds: Float[Array | np.ndarray, ""]
-
-    @classmethod
-    def blank(cls, program: Program) -> Enclosure:
-        """No proposal yet: zero multipliers, everything else missing."""
-        q, n = program.objective.mid.shape
-        return cls(
-            form=NormalForm(np.full((q, q), np.nan), np.full(q, np.nan)),
-            multipliers=np.zeros(program.products.free.shape[0]),
-            moments=np.full((n + q, n + q), np.nan),
-            status=np.array(int(SolverStatus.FAILED)),
-            seconds=np.array(0.0),
+            unknowns=np.full((programs, unknowns), np.nan),
+            multipliers=np.zeros((programs, len(program.products.free))),
+            moments=np.full((programs, size, size), np.nan),
+            statuses=np.full(programs, int(SolverStatus.FAILED)),
+            seconds=np.zeros(programs),
         )

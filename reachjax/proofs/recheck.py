@@ -17,7 +17,10 @@ Everything here is numpy on the host.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
+from jaxtyping import Float
 from scipy.optimize import root_scalar
 
 from reachjax.numerics.rounding import UNIT, Ball, gamma
@@ -25,7 +28,9 @@ from reachjax.programs.lmi import Program, form_rows, weighted_products
 from reachjax.sets import NormalForm
 
 
-def sound_offsets(program: Program, multipliers: np.ndarray) -> np.ndarray:
+def sound_offsets(
+    program: Program, multipliers: Float[np.ndarray, "f K"]
+) -> Float[np.ndarray, " f"]:
     """The smallest offset `(f,)` that each facet's multipliers `(f, K)` are shown to prove.
 
     Signed multipliers that are negative are taken as zero.
@@ -33,28 +38,9 @@ def sound_offsets(program: Program, multipliers: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: the multipliers have another shape, or contain NaN or infinity.
     """
-    facets, count = program.objective.mid.shape[0], program.products.free.shape[0]
-    multipliers = np.asarray(multipliers, dtype=float)
-    if multipliers.shape != (facets, count):
-        raise ValueError(
-            f"multipliers must have shape {(facets, count)} (facets, products), "
-            f"but {multipliers.shape} arrived"
-        )
-    broken = ~np.isfinite(multipliers).all(axis=1)
-    if broken.any():
-        raise ValueError(
-            f"multipliers of facet {int(np.argmax(broken))} contain NaN or infinity: "
-            "they prove nothing"
-        )
-    p = program.objective
-    with np.errstate(over="ignore", invalid="ignore"):  # overflow ends in the interval bound
-        by_intervals = interval_offsets(program)
-        return np.array(
-            [
-                _proved(program, multipliers[i], bordered(p.mid[i], p.rad[i]), by_intervals[i])
-                for i in range(facets)
-            ]
-        )
+    rows = zip(program.objective.mid, program.objective.rad, strict=True)
+    goals = (bordered(mid, rad) for mid, rad in rows)
+    return _proved_of_each(program, multipliers, goals, interval_offsets(program))
 
 
 def interval_offsets(program: Program) -> np.ndarray:
@@ -65,8 +51,8 @@ def interval_offsets(program: Program) -> np.ndarray:
     return p.mid[:, -1] + size + 2 * rounding
 
 
-def sound_level(program: Program, multipliers: np.ndarray, form: NormalForm) -> float:
-    """A number that `|A x+ + b|` surely never exceeds, from any multipliers `(K,)`.
+def sound_level(program: Program, multipliers: Float[np.ndarray, "1 K"], form: NormalForm) -> float:
+    """A number that `|A x+ + b|` surely never exceeds, from any multipliers `(1, K)`.
 
     Signed multipliers that are negative are taken as zero. Without good ones it is the root of the
     sum of the squares of `A x+ + b` by intervals.
@@ -74,18 +60,12 @@ def sound_level(program: Program, multipliers: np.ndarray, form: NormalForm) -> 
     Raises:
         ValueError: the multipliers have another shape, or contain NaN or infinity.
     """
-    shape = program.products.free.shape
-    multipliers = np.asarray(multipliers, dtype=float)
-    if multipliers.shape != shape or not np.isfinite(multipliers).all():
-        raise ValueError(
-            f"multipliers must be finite and have shape {shape} (products,), "
-            f"but {multipliers.shape} arrived, {np.isfinite(multipliers).sum()} of them finite"
-        )
     with np.errstate(over="ignore", invalid="ignore"):
         V = form_rows(program, form)
-        by_intervals = half_square_by_intervals(V)
-        half = _proved(program, multipliers, squared(V), by_intervals)
-    return float(np.sqrt(max(2 * np.fmin(half, by_intervals), 0.0)) * (1 + gamma(4)))
+        by_intervals = np.array([half_square_by_intervals(V)])
+        half = _proved_of_each(program, multipliers, [squared(V)], by_intervals)
+    half = float(np.fmin(half, by_intervals)[0])
+    return float(np.sqrt(max(2 * half, 0.0)) * (1 + gamma(4)))
 
 
 def half_square_by_intervals(V: Ball) -> float:
@@ -100,6 +80,31 @@ def squared(V: Ball) -> Ball:
     size, squares = abs(V.mid), V.mid.T @ V.mid
     error = gamma(len(V.mid) + 4) * (size.T @ size) + V.rad.T @ (size + V.rad) + size.T @ V.rad
     return Ball(squares, error * (1 + gamma(8)))
+
+
+def _proved_of_each(
+    program: Program,
+    multipliers: np.ndarray,
+    goals: Iterable[Ball],
+    by_intervals: Float[np.ndarray, " f"],
+) -> Float[np.ndarray, " f"]:
+    """What multipliers, checked first, are shown to prove of each goal's matrix."""
+    shape = len(by_intervals), len(program.products.free)
+    multipliers = np.asarray(multipliers, dtype=float)
+    if multipliers.shape != shape:
+        raise ValueError(
+            f"multipliers must have shape {shape} (programs, products), but {multipliers.shape} "
+            "arrived"
+        )
+    broken = ~np.isfinite(multipliers).all(axis=1)
+    if broken.any():
+        raise ValueError(
+            f"multipliers of program {int(np.argmax(broken))} contain NaN or infinity: "
+            "they prove nothing"
+        )
+    each = zip(multipliers, goals, by_intervals, strict=True)
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow ends in the interval bound
+        return np.array([_proved(program, *given) for given in each])
 
 
 def _proved(program: Program, multipliers: np.ndarray, goal: Ball, by_intervals: float) -> float:

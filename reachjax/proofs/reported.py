@@ -1,4 +1,10 @@
-"""Which bounds are reported: what the recheck proves, in the light of what the solver claims."""
+"""Which bounds are reported: what the recheck proves, in the light of what the solver claims.
+
+The recheck knows that the basis is bounded, so it may prove less than the program's optimal value.
+Where the solver has that value, the bound stays there: it means what the relaxation's name says. A
+claim is that value if the multipliers prove it and the moments, which attain it, show that the
+relaxation allows no less. Elsewhere the bound is what is proved, by multipliers or by intervals.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +16,8 @@ from jaxtyping import Array, Bool, Float
 from reachjax.numerics.rounding import gamma
 from reachjax.programs.lmi import Program, form_rows
 from reachjax.programs.presolve import LEAST_WIDTH, NormalProgram, presolved
-from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution
-from reachjax.proofs.recheck import clipped, interval_offsets, sound_level, sound_offsets
-from reachjax.proofs.slopes import Held, held_offsets
+from reachjax.proofs.proposal import ANSWERS, Proposal
+from reachjax.proofs.recheck import interval_offsets, sound_level, sound_offsets
 from reachjax.sets import NormalForm
 
 SHORTFALL = 1e-3
@@ -29,139 +34,171 @@ class Judged(NamedTuple):
     Attributes:
         value: what is proved: the offsets `(f,)`, or an ellipsoid.
         optimal: whether it is the relaxation's optimum, of each facet or of the ellipsoid.
-        held: what its derivative rests on.
+        held: what else its derivative rests on.
         proposal: what the solver proposed.
     """
 
     value: Any
     optimal: Bool[Array | np.ndarray, "*f"]
     held: Any
-    proposal: Any
+    proposal: Proposal
 
 
-def judged_offsets(program: Program, solution: Solution) -> Judged:
-    """The rechecked offsets, never below what the relaxation itself gives, and their derivative.
+class Sized(NamedTuple):
+    """The ellipsoid `|A x + b| <= level`, of which `A` and `b` are the form's times the factor."""
 
-    The recheck knows that the basis is bounded, so it may prove less than the program's optimal
-    value. Where the solver has that value, the offset stays there: it means what the relaxation's
-    name says. A claim is that value if the multipliers prove it and the moments attain it.
-    Elsewhere the offset is what is proved, by multipliers or by intervals.
+    form: NormalForm
+    level: Float[Array | np.ndarray, ""]
+    factor: Float[Array | np.ndarray, ""] = np.array(1.0)
+
+    @property
+    def scaled(self) -> NormalForm:
+        """`A` and `b`."""
+        return NormalForm(self.factor * self.form.A, self.factor * self.form.b)
+
+    @property
+    def log_volume(self) -> float:
+        """The logarithm of the volume, but for that of the unit ball; infinite without a level."""
+        if not np.isfinite(self.level):
+            return np.inf
+        A, b = self.scaled
+        return float(len(b) * np.log(max(self.level, 1e-300)) - np.linalg.slogdet(A)[1])
+
+
+def judged_offsets(program: Program, proposal: Proposal) -> Judged:
+    """The rechecked offsets, never below what the relaxation itself gives.
 
     The derivative is the program's where multipliers and moments bear the claim out, whatever the
-    solver calls it. Elsewhere it is that of what is proved, multipliers being held (`slopes`).
+    solver calls it: that is what is held. Elsewhere it is that of what is proved (`slopes`).
 
     Args:
         program: of finite numbers.
-        solution: of finite multipliers.
+        proposal: of finite multipliers.
     """
     by_intervals = interval_offsets(program)
-    multipliers = np.asarray(solution.multipliers)
-    by_multipliers = sound_offsets(program, multipliers)
-    offsets = np.fmin(by_multipliers, by_intervals)
-    claims = np.asarray(solution.offsets)
+    multipliers = np.asarray(proposal.multipliers)
+    offsets = np.fmin(sound_offsets(program, multipliers), by_intervals)
+    claims = np.asarray(proposal.unknowns)[:, 0]
     size = by_intervals - np.asarray(program.objective.mid)[:, -1]
     slack = SHORTFALL * size + ROUNDING * (abs(by_intervals) + size)
     proved = offsets <= claims + slack  # False where the claim is NaN
-    borne_out = proved & np.isfinite(claims) & (_attained(program, solution) >= claims - slack)
-    optimal = np.isin(solution.statuses, ANSWERS) & borne_out
-    slope, moments = clipped(program, multipliers), np.array(solution.moments)
-    held, used = np.flatnonzero(~borne_out), by_multipliers < by_intervals
-    slope[held], moments[held] = held_offsets(
-        program.with_objective(held), multipliers[held], used[held]
+    borne_out = proved & np.isfinite(claims) & (_attained(program, proposal) >= claims - slack)
+    optimal = np.isin(proposal.statuses, ANSWERS) & borne_out
+    return Judged(
+        np.where(optimal, np.fmax(offsets, claims), offsets), optimal, borne_out, proposal
     )
-    value = np.where(optimal, np.fmax(offsets, claims), offsets)
-    return Judged(value, optimal, Held(slope, moments), solution)
 
 
-def _attained(program: Program, solution: Solution) -> Float[np.ndarray, " f"]:
+def _attained(program: Program, proposal: Proposal) -> Float[np.ndarray, " f"]:
     """The values of the moment matrices, `-inf` for those that the program does not allow.
 
     The optimal value is no smaller (weak duality), but for what they miss their constraints by.
     """
     values = np.full(len(program.objective.mid), -np.inf)
-    if not np.isfinite(np.asarray(solution.moments)).any():  # as of a program that was cut
+    if not np.isfinite(np.asarray(proposal.moments)).any():  # as of a program that was cut
         return values
-    reduced = presolved(program)
-    for i, whole in enumerate(np.asarray(solution.moments)):
-        X = whole[np.ix_(reduced.columns, reduced.columns)]
-        if not np.isfinite(X).all() or abs(X[-1, -1] - 1) > SHORTFALL:
-            continue
-        if _missed(reduced, X) <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL:
-            values[i] = reduced.centers[i] + reduced.units[i] * (reduced.objective[i] @ X[:, -1])
+    normal = presolved(program)
+    for i, whole in enumerate(np.asarray(proposal.moments)):
+        if _allowed(normal, whole):
+            column = whole[normal.columns, -1]
+            values[i] = normal.centers[i] + normal.units[i] * (normal.objective[i] @ column)
     return values
 
 
-def _missed(reduced: NormalProgram, moments: np.ndarray) -> float:
-    """By how much moments over the columns kept miss the sign of a product."""
-    products = reduced.generators.paired(moments)
-    return float(np.where(reduced.free, abs(products), -products).max(initial=0.0))
+def _allowed(normal: NormalProgram, moments: Float[np.ndarray, "N N"]) -> bool:
+    """Whether moments have corner one, are semidefinite and give no product the wrong sign."""
+    n = normal.whole[1]
+    used = np.r_[normal.columns, np.arange(n, len(moments))]
+    X = moments[np.ix_(used, used)]
+    if not (np.isfinite(X).all() and abs(moments[n - 1, n - 1] - 1) <= SHORTFALL):
+        return False
+    own = slice(len(normal.columns))
+    products = normal.generators.paired(X[own, own])
+    missed = float(np.where(normal.free, abs(products), -products).max(initial=0.0))
+    return missed <= SHORTFALL and np.linalg.eigvalsh(X)[0] >= -SHORTFALL
 
 
-def judged_form(
-    program: Program,
-    enclosure: Enclosure,
-    given: NormalForm | None = None,
-    centred: bool = False,
-) -> tuple[NormalForm, np.ndarray, np.ndarray]:
-    """The ellipsoid `|A x+ + b| <= level` to report, its level being what is proved.
+def judged_least(
+    program: Program, proposal: Proposal, form: NormalForm, centred: bool = False
+) -> tuple[Sized, bool]:
+    """The ellipsoid around the successors to report, its level being what is proved.
 
     It counts as the relaxation's optimum if it is on the central path, or if the solver answers and
-    what is proved is as large as what it proposes, or less where the moments of a given shape show
-    that the relaxation allows no less; the level is then 1 at least. Where the solver proposes
-    nothing of use, the ellipsoid is `given`, or that around the box of successors.
+    what is proved is as large as what it proposes; the level is then 1 at least. Where the solver
+    proposes nothing of use, it is the ellipsoid around the box of successors.
+
+    Args:
+        program: of finite numbers.
+        proposal: of finite multipliers.
+        form: what it proposes: `|A x+ + b| <= 1`.
+        centred: whether that is on the central path.
 
     Returns:
-        The form, the level, and whether it is the relaxation's optimum.
+        The ellipsoid, and whether it is the relaxation's optimum.
     """
-    multipliers = np.asarray(enclosure.multipliers)
-    form, level = enclosure.form, np.inf
-    if _invertible(form):
-        level = sound_level(program, multipliers, form)
-    optimal = False
-    if level <= 1 + SHORTFALL:
-        answered = int(enclosure.status) in ANSWERS
-        dual = given is not None and largest_factor(program, enclosure) <= 1 + SHORTFALL
-        optimal = centred or (answered and (level >= 1 - SHORTFALL or dual))
-    if optimal:
-        level = max(1.0, level)
-    else:
-        other = _interval_form(program) if given is None else given
-        least = LEAST_WIDTH * float(np.linalg.norm(other.A, 2))
-        proved = max(sound_level(program, multipliers, other), least)
-        if not log_volume(form, level) <= log_volume(other, proved):
-            form, level = other, proved
-    return form, np.array(level), np.array(optimal)
+    level = _level(program, proposal, form)
+    answered = int(proposal.statuses[0]) in ANSWERS
+    if level <= 1 + SHORTFALL and (centred or (answered and level >= 1 - SHORTFALL)):
+        return Sized(form, np.array(max(1.0, level))), True
+    around = _interval_form(program)
+    return _smaller(program, proposal, Sized(form, np.array(level)), around), False
 
 
-def largest_factor(program: Program, enclosure: Enclosure) -> float:
-    """What no factor on the proposed `A` and `b` exceeds; infinite if nothing is shown.
+def judged_shape(program: Program, proposal: Proposal, given: NormalForm) -> tuple[Sized, bool]:
+    """The ellipsoid of a given form to report, its level being what is proved.
+
+    It counts as the relaxation's optimum if the solver answers, and multipliers and moments bear
+    out the factor that it proposes; the level is then 1 at least.
+
+    Args:
+        program: of finite numbers.
+        proposal: of finite multipliers, and the factor on the form.
+        given: the form.
+
+    Returns:
+        The ellipsoid, and whether it is the relaxation's optimum.
+    """
+    proposed = Sized(given, np.array(np.inf), np.asarray(proposal.unknowns)[0, 0])
+    level = _level(program, proposal, proposed.scaled)
+    answered = int(proposal.statuses[0]) in ANSWERS
+    if answered and level <= 1 + SHORTFALL and _most(program, proposal, proposed) <= 1 + SHORTFALL:
+        return proposed._replace(level=np.array(max(1.0, level))), True
+    return _smaller(program, proposal, proposed._replace(level=np.array(level)), given), False
+
+
+def _most(program: Program, proposal: Proposal, proposed: Sized) -> float:
+    """What no further factor on the proposed `A` and `b` exceeds; infinite if nothing is shown.
 
     With `X` positive semidefinite and `<X, G_k>` of the right signs, `[e e' - G, f V'; f V, I]` is
     semidefinite for no `f` beyond `(X_nn + trace X_22) / (-2 <X_21, V>)` (weak duality).
     """
-    n, X = len(program.transform), np.asarray(enclosure.moments)
-    if not np.isfinite(X).all() or X[n - 1, n - 1] <= 0:
+    n, X = len(program.transform), np.asarray(proposal.moments)[0]
+    if not _allowed(presolved(program), X):
         return np.inf
-    X, reduced = X / X[n - 1, n - 1], presolved(program)
-    missed = _missed(reduced, X[np.ix_(reduced.columns, reduced.columns)])
-    if max(missed, -np.linalg.eigvalsh((X + X.T) / 2)[0]) > SHORTFALL:
-        return np.inf
-    slope = -2 * np.sum(X[n:, :n] * form_rows(program, enclosure.form).mid)
-    return (1 + np.trace(X[n:, n:])) / slope if slope > 0 else np.inf
+    slope = -2 * np.sum(X[n:, :n] * form_rows(program, proposed.scaled).mid)
+    return (X[n - 1, n - 1] + np.trace(X[n:, n:])) / slope if slope > 0 else np.inf
 
 
-def log_volume(form: NormalForm, level: float | np.ndarray) -> float:
-    """The logarithm of the volume of `|A x + b| <= level`, but for that of the unit ball."""
-    if not np.isfinite(level):
+def _level(program: Program, proposal: Proposal, form: NormalForm) -> float:
+    """What is proved of a form; infinite if it is no ellipsoid."""
+    if not _invertible(form):
         return np.inf
-    return float(len(form.b) * np.log(max(level, 1e-300)) - np.linalg.slogdet(form.A)[1])
+    return sound_level(program, np.asarray(proposal.multipliers), form)
+
+
+def _smaller(program: Program, proposal: Proposal, one: Sized, form: NormalForm) -> Sized:
+    """The ellipsoid itself, or one of another form with what is proved of it."""
+    least = LEAST_WIDTH * float(np.linalg.norm(form.A, 2))
+    level = max(sound_level(program, np.asarray(proposal.multipliers), form), least)
+    other = Sized(form, np.array(level))
+    return one if one.log_volume <= other.log_volume else other
 
 
 def _interval_form(program: Program) -> NormalForm:
     """The ellipsoid around the interval bounds of the successor, never quite flat."""
-    reduced = presolved(program)
-    A = np.diag(1 / (np.sqrt(len(reduced.widths)) * reduced.widths))
-    return NormalForm(A, -A @ reduced.centers)
+    normal = presolved(program)
+    A = np.diag(1 / (np.sqrt(len(normal.widths)) * normal.widths))
+    return NormalForm(A, -A @ normal.centers)
 
 
 def _invertible(form: NormalForm) -> bool:

@@ -34,15 +34,15 @@ from reachjax.sets import NormalForm
 
 
 class Held(NamedTuple):
-    """What the derivative of bounds rests on: that of the Lagrangian, these being held.
+    """What the derivative of bounds rests on: that of `<X, Z>` (`lmi`), these being held.
 
     Attributes:
-        multipliers: `(f, K)` of offsets; `(K,)` of a level.
-        moments: `(f, n, n)` of offsets; `(n + q, n + q)` of a level.
+        multipliers: `(f, K)`.
+        moments: `(f, N, N)`.
     """
 
-    multipliers: Float[Array | np.ndarray, "*f K"]
-    moments: Float[Array | np.ndarray, "*f n n"]
+    multipliers: Float[Array | np.ndarray, "f K"]
+    moments: Float[Array | np.ndarray, "f N N"]
 
 
 def held_offsets(
@@ -50,7 +50,7 @@ def held_offsets(
     multipliers: Float[np.ndarray, "f K"],
     by_multipliers: Bool[np.ndarray, " f"],
 ) -> Held:
-    """Multipliers `(f, K)` and moments `(f, n, n)` of `lmi.lagrangian_slopes` for each offset.
+    """Multipliers and moments of the bound of each offset.
 
     Args:
         program: of finite numbers.
@@ -68,26 +68,26 @@ def held_offsets(
     return Held(np.where(by_multipliers[:, None], clipped(program, multipliers), 0.0), moments)
 
 
-def held_level(program: Program, multipliers: Float[np.ndarray, " K"], form: NormalForm) -> Held:
-    """Multipliers `(K,)` and moments `(n + q, n + q)` of `lmi.schur_slopes` for a level.
+def held_level(program: Program, multipliers: Float[np.ndarray, "1 K"], form: NormalForm) -> Held:
+    """Multipliers and moments of the bound of a level, by multipliers or by intervals.
 
     The level `s` is `sound_level`'s; with `V = A x+ + b`, `s ds = <X / 2, d(F' Gamma F + V' V)>`.
     Zero where the level is.
     """
     V = form_rows(program, form)
     q, n = V.mid.shape
-    moments, held = np.zeros((n + q, n + q)), np.zeros(len(multipliers))
+    moments, held = np.zeros((1, n + q, n + q)), np.zeros_like(multipliers)
     level = sound_level(program, multipliers, form)
     if not 0 < level < np.inf:
         return Held(held, moments)
     if level**2 / 2 < half_square_by_intervals(V):
-        X = _moments(program, multipliers, squared(V))
+        X = _moments(program, multipliers[0], squared(V))
         held, rows = clipped(program, multipliers) / level, V.mid @ X / level
-        moments[:n, :n] = -X / 2
+        moments[0, :n, :n] = -X / 2
     else:
         signs = np.sign(V.mid)
         rows = signs * abs(V.mid).sum(axis=1, keepdims=True) / level
-    moments[n:, :n] = rows / 2
+    moments[0, n:, :n] = rows / 2
     return Held(held, moments)
 
 

@@ -3,11 +3,12 @@
 from reachjax.solvers.auto import Auto
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.clarabel import Clarabel
-from reachjax.solvers.cvxpy_solvers import SCS, CvxpySolver
-from reachjax.solvers.ellipsoids import GivenShape, LeastVolume
+from reachjax.solvers.conic import SCS, CvxpySolver
+from reachjax.solvers.ellipsoids import GivenShape
 from reachjax.solvers.facets import Facets
 from reachjax.solvers.goals import AbstractGoal, proved
 from reachjax.solvers.interior_point import InteriorPoint
+from reachjax.solvers.least_volume import LeastVolume
 from reachjax.solvers.rounds import Rounds
 
 __all__ = [

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
+
 from reachjax.numerics.budget import clock
 from reachjax.numerics.checks import whole_number
 from reachjax.programs.lmi import Program
-from reachjax.programs.presolve import presolved
-from reachjax.proofs.proposal import ANSWERS, Enclosure, Solution, SolverStatus
-from reachjax.sets import NormalForm
+from reachjax.programs.pencils import AbstractInequality
+from reachjax.proofs.proposal import ANSWERS, Proposal, SolverStatus
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.clarabel import Clarabel
-from reachjax.solvers.faults import proposed_enclosure
+from reachjax.solvers.faults import proposed
 from reachjax.solvers.interior_point import InteriorPoint
 
 
@@ -62,26 +63,24 @@ class Auto(AbstractSolver):
         size, count = len(program.transform), len(program.products.free)
         return self.large if size > self.limit and _is_lean(count, size) else self.small
 
-    def solve(self, program: Program) -> Solution:
-        """Propose multipliers for every facet."""
-        return self.choice(program).solve(program)
+    def solve(self, program: Program, goal: AbstractInequality) -> Proposal:
+        """Propose multipliers, and what is sought, for every program of a goal.
 
-    def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
-        """Propose the smallest ellipsoid around the successors, and its multipliers.
-
-        What counts here is the program without what is unused. Where the one that is chosen fails,
-        the other is asked.
+        For ellipsoids the program counts without what is unused, and where the one that is chosen
+        fails, the other is asked.
         """
-        reduced = presolved(program)
-        if _is_lean(len(reduced.kept), len(reduced.columns) + len(program.objective.mid)):
+        if not goal.logarithmic:
+            return self.choice(program).solve(program, goal)
+        pencil = goal.pencil(program)
+        if _is_lean(pencil.multipliers, pencil.size):
             first, second, enough = self.large, self.small, (SolverStatus.SOLVED,)
         else:  # an inaccurate ellipsoid is centred anyhow
             first, second, enough = self.small, self.large, ANSWERS
-        found = proposed_enclosure(first, program, form)
-        if found.status in enough or clock().late:
+        found = proposed(first, program, goal)
+        if np.isin(found.statuses, enough).all() or clock().late:
             return found
-        other = proposed_enclosure(second, program, form)
-        return other if other.status in ANSWERS else found
+        other = proposed(second, program, goal)
+        return other if np.isin(other.statuses, ANSWERS).all() else found
 
 
 def _is_lean(multipliers: int, size: int) -> bool:

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import os
-import time
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -16,12 +13,10 @@ from jaxtyping import Float
 
 from reachjax.numerics.budget import MOST_BYTES, clock, require_memory
 from reachjax.programs.lmi import Program
-from reachjax.programs.presolve import NormalProgram, presolved
-from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
-from reachjax.sets import NormalForm
-from reachjax.solvers.base import require_positive
-from reachjax.solvers.conic import RESCALINGS, STALLED, AbstractConicSolver
-from reachjax.solvers.models import unit_generators
+from reachjax.programs.pencils import AbstractInequality, Pencil
+from reachjax.proofs.proposal import CLAIMING, Proposal, SolverStatus
+from reachjax.solvers.base import RESCALINGS, Found, proposed_by, require_positive
+from reachjax.solvers.conic import LEAST, AbstractConicSolver, require_panic, unit_columns
 
 STATUSES = {
     "Solved": SolverStatus.SOLVED,
@@ -36,17 +31,12 @@ STATUSES = {
 }
 """Clarabel's words for how it ended; any other is a failure."""
 
-LEAST = 1e-3
-"""Seconds: Clarabel takes no limit of zero."""
-
-ANSWERS = SolverStatus.SOLVED, SolverStatus.INACCURATE, SolverStatus.LIMIT
-
 
 @dataclasses.dataclass(frozen=True)
 class Clarabel(AbstractConicSolver):
     """The interior-point code Clarabel, which `Auto` takes for small programs.
 
-    Facets go to it directly, ellipsoids by cvxpy.
+    Offsets and sizes go to it directly, ellipsoids of least volume by cvxpy.
 
     Args:
         tolerance: of feasibility and of the gap, relative and absolute.
@@ -81,60 +71,26 @@ class Clarabel(AbstractConicSolver):
             "chordal_decomposition_enable": False,
         }
 
-    def solve(self, program: Program) -> Solution:
-        """Propose multipliers for every facet, on as many threads as there are cores and memory.
+    def solve(self, program: Program, goal: AbstractInequality) -> Proposal:
+        """Propose multipliers and offsets or factors, on as many threads as there are cores and
+        memory; ellipsoids of least volume by cvxpy.
 
         Raises:
-            MemoryError: one facet would take too much of it.
+            MemoryError: one program would take too much of it.
             TimeOverError: the time in force would be over before the first iterate.
         """
-        reduced, solution = presolved(program), Solution.blank_for(program)
-        taken = _require_memory(reduced.objective.shape[1])
-        budget = clock()  # of this thread; others have none
-        cone = FacetCone(reduced, self._options)
+        pencil = goal.pencil(program)
+        taken = _require_memory(pencil.size)
+        if len(pencil.sizes) > 1:
+            return super().solve(program, goal)
+        cone = Cone(pencil, self._options)
 
-        def solve(i: int) -> None:
-            began, factor, found = time.perf_counter(), 1.0, None
-            solution.statuses[i] = SolverStatus.LIMIT
-            for factor in RESCALINGS:
-                if budget.late:
-                    break
-                solution.statuses[i], found = cone.solved(factor * reduced.objective[i])
-                if solution.statuses[i] not in STALLED:
-                    break
-            solution.seconds[i] = time.perf_counter() - began
-            if found is None:
-                return
-            offset, multipliers, moment = found
-            unit = reduced.units[i] / factor
-            solution.offsets[i] = reduced.centers[i] + unit * offset
-            solution.multipliers[i, reduced.kept] = unit * multipliers / reduced.norms
-            if moment[-1, -1] > 0:
-                solution.moments[i] = 0.0
-                used = np.ix_(reduced.columns, reduced.columns)
-                solution.moments[i][used] = moment / moment[-1, -1]
+        def attempt(i: int, scale: float) -> tuple[SolverStatus, Found | None]:
+            return cone.solved(scale * pencil.constant(i))
 
-        facets, threads = range(len(reduced.objective)), int(MOST_BYTES // max(8 * taken, 1))
-        if len(facets) > 1:
-            pool = ThreadPoolExecutor(min(os.cpu_count() or 1, threads))
-            try:
-                list(pool.map(solve, facets))
-            finally:  # nobody waits for them after Ctrl-C
-                pool.shutdown(wait=False, cancel_futures=True)
-        else:
-            for i in facets:
-                solve(i)
-        return solution
-
-    def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
-        """Propose the smallest ellipsoid around the successors, and its multipliers.
-
-        Raises:
-            MemoryError: it would take too much memory.
-            TimeOverError: the time in force would be over before the first iterate.
-        """
-        _require_memory(int(program.used.sum()) + len(program.objective.mid))
-        return super().enclose(program, form)
+        threads = int(MOST_BYTES // max(8 * taken, 1))
+        given = attempt, program, goal, pencil
+        return proposed_by(*given, scales=RESCALINGS, threads=threads)
 
 
 def _require_memory(size: int) -> float:
@@ -149,32 +105,33 @@ def _require_memory(size: int) -> float:
     return 2 * entries**2
 
 
-class FacetCone:
-    """`sum_k y_k G_k + p e' + e p' - 2 b e e' <= 0` with the smallest `b`, as Clarabel takes it.
+class Cone:
+    """A pencil of one unknown, as Clarabel takes it.
 
-    The unknowns are `b` and the `y_k`; those that are signed are in the nonnegative orthant, minus
-    the matrix in the semidefinite cone. Only the vector of constants depends on `p`.
+    The multipliers that are signed are in the nonnegative orthant, the matrix in the semidefinite
+    cone. Only the vector of constants differs from program to program.
 
     Args:
-        program: the normal program.
+        pencil: of a goal.
         options: by Clarabel's names.
     """
 
-    def __init__(self, program: NormalProgram, options: Mapping[str, Any]):
+    def __init__(self, pencil: Pencil, options: Mapping[str, Any]):
         self._clarabel: Any = importlib.import_module("clarabel")  # only where it is needed
-        generators, self._sizes = unit_generators(program)
-        n, count = program.objective.shape[1], len(program.kept)
+        unknowns, generators, self._sizes = unit_columns(pencil)
+        n, count = pencil.size, pencil.multipliers
         # Clarabel has upper triangles column by column, their inner products those of matrices
         self._column, self._row = np.tril_indices(n)
         self._weight = np.where(self._row == self._column, 1.0, np.sqrt(2.0))
-        triangle = sp.diags_array(self._weight) @ generators[self._row * n + self._column]
-        corner = sp.csc_array(-2.0 * np.eye(1, len(self._row), len(self._row) - 1).T)
-        signed = np.flatnonzero(~program.free)
+        flat, weight = self._row * n + self._column, sp.diags_array(self._weight)
+        signed = np.flatnonzero(~pencil.normal.free)
         below = sp.csc_array(
             (-np.ones(len(signed)), (np.arange(len(signed)), 1 + signed)),
             shape=(len(signed), 1 + count),
         )
-        self._matrix = sp.csc_array(sp.vstack([below, sp.hstack([corner, triangle])]))
+        beside = sp.hstack([weight @ sp.csc_array(part)[flat] for part in (unknowns, generators)])
+        self._matrix = sp.csc_array(sp.vstack([below, beside]))
+        self._costs = np.r_[-pencil.sizes[:, 0, 0], np.zeros(count)]
         self._signed, self._size = len(signed), n
         self._cones = [self._clarabel.PSDTriangleConeT(n)]
         if len(signed):
@@ -184,21 +141,14 @@ class FacetCone:
         for name, value in options.items():
             setattr(self._settings, name, value)
 
-    def solved(
-        self, row: Float[np.ndarray, " n"]
-    ) -> tuple[SolverStatus, tuple[float, np.ndarray, np.ndarray] | None]:
-        """How the program with this `p` ended; its offset, multipliers and moments if it has any.
-
-        Args:
-            row: without a constant.
-        """
-        unknowns = 1 + len(self._sizes)
+    def solved(self, constant: Float[np.ndarray, "N N"]) -> tuple[SolverStatus, Found | None]:
+        """How the program with this constant ends, and what is found if anything is."""
+        unknowns = len(self._costs)
         constants = np.zeros(self._signed + len(self._row))
-        there = self._column == self._size - 1
-        constants[self._signed :][there] = -(self._weight * row[self._row])[there]
+        constants[self._signed :] = self._weight * constant[self._row, self._column]
         solver = self._clarabel.DefaultSolver(
             sp.csc_array((unknowns, unknowns)),
-            np.eye(1, unknowns)[0],
+            self._costs,
             self._matrix,
             constants,
             self._cones,
@@ -209,14 +159,13 @@ class FacetCone:
         except Exception:
             raise
         except BaseException as error:  # a panic of compiled code is no Exception
-            if isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit):
-                raise
+            require_panic(error)
             return SolverStatus.FAILED, None
         status = STATUSES.get(str(found.status), SolverStatus.FAILED)
         values = np.array(found.x)
-        if status not in ANSWERS or not np.isfinite(values).all():
+        if status not in CLAIMING or not np.isfinite(values).all():
             return status, None
-        moment = np.zeros((self._size, self._size))
-        moment[self._row, self._column] = np.array(found.z)[self._signed :] / self._weight
-        moment[self._column, self._row] = moment[self._row, self._column]
-        return status, (float(values[0]), values[1:] / self._sizes, moment)
+        moments = np.zeros((self._size, self._size))
+        moments[self._row, self._column] = np.array(found.z)[self._signed :] / self._weight
+        moments[self._column, self._row] = moments[self._row, self._column]
+        return status, Found(values[:1], values[1:] / self._sizes, moments)

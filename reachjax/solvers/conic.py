@@ -1,30 +1,26 @@
-"""Semidefinite programs by cvxpy, with a solver that it calls by name."""
+"""Semidefinite programs by cvxpy, with a solver that it calls by name: SCS, and any other."""
 
 from __future__ import annotations
 
 import abc
+import dataclasses
 import threading
-import time
 import warnings
-from collections.abc import Callable
-from functools import cache, wraps
-from typing import Any, ParamSpec, TypeVar
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float
 
 from reachjax.numerics.budget import clock
 from reachjax.programs.lmi import Program
-from reachjax.programs.presolve import presolved
-from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
-from reachjax.sets import NormalForm
-from reachjax.solvers.base import AbstractSolver
+from reachjax.programs.pencils import AbstractInequality, Pencil
+from reachjax.programs.presolve import THINNEST
+from reachjax.proofs.proposal import Proposal, SolverStatus
+from reachjax.solvers.base import RESCALINGS, AbstractSolver, Found, proposed_by, require_positive
 from reachjax.solvers.faults import UnknownOptionError, UnknownSolverError
-from reachjax.solvers.models import EllipsoidModel, FacetModel
-
-RESCALINGS = (1.0, 8.0, 0.125, 64.0, 1.0)
-"""Factors on the objective, tried in turn while a solver stalls: another scale often helps it."""
-
-STALLED = (SolverStatus.INACCURATE, SolverStatus.FAILED)
 
 STATUSES = {
     "optimal": SolverStatus.SOLVED,
@@ -39,21 +35,11 @@ STATUSES = {
 }
 """cvxpy's words for how a solver ended."""
 
+LEAST = 1e-3
+"""Seconds that a solver is given at least: zero is no limit to some, and an error to others."""
+
 ONE_AT_A_TIME = threading.RLock()
 """Threads share cvxpy's count of variables, and the filters of warnings that are set around it."""
-
-
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-def _one_at_a_time(method: Callable[P, T]) -> Callable[P, T]:
-    @wraps(method)
-    def alone(*args: P.args, **kwargs: P.kwargs) -> T:
-        with ONE_AT_A_TIME:
-            return method(*args, **kwargs)
-
-    return alone
 
 
 class AbstractConicSolver(AbstractSolver, abc.ABC):
@@ -63,79 +49,139 @@ class AbstractConicSolver(AbstractSolver, abc.ABC):
     def settings(self) -> tuple[str, dict[str, Any]]:
         """The name cvxpy has for the solver, and the keyword arguments for `Problem.solve`."""
 
-    @_one_at_a_time
-    def solve(self, program: Program) -> Solution:
-        """Propose multipliers for every facet.
+    def solve(self, program: Program, goal: AbstractInequality) -> Proposal:
+        """Propose multipliers, and what is sought, for every program of a goal.
 
         Raises:
             ValueError: cvxpy does not find the solver, or it takes no semidefinite programs.
             TypeError: the solver does not know one of the options.
         """
-        name, options = self.settings()
-        _require_installed(name)
-        reduced = presolved(program)
-        model = FacetModel(reduced)
-        solution = Solution.blank_for(program)
-        for i, (row, center, unit) in enumerate(
-            zip(reduced.objective, reduced.centers, reduced.units, strict=True)
-        ):
-            if clock().late:
-                solution.statuses[i:] = SolverStatus.LIMIT
-                break
-            began = time.perf_counter()
-            factor = 1.0
-            for factor in RESCALINGS:
-                model.objective.value = factor * row
-                solution.statuses[i] = _run(model.problem, name, options)
-                if solution.statuses[i] not in STALLED:
-                    break
-            solution.seconds[i] = time.perf_counter() - began
-            multipliers = model.multipliers.value
-            if model.offset.value is None or multipliers is None:
-                continue
-            solution.offsets[i] = center + unit / factor * float(model.offset.value)
-            solution.multipliers[i, reduced.kept] = unit / factor * multipliers / reduced.norms
-            moment = np.asarray(model.lmi.dual_value, dtype=float)
-            if moment.ndim == 2 and moment[-1, -1] > 0:
-                solution.moments[i] = 0.0
-                used = np.ix_(reduced.columns, reduced.columns)
-                solution.moments[i][used] = moment / moment[-1, -1]
-        return solution
+        with ONE_AT_A_TIME:
+            name, options = self.settings()
+            if name not in _installed():
+                raise UnknownSolverError(
+                    f"the solver {name!r} is not among those that cvxpy finds here: "
+                    f"{', '.join(_installed())}"
+                )
+            pencil = goal.pencil(program)
+            model = Model(pencil)
 
-    @_one_at_a_time
-    def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
-        """Propose the smallest ellipsoid around the successors, and its multipliers.
+            def attempt(i: int, scale: float) -> tuple[SolverStatus, Found | None]:
+                return model.solved(scale * pencil.constant(i), name, options)
 
-        Raises:
-            ValueError: cvxpy does not find the solver, or it takes no such programs.
-            TypeError: the solver does not know one of the options.
-        """
-        name, options = self.settings()
-        _require_installed(name)
-        reduced, proposal = presolved(program), Enclosure.blank(program)
-        began, status = time.perf_counter(), SolverStatus.FAILED
-        scaled = model = None
-        for factor in RESCALINGS[: 1 if form is None else None]:
-            scaled = reduced.with_units(reduced.widths / factor)
-            model = EllipsoidModel(scaled, None if form is None else scaled.to_unit_box(form))
-            status = _run(model.problem, name, options)
-            if status not in STALLED or clock().late:
-                break
-        seconds = time.perf_counter() - began
-        assert model is not None
-        assert scaled is not None
-        found, multipliers = model.form, model.multipliers.value
-        proposal = proposal._replace(status=np.array(int(status)), seconds=np.array(seconds))
-        if found is None or multipliers is None:
-            return proposal
-        proposal.multipliers[reduced.kept] = multipliers / reduced.norms
-        moments = np.asarray(model.lmi.dual_value, dtype=float)
-        if moments.ndim == 2:
-            size, extra = len(program.transform), len(found.b)
-            used = np.r_[reduced.columns, size + np.arange(extra)]
-            proposal.moments[:] = 0.0
-            proposal.moments[np.ix_(used, used)] = moments
-        return proposal._replace(form=scaled.from_unit_box(found))
+            # an ellipsoid has its own scale
+            scales = RESCALINGS[: None if model.is_linear else 1]
+            return proposed_by(attempt, program, goal, pencil, scales=scales)
+
+
+@dataclasses.dataclass(frozen=True)
+class SCS(AbstractConicSolver):
+    """The splitting conic solver: many cheap iterations, few digits.
+
+    Args:
+        tolerance: of feasibility and of the gap, relative and absolute.
+        max_iterations: a facet that needs more is reported with status `LIMIT` or `INACCURATE`.
+    """
+
+    tolerance: float = 1e-7
+    max_iterations: int = 50_000
+
+    def __post_init__(self):
+        require_positive(self)
+
+    def settings(self) -> tuple[str, dict[str, Any]]:
+        """SCS's own names."""
+        return "SCS", {
+            "eps_abs": self.tolerance,
+            "eps_rel": self.tolerance,
+            "max_iters": self.max_iterations,
+        } | ({"time_limit_secs": max(clock().left, LEAST)} if clock().timed else {})
+
+
+@dataclasses.dataclass(frozen=True)
+class CvxpySolver(AbstractConicSolver):
+    """Any other solver that cvxpy knows, by cvxpy's name for it.
+
+    Args:
+        name: such as `cvxpy.MOSEK`.
+        options: keyword arguments of `cvxpy.Problem.solve` for this solver.
+
+    Example:
+        >>> CvxpySolver("SCS", {"eps_abs": 1e-6}).settings()
+        ('SCS', {'eps_abs': 1e-06})
+    """
+
+    name: str
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
+
+    def settings(self) -> tuple[str, dict[str, Any]]:
+        """The settings as given; the names cvxpy has are in capitals."""
+        return self.name.upper(), dict(self.options)
+
+
+def unit_columns(pencil: Pencil) -> tuple[sp.csc_array, sp.csc_array, Float[np.ndarray, " k"]]:
+    """The flattened `-H_j`, `(N * N, u)`, and the `G_k` at unit size and the sizes they had."""
+    columns = sp.csc_array(-pencil.terms.columns())
+    unknowns, generators = columns[:, pencil.multipliers :], columns[:, : pencil.multipliers]
+    sizes = np.sqrt(np.asarray(generators.multiply(generators).sum(axis=0)).ravel())
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    return unknowns, sp.csc_array(generators @ sp.diags_array(1 / sizes)), sizes
+
+
+class Model:
+    """A pencil as cvxpy states it.
+
+    It is built once for all programs of a goal. Only a parameter, the constant, changes from one to
+    the next, so cvxpy's canonicalisation is done once as well (disciplined parametrised
+    programming).
+    """
+
+    def __init__(self, pencil: Pencil):
+        import cvxpy as cp
+
+        unknowns, generators, self._sizes = unit_columns(pencil)
+        self._free: Any = pencil.normal.free
+        free, signed = generators[:, self._free], generators[:, ~self._free]
+        size = pencil.size
+        self._y_free = cp.Variable(free.shape[1]) if free.shape[1] else None
+        self._y_signed = cp.Variable(signed.shape[1], nonneg=True)
+        self._constant = cp.Parameter(size * size)
+        self._sought = cp.Variable(len(pencil.sizes))
+        weighted = signed @ self._y_signed
+        if self._y_free is not None:
+            weighted = weighted + free @ self._y_free
+        matrix = weighted + unknowns @ self._sought - self._constant
+        self._lmi = cp.reshape(matrix, (size, size), order="F") << 0
+        self.is_linear, s = len(pencil.sizes) == 1, pencil.sizes.shape[1]
+        flat = pencil.sizes.reshape(len(pencil.sizes), s * s)
+        constraints: list[Any] = [self._lmi]
+        if self.is_linear:
+            enlarged = flat[:, 0] @ self._sought
+        else:
+            matrix = cp.reshape(flat.T @ self._sought, (s, s), order="F")
+            enlarged = cp.log_det(matrix)
+            constraints.append(matrix << np.eye(s) / THINNEST)
+        self._problem = cp.Problem(cp.Maximize(enlarged), constraints)
+
+    def solved(
+        self, constant: Float[np.ndarray, "N N"], name: str, options: dict[str, Any]
+    ) -> tuple[SolverStatus, Found | None]:
+        """How the program with this constant ends, and what is found if anything is."""
+        self._constant.value = constant.ravel()
+        status = _run(self._problem, name, options)
+        unknowns, signed = self._sought.value, self._y_signed.value
+        if unknowns is None or signed is None:
+            return status, None
+        y = np.zeros(len(self._free))
+        y[~self._free] = signed
+        if self._y_free is not None:
+            y[self._free] = self._y_free.value
+        if not (np.isfinite(y).all() and np.isfinite(unknowns).all()):
+            return status, None
+        moments = np.asarray(self._lmi.dual_value, dtype=float)
+        if moments.ndim != 2:
+            moments = np.full(constant.shape, np.nan)
+        return status, Found(np.asarray(unknowns), y / self._sizes, moments)
 
 
 @cache
@@ -145,16 +191,8 @@ def _installed() -> list[str]:
     return cp.installed_solvers()
 
 
-def _require_installed(name: str) -> None:
-    if name not in _installed():
-        raise UnknownSolverError(
-            f"the solver {name!r} is not among those that cvxpy finds here: "
-            f"{', '.join(_installed())}"
-        )
-
-
 def _run(problem: Any, name: str, options: dict) -> SolverStatus:
-    """Solve; values that an earlier facet left behind are cleared first."""
+    """Solve; values that an earlier program left behind are cleared first."""
     import cvxpy as cp
 
     for variable in problem.variables():
@@ -174,7 +212,12 @@ def _run(problem: Any, name: str, options: dict) -> SolverStatus:
         except Exception:
             raise
         except BaseException as error:  # a panic of compiled code is no Exception
-            if isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit):
-                raise
+            require_panic(error)
             return SolverStatus.FAILED
     return STATUSES.get(problem.status, SolverStatus.FAILED)
+
+
+def require_panic(error: BaseException) -> None:
+    """Raise an error again that is no panic of compiled code, but an interrupt."""
+    if isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit):
+        raise error

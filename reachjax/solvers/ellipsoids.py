@@ -1,100 +1,54 @@
-"""Ellipsoids around the successors: of least volume, or the smallest of a given shape."""
+"""Ellipsoids around the successors: what all goals of this kind share, and the smallest of a given
+shape. That of least volume is in `least_volume`.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+import scipy.sparse as sp
+from jaxtyping import Array, Float
 
-from reachjax.numerics.budget import clock
-from reachjax.numerics.host import all_finite
 from reachjax.numerics.pytrees import pytree
-from reachjax.programs.lmi import Program, Slopes, form_rows, schur_slopes, with_successor
-from reachjax.programs.presolve import presolved
-from reachjax.programs.relaxations import Products
+from reachjax.programs.generators import Generators
+from reachjax.programs.lmi import Program, Slopes, form_rows, inequality_slopes
+from reachjax.programs.pencils import Pencil, Shape
+from reachjax.programs.presolve import NormalProgram, presolved
 from reachjax.proofs.ellipsoids import EllipsoidCertificate
-from reachjax.proofs.proposal import ANSWERS, Enclosure, SolverStatus
-from reachjax.proofs.reported import SHORTFALL, Judged, judged_form, largest_factor, log_volume
+from reachjax.proofs.proposal import Proposal
+from reachjax.proofs.recheck import clipped
+from reachjax.proofs.reported import Judged, Sized, judged_shape
 from reachjax.proofs.slopes import held_level
 from reachjax.sets import Ellipsoid, NormalForm
 from reachjax.solvers.base import AbstractSolver
-from reachjax.solvers.centring import centred, sensitivity
-from reachjax.solvers.cut_pool import NONE, CutPool, joint
-from reachjax.solvers.faults import proposed_enclosure
+from reachjax.solvers.faults import proposed
 from reachjax.solvers.goals import AbstractGoal
-from reachjax.solvers.rounds import Rounds, Shown, idle, in_rounds
-
-ATTEMPTS = 3
-"""How often a program is solved, each time in better coordinates."""
 
 
-class Sized(NamedTuple):
-    """The ellipsoid `|A x + b| <= level`, of which `A` and `b` are the first's times the factor."""
+class AbstractEllipsoid(AbstractGoal):
+    """What ellipsoids of all kinds have in common."""
 
-    form: NormalForm
-    level: Float[Array | np.ndarray, ""]
-    factor: Float[Array | np.ndarray, ""] = np.array(1.0)
-
-
-class _Held(NamedTuple):
-    """What a derivative rests on: the ellipsoid, whether it is the optimum, and its multipliers.
-
-    Attributes:
-        value: what is proved.
-        optimal: whether it is the relaxation's optimum.
-        multipliers: `(K,)`.
-        moments: `(n + q, n + q)`, zero where it is not.
-        frame: the coordinates of the successor in which it was centred.
-    """
-
-    value: Sized
-    optimal: Bool[np.ndarray, ""]
-    multipliers: Float[np.ndarray, " K"]
-    moments: Float[np.ndarray, "n+q n+q"]
-    frame: NormalForm
-
-
-class _AbstractEllipsoid(AbstractGoal):
-    """What both have in common."""
+    named: ClassVar[str] = "the ellipsoid"
+    logarithmic: ClassVar[bool] = True
 
     def rows(self, states: int) -> Float[Array, "n_x n_x"]:
         """The successor itself."""
         return jnp.eye(states)
-
-    @property
-    def given(self) -> NormalForm | None:
-        """The ellipsoid up to a factor; None if any will do."""
-        return None
-
-    def in_rounds(
-        self, program: Program, solver: AbstractSolver, rounds: Rounds
-    ) -> tuple[Products, Judged]:
-        """The products that the ellipsoid's own moments violate."""
-        pool, n = CutPool(program, rounds.layout), len(program.transform)
-
-        def solve(pairs: np.ndarray) -> Shown:
-            given = program.replace(products=joint(pool.core, pairs))
-            enclosure = proposed_enclosure(solver, given, self.given)
-            moments = np.asarray(enclosure.moments)
-            moment = moments[:n, :n] / moments[n - 1, n - 1]
-            return Shown(moment, idle(np.asarray(enclosure.multipliers), len(pairs)))
-
-        products = joint(pool.core, in_rounds(pool, rounds, NONE, solve))
-        return products, self.judged(program.replace(products=products), solver)
 
     def region(self, value: Sized) -> Ellipsoid:
         """The ellipsoid that is proved."""
         return Ellipsoid.enclosing(*_with_level_held(value))
 
     def certificate(
-        self, program: Program, value: Sized, proposal: Enclosure
+        self, program: Program, value: Sized, proposal: Proposal
     ) -> EllipsoidCertificate:
         """The proof of the ellipsoid."""
         form, level = _with_level_held(value)
-        return EllipsoidCertificate.from_enclosure(program, form, level, proposal)
+        own = {"bounds": np.ones(1), "form": form, "level": level}
+        return EllipsoidCertificate.of(program, proposal, **own)
 
 
 def _with_level_held(value: Sized) -> tuple[NormalForm, Any]:
@@ -105,149 +59,115 @@ def _with_level_held(value: Sized) -> tuple[NormalForm, Any]:
     return NormalForm(moving * form.A, moving * form.b), held
 
 
+def ellipsoid_pencil(
+    normal: NormalProgram, forms: NormalForm, sizes: Float[Array | np.ndarray, "u s s"]
+) -> Pencil:
+    """`Z = [e e' - F' Gamma F, V'; V, I]`, with `V = R W + r e'` and `W` the successor's rows.
+
+    Args:
+        normal: in whose units the successor varies by one.
+        forms: `R (u, q, q)` and `r (u, q)` of each unknown.
+        sizes: what the logarithm of the determinant is taken of.
+    """
+    W = normal.objective
+    (q, n), e = W.shape, np.eye(W.shape[1])[-1:]
+    # [0, V'; V, 0] = 2 sum_i sym(u_i' V_i) with unit rows u_i
+    rows = np.zeros((q + 1 + q, n + q))
+    rows[: q + 1, :n], rows[q + 1 :, n:] = np.vstack([W, e]), np.eye(q)
+    weights = 2 * np.concatenate([forms.A, forms.b[:, :, None]], axis=2)
+    k, i, j = np.nonzero(weights)
+    shares = weights[k, i, j], (k, np.arange(len(k)))
+    sharing = sp.csr_array(shares, shape=(len(weights), len(k)))
+    return Pencil(
+        normal=normal,
+        terms=normal.generators.below(Generators(rows, q + 1 + i, j, sharing)),
+        constant=lambda _: np.diag(np.r_[np.zeros(n - 1), 1.0, np.ones(q)]),
+        sizes=np.asarray(sizes),
+        units=np.ones(1),
+    )
+
+
+def level_slopes(program: Program, value: Sized, proposal: Proposal) -> tuple[Slopes, NormalForm]:
+    """The derivative of the level that is proved, in rows and in `A` and `b`."""
+    form = value.scaled
+    multipliers, moments = held_level(program, np.asarray(proposal.multipliers), form)
+    return form_slopes(program, multipliers[0], moments[0], form)
+
+
+def form_slopes(
+    program: Program,
+    multipliers: Float[Array | np.ndarray, " K"],
+    moments: Float[Array | np.ndarray, "N N"],
+    form: NormalForm,
+) -> tuple[Slopes, NormalForm]:
+    """The derivative of `<X, Z>` in rows and in `A` and `b`, where `V = A x+ + b`."""
+    extra, P = slice(len(program.transform), None), program.objective.mid
+    facts, V = inequality_slopes(program, multipliers, moments, extra)
+    return Slopes(facts, form.A.T @ V), NormalForm(V @ P.T, V[:, -1])
+
+
 @pytree
-class LeastVolume(_AbstractEllipsoid):
-    """The ellipsoid of least volume: problem (sdp::ellips)."""
-
-    def unknown(self, program: Program) -> Judged:
-        """No size: NaN."""
-        blank, q = Enclosure.blank(program), len(program.objective.mid)
-        return _judged(Sized(blank.form, np.array(np.nan)), np.array(False), blank, _identity(q))
-
-    def judged(self, program: Program, solver: AbstractSolver) -> Judged:
-        """The ellipsoid that is proved with what the solver proposes, in up to three attempts.
-
-        While the solver stalls, or the ellipsoid is as thin as it may be in these coordinates, the
-        next attempt is in those in which the ellipsoid proved so far is the unit ball.
-        """
-        if not all_finite(program):
-            return self.unknown(program)
-        frame, attempts = _identity(len(program.objective.mid)), []
-        for attempt in range(ATTEMPTS):
-            framed = with_successor(program, frame) if attempt else program
-            reduced = presolved(framed)
-            if attempt and (reduced.is_flat or clock().late):
-                break
-            proposed, on_path = _on_path(solver, framed)
-            enclosure = proposed._replace(form=proposed.form.of(frame))
-            form, level, optimal = judged_form(program, enclosure, centred=on_path)
-            optimal &= enclosure.status == SolverStatus.SOLVED
-            attempts.append(_judged(Sized(form, level), optimal, enclosure, frame))
-            if optimal and not reduced.is_thinnest(proposed.form):
-                return attempts[-1]
-            frame = NormalForm(form.A / level, form.b / level)
-            if not all_finite(frame):  # a single point
-                break
-        return min(attempts, key=lambda judged: log_volume(judged.value.form, judged.value.level))
-
-    def slopes(self, program: Program, held: _Held, cotangent: Sized) -> tuple[Slopes, Self]:
-        """Slopes of the point on the central path, or of the level that is proved."""
-        slopes = None
-        if held.optimal:
-            slopes = _along_path(program, held, cotangent.form)
-        if slopes is None or not all_finite(slopes):
-            slopes = _of_level(program, held, cotangent)
-        return slopes, self
-
-
-@pytree
-class GivenShape(_AbstractEllipsoid):
+class GivenShape(AbstractEllipsoid):
     """The smallest ellipsoid of a given centre and shape.
 
     Attributes:
-        form: the ellipsoid up to a factor on `A` and `b`.
+        form: the ellipsoid up to a factor on `A` and `b`, which is the unknown.
     """
 
     form: NormalForm
 
-    @property
-    def given(self) -> NormalForm:
-        """The ellipsoid up to a factor."""
-        return self.form
+    def shape(self, program: Program) -> Shape:
+        """One program of one unknown."""
+        q, n = program.objective.mid.shape
+        return Shape(1, 1, n + q)
+
+    def pencil(self, program: Program) -> Pencil:
+        """The pencil of ellipsoids whose only unknown is the factor, of unit size."""
+        normal = presolved(program)
+        normal = normal.with_units(normal.widths)
+        form, unit = normal.to_unit_box(self.form), self._unit(normal)
+        forms = NormalForm(form.A[None] / unit, form.b[None] / unit)
+        return ellipsoid_pencil(normal, forms, np.full((1, 1, 1), np.linalg.norm(form.A, 2) / unit))
+
+    def _unit(self, normal: NormalProgram) -> float:
+        """The size of the form in the normal program's units."""
+        A, b = normal.to_unit_box(self.form)
+        size = max(float(np.linalg.norm(A, 2)), float(np.linalg.norm(b)))
+        return size if size > 0 else 1.0
+
+    def absolute(
+        self, normal: NormalProgram, i: int, unknowns: Float[np.ndarray, " 1"]
+    ) -> Float[np.ndarray, " 1"]:
+        """The factor on the form itself."""
+        return unknowns / self._unit(normal)
 
     def unknown(self, program: Program) -> Judged:
         """No size: NaN."""
-        nan = np.array(np.nan)
-        blank, frame = Enclosure.blank(program), _identity(len(program.objective.mid))
-        return _judged(Sized(self.form, nan, nan), np.array(False), blank, frame)
+        nan, no = np.array(np.nan), np.array(False)
+        return Judged(Sized(self.form, nan, nan), no, (), Proposal.blank(program, self))
 
     def judged(self, program: Program, solver: AbstractSolver) -> Judged:
         """The size that is proved with what the solver proposes."""
-        if not all_finite((program, self.form)):
-            return self.unknown(program)
-        given, frame = self.form, _identity(len(program.objective.mid))
-        enclosure = proposed_enclosure(solver, program, given)
-        factor = np.sum(enclosure.form.A * given.A) / np.sum(given.A**2)
-        proposed = NormalForm(factor * given.A, factor * given.b)
-        enclosure = enclosure._replace(form=proposed)
-        form, level, optimal = judged_form(program, enclosure, given)
-        optimal &= largest_factor(program, enclosure) <= 1 + SHORTFALL  # the moments bear it out
-        factor = np.where(np.array_equal(form.A, proposed.A), factor, 1.0)
-        return _judged(Sized(given, level, factor), optimal, enclosure, frame)
+        proposal = proposed(solver, program, self)
+        value, optimal = judged_shape(program, proposal, self.form)
+        return Judged(value, np.array(optimal), (), proposal)
 
-    def slopes(self, program: Program, held: _Held, cotangent: Sized) -> tuple[Slopes, Self]:
+    def slopes(
+        self, program: Program, judged: Judged, cotangent: Sized
+    ) -> tuple[Slopes, GivenShape]:
         """Slopes of the factor, an optimal value; or of the level, the factor being held."""
-        n, factor = len(program.transform), held.value.factor
-        scaled = NormalForm(factor * self.form.A, factor * self.form.b)
-        if held.optimal:
+        n, value, factor = len(program.transform), judged.value, judged.value.factor
+        if judged.optimal:
             # stationarity in the factor gives the dual its scale, whatever the objective was
-            unit = -2 * np.sum(held.moments[n:, :n] * form_rows(program, self.form).mid)
-            free, weights = program.products.free, held.multipliers
-            proving = np.where(free, weights, np.maximum(weights, 0.0))  # negative ones do not
-            weight, rests_on = cotangent.factor / unit, (proving, held.moments)
+            multipliers = clipped(program, judged.proposal.multipliers[0])
+            moments = judged.proposal.moments[0]
+            unit = -2 * np.sum(moments[n:, :n] * form_rows(program, self.form).mid)
+            weight = cotangent.factor / unit
+            rows, sought = form_slopes(program, multipliers, moments, value.scaled)
         else:
-            weight, rests_on = cotangent.level, held_level(program, held.multipliers, scaled)
-        rows, sought = schur_slopes(program, rests_on[0], scaled, rests_on[1])
+            weight = cotangent.level
+            rows, sought = level_slopes(program, value, judged.proposal)
         slopes = Slopes(weight * rows.facts, weight * rows.objective)
         weight, own = weight * factor, cotangent.form
         form = NormalForm(own.A + weight * sought.A, own.b + weight * sought.b)
-        return slopes, self.replace(form=form)
-
-
-def _identity(q: int) -> NormalForm:
-    return NormalForm(np.eye(q), np.zeros(q))
-
-
-def _judged(value: Sized, optimal: np.ndarray, enclosure: Enclosure, frame: NormalForm) -> Judged:
-    moments = np.where(optimal, enclosure.moments, 0.0)
-    held = _Held(value, optimal, np.asarray(enclosure.multipliers), moments, frame)
-    return Judged(value, optimal, held, enclosure)
-
-
-def _on_path(solver: AbstractSolver, program: Program) -> tuple[Enclosure, bool]:
-    """The solver's ellipsoid, moved to the central path, and whether that was reached."""
-    enclosure = proposed_enclosure(solver, program)
-    if int(enclosure.status) not in ANSWERS:
-        return enclosure, False
-    found = centred(program, np.asarray(enclosure.multipliers), enclosure.form)
-    if found is None:
-        return enclosure, False
-    solved = np.array(int(SolverStatus.SOLVED))
-    return enclosure._replace(multipliers=found[0], form=found[1], status=solved), True
-
-
-def _along_path(program: Program, held: _Held, cotangent: NormalForm) -> Slopes:
-    """The difference of two Lagrangians' derivatives: see `Sensitivity`."""
-    path = sensitivity(program, held.multipliers, held.value.form, cotangent, held.frame)
-    first, _ = schur_slopes(program, path.multipliers, path.form, path.moments)
-    other, _ = schur_slopes(program, path.multipliers_slope, path.form_slope, path.moments_slope)
-    return Slopes(first.facts - other.facts, first.objective - other.objective)
-
-
-def _of_level(program: Program, held: _Held, cotangent: Sized) -> Slopes:
-    """Slopes of the level, the ellipsoid moving with the centre and widths of the successors' box.
-
-    Column `j` of `A` stays the same multiple of one over the width in `j`, and `A x + b` at the
-    centre of the box is held.
-    """
-    form, objective = held.value.form, program.objective.mid
-    multipliers, moments = held_level(program, held.multipliers, form)
-    rows, moved = schur_slopes(program, multipliers, form, moments)
-    A, b = (own + cotangent.level * part for own, part in zip(cotangent.form, moved, strict=True))
-    slope = cotangent.level * rows.objective
-    width, centre = abs(objective[:, :-1]).sum(axis=1), objective[:, -1]
-    varies = width > 0
-    wider = ((A - np.outer(b, centre)) * form.A).sum(axis=0) / np.where(varies, width, 1.0)
-    slope[:, :-1] -= np.where(varies, wider, 0.0)[:, None] * np.sign(objective[:, :-1])
-    slope[:, -1] -= form.A.T @ b
-    return Slopes(cotangent.level * rows.facts, slope)
+        return slopes, GivenShape(form)

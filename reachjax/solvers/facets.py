@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+import scipy.sparse as sp
+from jaxtyping import Array, Bool, Float, Int
 
-from reachjax.numerics.host import all_finite
 from reachjax.numerics.pytrees import pytree
-from reachjax.programs.lmi import Program, Slopes, lagrangian_slopes
+from reachjax.programs.generators import Generators
+from reachjax.programs.lmi import Program, Slopes, inequality_slopes
+from reachjax.programs.pencils import Pencil, Shape
+from reachjax.programs.presolve import NormalProgram, presolved
 from reachjax.programs.relaxations import Products
 from reachjax.proofs.facets import Certificate
-from reachjax.proofs.proposal import Solution, SolverStatus
-from reachjax.proofs.recheck import interval_offsets, sound_offsets
+from reachjax.proofs.proposal import Proposal, SolverStatus
+from reachjax.proofs.recheck import clipped, interval_offsets, sound_offsets
 from reachjax.proofs.reported import Judged, judged_offsets
-from reachjax.proofs.slopes import Held
+from reachjax.proofs.slopes import held_offsets
 from reachjax.sets import Polytope
 from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.cut_pool import NONE, CutPool, joint
@@ -39,67 +43,167 @@ class Facets(AbstractGoal):
 
     directions: Float[Array, "f n_x"]
 
+    named: ClassVar[str] = "facet {}"
+
     def rows(self, states: int) -> Float[Array, "f n_x"]:
         """The directions of the facets."""
         return self.directions
 
+    def shape(self, program: Program) -> Shape:
+        """A program for each facet, of one unknown."""
+        facets, size = program.objective.mid.shape
+        return Shape(facets, 1, size)
+
+    def pencil(self, program: Program) -> Pencil:
+        """`Z = 2 b e e' - p e' - e p' - F' Gamma F` for facets of unit 1-norm around zero."""
+        normal = presolved(program)
+        e = np.eye(normal.objective.shape[1])[-1:]
+        corner = Generators(e, np.array([0]), np.array([0]), sp.csr_array([[2.0]]))
+        return Pencil(
+            normal=normal,
+            terms=normal.generators.below(corner),
+            constant=lambda i: -(e.T * normal.objective[i] + normal.objective[i][:, None] * e),
+            sizes=np.full((1, 1, 1), -1.0),
+            units=normal.units,
+        )
+
+    def absolute(
+        self, normal: NormalProgram, i: int, unknowns: Float[np.ndarray, " u"]
+    ) -> Float[np.ndarray, " u"]:
+        """The offset, from that around the middle of the facet's interval."""
+        return normal.centers[i] + unknowns
+
     def unknown(self, program: Program) -> Judged:
         """No offsets: NaN."""
-        blank = Solution.blank_for(program)
-        unknown = np.full(len(blank.offsets), np.nan)
-        held = Held(np.full(blank.multipliers.shape, np.nan), np.full(blank.moments.shape, np.nan))
-        return Judged(unknown, np.zeros(len(unknown), dtype=bool), held, blank)
+        unknown = np.full(len(program.objective.mid), np.nan)
+        nothing = np.zeros(len(unknown), dtype=bool)
+        return Judged(unknown, nothing, nothing, Proposal.blank(program, self))
 
     def judged(self, program: Program, solver: AbstractSolver) -> Judged:
         """Offsets that are proved with what the solver proposes."""
-        if not all_finite(program):
-            return self.unknown(program)
-        return judged_offsets(program, proposed(solver, program))
+        return judged_offsets(program, proposed(solver, program, self))
 
     def in_rounds(
         self, program: Program, solver: AbstractSolver, rounds: Rounds
     ) -> tuple[Products, Judged]:
         """Each facet has its own products, and begins with those that the one before used."""
         pool = CutPool(program, rounds.layout)
-        found, used = [], pool.addable(rounds.warm_start)
+        found, pairs = list[_Round](), pool.addable(rounds.warm_start)
         for facet in range(len(program.objective.mid)):
             one = program.with_objective(slice(facet, facet + 1))
-            attained = None if rounds.witness is None else partial(rounds.witness, facet)
             if rounds.budget.late:
-                found.append(_unsolved(one, pool))
+                given = one.replace(products=joint(pool.core, NONE))
+                late = judged_offsets(given, Proposal.blank(given, self))
+                found.append(_Round(NONE, late, np.zeros(0, dtype=bool)))
             else:
-                found.append(_facet(one, pool, solver, rounds, attained, used))
-            used = found[-1].in_use
-        return _joined(program, pool, found)
+                attained = None if rounds.witness is None else partial(rounds.witness, facet)
+                found.append(self._best(one, pool, solver, rounds, attained, pairs))
+            pairs = found[-1].pairs[~found[-1].idle]
+        return self._joined(program, pool, found)
+
+    def _best(
+        self,
+        program: Program,
+        pool: CutPool,
+        solver: AbstractSolver,
+        rounds: Rounds,
+        attained: Callable[[Float[np.ndarray, " n"]], float] | None,
+        pairs: Int[np.ndarray, "p 2"],
+    ) -> _Round:
+        """The best round of one facet, that begins with these pairs."""
+        size = float(interval_offsets(program)[0] - program.objective.mid[0, -1])
+        enough = (rounds.cuts.gap or 0.0) * size
+        found: list[_Round] = []
+
+        def solve(pairs: np.ndarray) -> Shown:
+            judged = self.judged(program.replace(products=joint(pool.core, pairs)), solver)
+            resting = idle(judged.proposal.multipliers[0], len(pairs))
+            found.append(_Round(pairs, judged, resting))
+            moment = judged.proposal.moments[0]
+            if attained is None:
+                return Shown(moment, resting)
+            gap = min(each.offset for each in found) - attained(program.transform @ moment[:, -1])
+            return Shown(moment, resting, gap <= enough)
+
+        in_rounds(pool, rounds, pairs, solve)
+        least = min(each.offset for each in found)
+        near = [each for each in found if each.offset <= least + NEAR * size]
+        best = max(near, key=lambda each: each.is_optimal)  # the first that is, if any is
+        seconds = np.sum([each.judged.proposal.seconds for each in found], axis=0)
+        proposal = best.judged.proposal._replace(seconds=seconds)
+        return best._replace(judged=best.judged._replace(proposal=proposal))
+
+    def _joined(
+        self, program: Program, pool: CutPool, found: list[_Round]
+    ) -> tuple[Products, Judged]:
+        """All facets over the products that any of them has."""
+        pairs = np.unique(np.concatenate([each.pairs for each in found]), axis=0)
+        number = {tuple(pair): i for i, pair in enumerate(pairs)}
+        products, core, own = joint(pool.core, pairs), len(pool.core.free), []
+        for added, judged, _ in found:
+            places = np.array([number[tuple(pair)] for pair in added], dtype=int)
+            multipliers = np.zeros((1, len(products.free)))
+            there = np.r_[np.arange(core), core + places]
+            multipliers[:, there] = judged.proposal.multipliers
+            proposal = judged.proposal._replace(multipliers=multipliers)
+            own.append(judged._replace(proposal=proposal))
+        judged = jax.tree.map(lambda *parts: np.concatenate(parts), *own)
+        # proved with all products, which are in another order and so round otherwise
+        whole = program.replace(products=products)
+        proved = sound_offsets(whole, judged.proposal.multipliers)
+        again = np.fmin(proved, interval_offsets(whole))
+        return products, judged._replace(value=np.fmax(judged.value, again))
 
     def slopes(
-        self, program: Program, held: Held, cotangent: Float[np.ndarray, " f"]
-    ) -> tuple[Slopes, Self]:
+        self, program: Program, judged: Judged, cotangent: Float[np.ndarray, " f"]
+    ) -> tuple[Slopes, Facets]:
         """Slopes of the Lagrangian; the rows carry what the directions do."""
-        slopes = lagrangian_slopes(program, held.multipliers, held.moments, cotangent)
-        return slopes, self.replace(directions=np.zeros_like(self.directions))
+        multipliers = clipped(program, np.asarray(judged.proposal.multipliers))
+        moments, held = np.array(judged.proposal.moments), np.flatnonzero(~judged.held)
+        if len(held):
+            own, weights = program.with_objective(held), multipliers[held]
+            used = sound_offsets(own, weights) < interval_offsets(own)
+            multipliers[held], moments[held] = held_offsets(own, weights, used)
+        nothing: Any = np.zeros_like(self.directions)
+        return offset_slopes(program, multipliers, moments, cotangent), Facets(nothing)
 
     def region(self, value: Float[Array, " f"]) -> Polytope:
         """`directions x <= b`."""
         return Polytope(self.directions, value)
 
     def certificate(
-        self, program: Program, value: Float[Array, " f"], proposal: Solution
+        self, program: Program, value: Float[Array, " f"], proposal: Proposal
     ) -> Certificate:
         """The proof of the offsets."""
-        return Certificate.from_solution(program, value, proposal)
+        claims = proposal.unknowns[:, 0]
+        return Certificate.of(program, proposal, bounds=value, solver_offsets=claims)
+
+
+def offset_slopes(
+    program: Program,
+    multipliers: Float[np.ndarray, "f K"],
+    moments: Float[np.ndarray, "f n n"],
+    weights: Float[np.ndarray, " f"],
+) -> Slopes:
+    """The derivative of `<weights, offsets>`, multipliers and moments being held.
+
+    An offset moves by half of what its matrix `Z` misses at the moments.
+    """
+    corner = slice(len(program.transform) - 1, None)
+    facts, objective = np.zeros_like(program.facts.mid), np.zeros_like(program.objective.mid)
+    for i in np.flatnonzero(weights):
+        slopes = inequality_slopes(program, multipliers[i], moments[i], corner)
+        facts -= weights[i] / 2 * slopes.facts
+        objective[i] = weights[i] / 2 * slopes.objective[0]
+    return Slopes(facts, objective)
 
 
 class _Round(NamedTuple):
-    """One round of one facet: the products added, and what was proved with them."""
+    """One round of one facet: the products added, what was proved, and which are at zero."""
 
     pairs: Int[np.ndarray, "p 2"]
     judged: Judged
-
-    @property
-    def solution(self) -> Solution:
-        """What the solver proposed."""
-        return self.judged.proposal
+    idle: Bool[np.ndarray, " p"]
 
     @property
     def offset(self) -> float:
@@ -109,80 +213,5 @@ class _Round(NamedTuple):
     @property
     def is_optimal(self) -> bool:
         """Whether the offset is the solver's optimum, to its tolerance."""
-        solved = int(self.solution.statuses[0]) == SolverStatus.SOLVED
+        solved = int(self.judged.proposal.statuses[0]) == SolverStatus.SOLVED
         return solved and bool(self.judged.optimal[0])
-
-    @property
-    def idle(self) -> np.ndarray:
-        """Which of the products added have a multiplier at zero."""
-        return idle(np.asarray(self.solution.multipliers[0]), len(self.pairs))
-
-    @property
-    def in_use(self) -> Int[np.ndarray, "q 2"]:
-        """The products added that have a multiplier."""
-        return self.pairs[~self.idle]
-
-
-def _facet(
-    program: Program,
-    pool: CutPool,
-    solver: AbstractSolver,
-    rounds: Rounds,
-    attained: Callable[[Float[np.ndarray, " n"]], float] | None,
-    pairs: Int[np.ndarray, "p 2"],
-) -> _Round:
-    """The best round of one facet."""
-    size = float(interval_offsets(program)[0] - program.objective.mid[0, -1])
-    transform = np.asarray(program.transform)
-    found: list[_Round] = []
-
-    def solve(pairs: np.ndarray) -> Shown:
-        given = program.replace(products=joint(pool.core, pairs))
-        found.append(_Round(pairs, judged_offsets(given, proposed(solver, given))))
-        moment = np.asarray(found[-1].solution.moments[0])
-        if attained is None:
-            return Shown(moment, found[-1].idle)
-        least = min(each.offset for each in found)
-        gap = least - attained(transform @ moment[:, -1])
-        return Shown(moment, found[-1].idle, enough=gap <= (rounds.cuts.gap or 0.0) * size)
-
-    in_rounds(pool, rounds, pairs, solve)
-    least = min(each.offset for each in found)
-    near = [each for each in found if each.offset <= least + NEAR * size]
-    best = max(near, key=lambda each: each.is_optimal)  # the first that is, if any is
-    seconds = np.sum([each.solution.seconds for each in found], axis=0)
-    spent = best.judged._replace(proposal=best.solution._replace(seconds=seconds))
-    return best._replace(judged=spent)
-
-
-def _unsolved(program: Program, pool: CutPool) -> _Round:
-    """What is proved of a facet without a solver, when the time is over."""
-    given = program.replace(products=joint(pool.core, NONE))
-    return _Round(NONE, judged_offsets(given, Solution.blank_for(given)))
-
-
-def _joined(program: Program, pool: CutPool, found: list[_Round]) -> tuple[Products, Judged]:
-    """All facets over the products that any of them has."""
-    pairs = np.unique(np.concatenate([each.pairs for each in found]), axis=0)
-    number = {tuple(pair): i for i, pair in enumerate(pairs)}
-    products, core = joint(pool.core, pairs), len(pool.core.free)
-    solution = Solution.blank(len(found), len(products.free), len(program.transform))
-    held = np.zeros_like(solution.multipliers)
-    for i, each in enumerate(found):
-        mine = each.solution
-        places = np.array([number[tuple(pair)] for pair in each.pairs], dtype=int)
-        there = np.r_[np.arange(core), core + places]
-        solution.multipliers[i, there] = mine.multipliers[0]
-        held[i, there] = each.judged.held.multipliers[0]
-        solution.offsets[i], solution.statuses[i] = mine.offsets[0], mine.statuses[0]
-        solution.moments[i], solution.seconds[i] = mine.moments[0], mine.seconds[0]
-    # proved with all products, which are in another order and so round otherwise
-    whole = program.replace(products=products)
-    again = np.fmin(sound_offsets(whole, np.asarray(solution.multipliers)), interval_offsets(whole))
-    moments = np.concatenate([each.judged.held.moments for each in found])
-    return products, Judged(
-        value=np.fmax(np.array([each.offset for each in found]), again),
-        optimal=np.array([each.judged.optimal[0] for each in found]),
-        held=Held(held, moments),
-        proposal=solution,
-    )

@@ -8,8 +8,8 @@ steps.
 **With an optimum.** Offsets and sizes are optimal values, so the envelope theorem gives their
 derivative: hold multipliers and moments fixed and differentiate the Lagrangian (`programs.lmi`).
 The ellipsoid of least volume is an optimal *point*: what is reported is the point on the central
-path nearby, which moves as the implicit function theorem says (`centring`). What the recheck adds
-to an optimum is not differentiated.
+path nearby, which moves as the implicit function theorem says (`least_volume`). What the recheck
+adds to an optimum is not differentiated.
 
 **Without an optimum.** The derivative is that of the bound that is reported, whatever the status:
 where multipliers and moments do not bear out an optimum, of what the multipliers prove, these being
@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import abc
 from functools import partial
-from typing import Any, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -42,18 +42,25 @@ from jaxtyping import Array, Bool, Float
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.host import all_finite, on_host, shapes_of
-from reachjax.numerics.pytrees import Replaceable
 from reachjax.programs.lmi import Program, Slopes
+from reachjax.programs.pencils import AbstractInequality
 from reachjax.programs.relaxations import LocalBounds, Products
 from reachjax.proofs.certificates import AbstractCertificate
+from reachjax.proofs.proposal import Proposal
 from reachjax.proofs.reported import Judged
 from reachjax.sets import AbstractSet
 from reachjax.solvers.base import AbstractSolver
-from reachjax.solvers.rounds import Rounds
+from reachjax.solvers.cut_pool import NONE, CutPool, joint
+from reachjax.solvers.faults import proposed
+from reachjax.solvers.rounds import Rounds, Shown, idle, in_rounds
 
 
-class AbstractGoal(Replaceable, abc.ABC):
-    """What is sought of a program. A pytree; what gets a program gets numpy arrays, on the host."""
+class AbstractGoal(AbstractInequality):
+    """What is sought of a program. A pytree; what gets a program gets numpy arrays, on the host.
+
+    It says what a solver sees (`programs.pencils`), what is proved with what that proposes, and how
+    that moves with the program's rows.
+    """
 
     @abc.abstractmethod
     def rows(self, states: int) -> Float[Array, "f n_x"]:
@@ -65,21 +72,34 @@ class AbstractGoal(Replaceable, abc.ABC):
 
     @abc.abstractmethod
     def judged(self, program: Program, solver: AbstractSolver) -> Judged:
-        """What the solver proposes, and what that proves."""
+        """What the solver proposes for a program of finite numbers, and what that proves."""
 
-    @abc.abstractmethod
     def in_rounds(
         self, program: Program, solver: AbstractSolver, rounds: Rounds
     ) -> tuple[Products, Judged]:
-        """The products that were added round by round, and what is proved with them."""
+        """The products that were added round by round, and what is proved with them.
+
+        As they are here, for goals of one program: those that its own moments violate.
+        """
+        pool, n = CutPool(program, rounds.layout), len(program.transform)
+
+        def solve(pairs: np.ndarray) -> Shown:
+            given = program.replace(products=joint(pool.core, pairs))
+            found = proposed(solver, given, self)
+            return Shown(found.moments[0, :n, :n], idle(found.multipliers[0], len(pairs)))
+
+        products = joint(pool.core, in_rounds(pool, rounds, NONE, solve))
+        return products, judged(self, program.replace(products=products), solver)
 
     @abc.abstractmethod
-    def slopes(self, program: Program, held: Any, cotangent: Any) -> tuple[Slopes, Self]:
+    def slopes(
+        self, program: Program, judged: Judged, cotangent: Any
+    ) -> tuple[Slopes, AbstractGoal]:
         """The derivative of `<cotangent, value>` in the program's rows, and in the goal.
 
         Args:
             program: the program.
-            held: what it rests on, as `judged` returned it.
+            judged: what was proved of it: finite numbers.
             cotangent: weights of the value.
         """
 
@@ -88,13 +108,20 @@ class AbstractGoal(Replaceable, abc.ABC):
         """The set that is proved."""
 
     @abc.abstractmethod
-    def certificate(self, program: Program, value: Any, proposal: Any) -> AbstractCertificate:
+    def certificate(self, program: Program, value: Any, proposal: Proposal) -> AbstractCertificate:
         """The proof of the set."""
+
+
+def judged(goal: AbstractGoal, program: Program, solver: AbstractSolver) -> Judged:
+    """What is proved of a goal with what a solver proposes, of numpy arrays."""
+    if not all_finite((goal, program)):
+        return goal.unknown(program)
+    return goal.judged(program, solver)
 
 
 def proved(
     goal: AbstractGoal, program: Program, solver: AbstractSolver, rounds: Rounds | None = None
-) -> tuple[Program, Any, Any]:
+) -> tuple[Program, Any, Proposal]:
     """What is proved of a goal, differentiable in the program's rows and in the goal.
 
     Args:
@@ -109,21 +136,20 @@ def proved(
     fixed = jax.lax.stop_gradient((goal, program))
     if rounds is not None and is_concrete(fixed):
         sought, given = jax.device_get(fixed)
-        products, judged = jax.device_put(sought.in_rounds(given, solver, rounds))
+        products, found = jax.device_put(sought.in_rounds(given, solver, rounds))
         program = program.replace(products=products)
     else:
         if rounds is not None:
             program = program.replace(products=LocalBounds().products(rounds.layout))
             fixed = jax.lax.stop_gradient((goal, program))
         shapes = shapes_of(goal.unknown(program))
-        judged: Any = on_host(partial(_judged, solver), shapes, fixed)
+        found: Any = on_host(partial(_judged, solver), shapes, fixed)
     rows = program.facts.mid, program.objective.mid
-    return program, *_enveloped(goal, *rows, program, judged)
+    return program, *_enveloped(goal, *rows, program, found)
 
 
 def _judged(solver: AbstractSolver, fixed: tuple[AbstractGoal, Program]) -> Judged:
-    goal, program = fixed
-    return goal.judged(program, solver)
+    return judged(*fixed, solver)
 
 
 @jax.custom_vjp
@@ -133,7 +159,7 @@ def _enveloped(goal, facts, objective, program, judged):
 
 
 def _forward(goal, facts, objective, program, judged):
-    return _enveloped(goal, facts, objective, program, judged), (goal, program, judged.held)
+    return _enveloped(goal, facts, objective, program, judged), (goal, program, judged)
 
 
 @lenient
@@ -141,22 +167,21 @@ def _backward(residual, cotangents):
     goal, program, _ = residual
     value, proposal = cotangents
     rows = Slopes(program.facts.mid, program.objective.mid)
-    shapes = shapes_of((rows, goal))
-    found: Any = on_host(_slopes, shapes, (*residual, value))
+    found: Any = on_host(_slopes, shapes_of((rows, goal)), (*residual, value))
     asked = _asked_for(proposal)
     (facts, objective), sought = jax.tree.map(lambda x: jnp.where(asked, jnp.nan, x), found)
     return sought, facts, objective, None, None
 
 
-def _slopes(argument: tuple[AbstractGoal, Program, Any, Any]) -> tuple[Slopes, AbstractGoal]:
-    goal, program, held, cotangent = argument
-    if not all_finite((goal, program, held)):
+def _slopes(argument: tuple[AbstractGoal, Program, Judged, Any]) -> tuple[Slopes, AbstractGoal]:
+    goal, program, judged, cotangent = argument
+    if not all_finite((goal, program, judged.value)):
         rows = Slopes(program.facts.mid, program.objective.mid)
         return jax.tree.map(lambda leaf: np.full_like(leaf, np.nan), (rows, goal))
-    return goal.slopes(program, held, cotangent)
+    return goal.slopes(program, judged, cotangent)
 
 
-def _asked_for(proposal: Any) -> Bool[Array, ""]:
+def _asked_for(proposal: Proposal) -> Bool[Array, ""]:
     """Whether a derivative of what a solver proposes is asked for; there is none."""
     parts = [part for part in jax.tree.leaves(proposal) if part.dtype == float]
     return jnp.array([jnp.any(part != 0) for part in parts]).any()

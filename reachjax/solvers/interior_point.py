@@ -1,21 +1,24 @@
-"""The library's own interior-point methods: facets (`primal_dual`) and ellipsoids (`centring`)."""
+"""The library's own interior-point methods: `primal_dual`, and `barrier` for ellipsoids."""
 
 from __future__ import annotations
 
 import dataclasses
-import time
 
 import numpy as np
 
-from reachjax.numerics.budget import clock, require_memory
+from reachjax.numerics.budget import require_memory
 from reachjax.numerics.checks import whole_number
+from reachjax.numerics.host import all_finite
 from reachjax.programs.lmi import Program
-from reachjax.programs.presolve import presolved
-from reachjax.proofs.proposal import Enclosure, Solution, SolverStatus
-from reachjax.sets import NormalForm
-from reachjax.solvers.base import AbstractSolver, require_positive
-from reachjax.solvers.centring import enclosed
-from reachjax.solvers.primal_dual import minimised
+from reachjax.programs.pencils import AbstractInequality, Pencil
+from reachjax.programs.presolve import THINNEST
+from reachjax.proofs.proposal import Proposal, SolverStatus
+from reachjax.solvers.barrier import FROM_AFAR, WEIGHTS, Barrier
+from reachjax.solvers.base import AbstractSolver, Attempt, Found, proposed_by, require_positive
+from reachjax.solvers.primal_dual import Instance, minimised
+
+USEFUL = 1e-3
+"""A path that is lost at a smaller weight still gives an ellipsoid, looser by that as above."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,41 +52,54 @@ class InteriorPoint(AbstractSolver):
         require_positive(self)
         whole_number("InteriorPoint.max_iterations", self.max_iterations, 1)
 
-    def solve(self, program: Program) -> Solution:
-        """Propose multipliers for every facet.
+    def solve(self, program: Program, goal: AbstractInequality) -> Proposal:
+        """Propose multipliers, and what is sought, for every program of a goal.
 
         Raises:
             MemoryError: an iteration would take too much memory.
             TimeOverError: the time in force would be over before the first iterate.
         """
-        facets, size = program.objective.mid.shape
-        solution = Solution.blank(facets, len(program.products.free), size)
-        reduced = presolved(program)
-        count, pairs = reduced.generators.size, len(reduced.generators.left)
+        if not all_finite((goal, program)):
+            return Proposal.blank(program, goal)
+        pencil = goal.pencil(program)
+        attempt = _along_path(pencil) if goal.logarithmic else self._by_iterates(pencil)
+        return proposed_by(attempt, program, goal, pencil)
+
+    def _by_iterates(self, pencil: Pencil) -> Attempt:
+        """By the primal-dual method, whose matrices are half of the pencil's."""
+        count, pairs = pencil.multipliers, len(pencil.normal.generators.left)
         named = f"a program of {count:,} multipliers and {pairs:,} products"
         require_memory(named, count * (pairs + 2 * count), 8 * pairs**2 + count**3 / 3)
-        used = np.ix_(reduced.columns, reduced.columns)
-        for i, row in enumerate(reduced.objective):
-            if clock().late:
-                solution.statuses[i:] = SolverStatus.LIMIT
-                break
-            began = time.perf_counter()
-            given = reduced.generators, reduced.free, row
-            found = minimised(*given, self.tolerance, self.max_iterations)
-            solution.seconds[i] = time.perf_counter() - began
-            solution.statuses[i] = found.status
-            solution.offsets[i] = reduced.centers[i] + reduced.units[i] * found.offset
-            # twice: the method's objective is half of `p e' + e p'`
-            multipliers = 2 * reduced.units[i] * found.multipliers / reduced.norms
-            solution.multipliers[i, reduced.kept] = multipliers
-            if np.isfinite(found.moment).all():
-                solution.moments[i] = 0.0
-                solution.moments[i][used] = found.moment
-        return solution
+        generators = pencil.terms.scaled(np.r_[np.full(count, -1.0), -0.5])
+        free, target = np.append(pencil.normal.free, True), float(pencil.sizes[0, 0, 0])
 
-    def enclose(self, program: Program, form: NormalForm | None = None) -> Enclosure:
-        """Propose the smallest ellipsoid around the successors, and its multipliers.
+        def attempt(i: int, scale: float) -> tuple[SolverStatus, Found]:
+            given = Instance(generators, free, -scale * pencil.constant(i) / 2, target)
+            found = minimised(given, self.tolerance, self.max_iterations)
+            sought = np.array([found.offset])
+            return found.status, Found(sought, 2 * found.multipliers, found.moment)
 
-        Its central path is followed to its end, on the host (`barrier`).
-        """
-        return enclosed(program, form)
+        return attempt
+
+
+def _along_path(pencil: Pencil) -> Attempt:
+    """By the central path, followed from afar to its end."""
+
+    def attempt(i: int, scale: float) -> tuple[SolverStatus, Found | None]:
+        if not (pencil.sizes.any() and pencil.normal.columns.size):
+            return SolverStatus.FAILED, None
+        barrier = Barrier(pencil)
+        end = barrier.path_end(barrier.inside, FROM_AFAR + WEIGHTS)
+        if end is None or end.weight > USEFUL:
+            return SolverStatus.FAILED, None
+        y = end.y[barrier.unknowns]
+        if len(y) == 1 and np.linalg.norm(barrier.enlarged(end.y), 2) > 0.5 / THINNEST:
+            return SolverStatus.UNBOUNDED, None
+        solved = end.weight == WEIGHTS[-1]
+        moments = end.weight * barrier.inverse(end.y)
+        return (
+            SolverStatus.SOLVED if solved else SolverStatus.INACCURATE,
+            Found(y, end.y[: pencil.multipliers], moments),
+        )
+
+    return attempt

@@ -1,7 +1,9 @@
-"""An infeasible-start primal-dual method for the program of a facet, in numpy.
+"""An infeasible-start primal-dual method for the offset of a facet, in numpy.
 
     minimise b   over b, y   with   S = b e' e - C - sum_k y_k G_k >= 0,   y_k >= 0 unless free,
     maximise <C, X>          with   X >= 0,  X_ee = 1,  <G_k, X> = z_k >= 0 (0 where free).
+
+Any pencil of one unknown is of this kind, with a matrix of its own in the place of `-e' e`.
 
 Cones of general conic solvers hold a dense block of `n (n + 1) / 2` rows for a matrix inequality of
 size `n`. Here a multiplier's matrix is a sum of products of two rows, so Gram matrices of rows are
@@ -88,12 +90,12 @@ class Residuals(NamedTuple):
 
 
 class Optimum(NamedTuple):
-    """What a run found for one facet, in the scaling of its generators.
+    """What a run found for one program, in the scaling of its generators.
 
     Attributes:
-        offset: `b`, NaN where there is none.
-        multipliers: `(K,)`, without the offset.
-        moment: `(n, n)`, with corner 1.
+        offset: the unknown, NaN where there is none.
+        multipliers: `(K,)`, without it.
+        moment: `(n, n)`, NaN where there is none.
         status: how the run ended.
         merit: the largest relative residual or gap.
         iterations: how many.
@@ -107,31 +109,41 @@ class Optimum(NamedTuple):
     iterations: int
 
 
-class FacetProgram:
-    """The program of one facet: generators, the offset's the last, and the objective.
+class Instance(NamedTuple):
+    """A program of one unknown.
+
+    Attributes:
+        generators: of unit size, the unknown's the last.
+        free: `(K,)`, multipliers of either sign, the unknown among them.
+        cost: `(n, n)`, `C`.
+        target: what the product of `X` with the unknown's matrix is: `-1` for an offset.
+    """
+
+    generators: Generators
+    free: np.ndarray
+    cost: np.ndarray
+    target: float
+
+
+class Iteration:
+    """The equations of a program and its steps.
 
     Args:
-        generators: of unit size, over `n` columns of which the last is the constant's.
-        free: `(K,)`, multipliers of either sign.
-        row: `(n,)`, the objective, of unit 1-norm.
+        given: the program.
         damping: `kappa` of this module's docstring.
     """
 
-    def __init__(self, generators: Generators, free: np.ndarray, row: np.ndarray, damping: float):
-        n = len(row)
-        e = np.eye(n)[-1]
-        self.generators = generators.with_square(e, -1.0)
-        self.signed = ~np.append(free, True)
-        self.target = np.append(np.zeros(len(free)), -1.0)
-        # the offset has no part in the damping: its equation holds the corner of X at one
-        self.damped = damping * np.append(np.ones(len(free)), 0.0)
-        self.row = row
-        self.cost = symmetric(np.outer(row, e))
-        self.degree = n + int(self.signed.sum())
+    def __init__(self, given: Instance, damping: float):
+        self.generators, free, self.cost, target = given
+        self.signed = ~free
+        # what is sought has no part in the damping: its equation holds the scale of X
+        last = np.arange(len(free)) == len(free) - 1
+        self.target, self.damped = np.where(last, target, 0.0), np.where(last, 0.0, damping)
+        self.degree = len(self.cost) + int(self.signed.sum())
 
     def start(self) -> Point:
         """`X = I`, `S = 10 I`, and multipliers of the same size; free ones are zero."""
-        eye, signed = np.eye(len(self.row)), 1.0 * self.signed
+        eye, signed = np.eye(len(self.cost)), 1.0 * self.signed
         return Point(eye, 10.0 * eye, signed, signed.copy())
 
     def residuals(self, point: Point, paired: np.ndarray) -> Residuals:
@@ -141,7 +153,8 @@ class FacetProgram:
         dual = -self.cost - self.generators.weighted(y) - S
         products = float(np.sum(X * S) + y @ z)
         # the difference of both values alone may vanish before either is optimal
-        gap = max(abs(y[-1] - self.row @ X[:, -1]), products) / (1 + abs(y[-1]))
+        value = -self.target[-1] * y[-1]
+        gap = max(abs(value - np.sum(self.cost * X)), products) / (1 + abs(value))
         missed = abs(primal).max() / max(1.0, float(np.linalg.norm(X)))
         merit = float(np.max([missed, abs(dual).max(), gap]))
         return Residuals(primal, dual, products / self.degree, merit)
@@ -188,28 +201,24 @@ class FacetProgram:
         return following, missed, min(a, b)
 
 
-def minimised(
-    generators: Generators, free: np.ndarray, row: np.ndarray, tolerance: float, most: int
-) -> Optimum:
-    """Minimise the offset of one facet, once more with less damping where that stalls.
+def minimised(given: Instance, tolerance: float, most: int) -> Optimum:
+    """Minimise what is sought, once more with less damping where that stalls.
 
     Args:
-        generators: as of `FacetProgram`.
-        free: as of it.
-        row: as of it.
+        given: the program.
         tolerance: relative, of residuals and gap.
         most: how many iterations there may be.
     """
-    first = _run(FacetProgram(generators, free, row, DAMPING), tolerance, most)
+    first = _run(Iteration(given, DAMPING), tolerance, most)
     if first.status not in (SolverStatus.INACCURATE, SolverStatus.FAILED):
         return first
     left = most - first.iterations
-    second = _run(FacetProgram(generators, free, row, LESS), tolerance, left)
+    second = _run(Iteration(given, LESS), tolerance, left)
     best = second if second.merit < first.merit else first
     return best._replace(iterations=first.iterations + second.iterations)
 
 
-def _run(program: FacetProgram, tolerance: float, most: int) -> Optimum:
+def _run(program: Iteration, tolerance: float, most: int) -> Optimum:
     """Iterate from the start to an optimum, or until that stalls."""
     point = best = program.start()
     least, iterations, idle, short, over = np.inf, 0, 0, 0, False
@@ -229,14 +238,13 @@ def _run(program: FacetProgram, tolerance: float, most: int) -> Optimum:
             lost = not np.isfinite(missed.merit) or idle > PATIENCE or short > 3
             enough = least <= FURTHER * tolerance or (least <= tolerance and idle > 2)
             point, over, iterations = following, lost or enough, iterations + 1
-    corner = best.X[-1, -1]
-    if not (np.isfinite(least) and corner > 0 and all(np.isfinite(part).all() for part in best)):
+    if not (np.isfinite(least) and all(np.isfinite(part).all() for part in best)):
         blank = np.zeros(len(best.y) - 1), np.full_like(best.X, np.nan)
         failed = SolverStatus.LIMIT if clock().late else SolverStatus.FAILED
         return Optimum(np.nan, *blank, failed, least, iterations)
     ended = SolverStatus.INACCURATE if over else SolverStatus.LIMIT
     status = SolverStatus.SOLVED if least <= tolerance else ended
-    return Optimum(best.y[-1], best.y[:-1], best.X / corner, status, least, iterations)
+    return Optimum(best.y[-1], best.y[:-1], best.X, status, least, iterations)
 
 
 def symmetric(matrix: np.ndarray) -> np.ndarray:

@@ -40,25 +40,13 @@ def _noisy(array, rng):
 
 
 def _status(code: Any) -> Callable:
-    """Every status replaced, whatever the answer calls it."""
-
-    def change(answer, rng):
-        name = "statuses" if hasattr(answer, "statuses") else "status"
-        return answer._replace(**{name: np.full(np.shape(getattr(answer, name)), code)})
-
-    return change
+    """Every status replaced."""
+    return _spoilt_part("statuses", lambda statuses, rng: np.full(np.shape(statuses), code))
 
 
 def _claim(change: Callable) -> Callable:
-    """The solver's own value (offsets, or the ellipsoid), moved; the rest as it was."""
-
-    def spoil(answer, rng):
-        if hasattr(answer, "offsets"):
-            return answer._replace(offsets=change(answer.offsets, rng))
-        form = answer.form
-        return answer._replace(form=form._replace(A=change(form.A, rng)))
-
-    return spoil
+    """What is sought as the solver has it, moved; the rest as it was."""
+    return _spoilt_part("unknowns", change)
 
 
 def _raises(answer, rng):
@@ -149,10 +137,6 @@ class Faulty(rj.AbstractSolver):
             return answer
         return FAULTS[self.fault](answer, np.random.default_rng([self.seed, call]))
 
-    def solve(self, program: Any) -> Any:
-        """The answer for facets, spoilt."""
-        return self._spoilt(self.inner.solve(program))
-
-    def enclose(self, program: Any, form: Any = None) -> Any:
-        """The answer for an ellipsoid, spoilt."""
-        return self._spoilt(self.inner.enclose(program, form))
+    def solve(self, program: Any, goal: Any) -> Any:
+        """The answer, spoilt."""
+        return self._spoilt(self.inner.solve(program, goal))

@@ -24,6 +24,7 @@ from tests.campaign.random_regions import Initial
 from tests.campaign.regions import plain
 from tests.campaign.suprema import affine_steps, root
 from tests.campaign.verdicts import Question, judged
+from tests.closed_loops import proposal_of
 
 # x+ = x + clip(-0.4 x, -1, 1), its controller written with the two parts of |x|
 LAYERS = [(np.array([[1.0], [-1.0]]), np.zeros(2)), (np.array([[-0.4, 0.4]]), np.zeros(1))]
@@ -235,7 +236,7 @@ def test_an_exception_of_a_solver_is_a_failed_program():
         )
     assert set(proof.statuses) == {rj.SolverStatus.FAILED}
     with pytest.raises(RuntimeError, match="licence") as passed_on:
-        solver.solve(jax.device_get(proof.program))
+        proposal_of(solver, jax.device_get(proof.program))
     assert unclear(passed_on.value) == "LicenceError from elsewhere"
 
 
@@ -260,10 +261,10 @@ def test_every_fault_is_one():
     assert hash(Faulty(rj.Clarabel(), "None")) == hash(Faulty(rj.Clarabel(), "None"))
     _, proof = rj.reach_step(library_loop(), rj.Box([1.0], [2.0]), rj.Template.box(1))
     program = jax.device_get(proof.program)
-    right = rj.Clarabel().solve(program)
+    right = proposal_of(rj.Clarabel(), program)
     for fault in FAULTS:
         try:
-            answer = Faulty(rj.Clarabel(), fault).solve(program)
+            answer = proposal_of(Faulty(rj.Clarabel(), fault), program)
         except RuntimeError:
             continue
         assert type(answer) is not type(right) or not same(answer, right)

@@ -8,7 +8,7 @@ import reachjax as rj
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.lmi import weighted_products
 from reachjax.proofs.recheck import interval_offsets, sound_offsets
-from tests.closed_loops import closed_loop, random_loop, step_program
+from tests.closed_loops import closed_loop, proposal_of, random_loop, step_program
 from tests.networks import box_region, dead_network, directions, he_network, simulate
 
 STATES = [1, 2, 3, 6]
@@ -32,7 +32,7 @@ def case(request):
     )
     states = np.vstack([region.corners, region.sample(20_000, seed=0)])
     attained = (simulate(data, states, 1)[1] @ directions(n_x, extra=1).T).max(axis=0)
-    return program, rj.Clarabel().solve(program), attained
+    return program, proposal_of(rj.Clarabel(), program), attained
 
 
 def garbage(kind, solved, rng):
@@ -99,7 +99,7 @@ def test_multipliers_that_are_not_finite_are_a_clear_failure(case, bad):
     program, solution, _ = case
     broken = solution.multipliers.copy()
     broken[-1, 0] = bad
-    with pytest.raises(ValueError, match=f"facet {len(broken) - 1} contain NaN or infinity"):
+    with pytest.raises(ValueError, match=f"program {len(broken) - 1} contain NaN or infinity"):
         sound_offsets(program, broken)
 
 
@@ -118,9 +118,9 @@ def test_the_recheck_of_a_solved_program_costs_next_to_nothing(n_x):
     program = jax.device_get(
         step_program(loop, X, X.bounding_box(), template.directions, 0, rj.LocalBounds())
     )
-    solution = rj.Clarabel(tolerance=1e-9).solve(program)
+    solution = proposal_of(rj.Clarabel(tolerance=1e-9), program)
     solved = solution.statuses == rj.SolverStatus.SOLVED
-    excess = sound_offsets(program, solution.multipliers) - solution.offsets
+    excess = sound_offsets(program, solution.multipliers) - solution.unknowns[:, 0]
     # a hundred times the solver's tolerance: feasibility counts once for every entry of the basis
     assert excess[solved].max() <= 1e-7
     assert solved.mean() >= 0.9
@@ -132,7 +132,7 @@ def test_an_offset_that_falls_short_is_raised_by_at_least_what_is_missing(case):
     rng = np.random.default_rng(1)
     n = len(program.transform)
     for i, multipliers in enumerate(np.maximum(solution.multipliers * 0.9, 0)):
-        raised = sound_offsets(program, np.tile(multipliers, (len(solution.offsets), 1)))[i]
+        raised = sound_offsets(program, np.tile(multipliers, (len(solution.statuses), 1)))[i]
         M = weighted_products(program, multipliers).mid
         p = program.objective.mid[i]
         eta = np.c_[rng.uniform(-1, 1, size=(2000, n - 1)), np.ones(2000)]

@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.programs.lmi import lagrangian_slopes, schur_slopes
 from reachjax.proofs.recheck import interval_offsets, sound_level, sound_offsets
-from reachjax.proofs.reported import judged_offsets
+from reachjax.proofs.reported import Sized, judged_offsets
 from reachjax.proofs.slopes import held_level, held_offsets
 from reachjax.sets import NormalForm
+from reachjax.solvers import Facets, LeastVolume
+from reachjax.solvers.ellipsoids import level_slopes
+from reachjax.solvers.facets import offset_slopes
+from reachjax.solvers.least_volume import form_of
+from tests.closed_loops import proposal_of
 from tests.solvers.test_enclosures import case, program
 
 STEP = 1e-6
@@ -20,7 +24,7 @@ def held(request):
     """A program and Clarabel's multipliers for it, off by up to a third."""
     found = program(*case(request.param, seed=request.param))
     noise = np.random.default_rng(0).uniform(0.7, 1.3, found.products.free.shape)
-    return found, noise * np.asarray(rj.Clarabel().solve(found).multipliers)
+    return found, noise * np.asarray(proposal_of(rj.Clarabel(), found).multipliers)
 
 
 def moves(held):
@@ -44,7 +48,7 @@ def along(slopes, direction):
 def offsets_along(program, held, direction):
     """The derivatives of all offsets, one after the other."""
     facets = np.eye(len(program.objective.mid))
-    return [along(lagrangian_slopes(program, *held, facet), direction) for facet in facets]
+    return [along(offset_slopes(program, *held, facet), direction) for facet in facets]
 
 
 def difference(f):
@@ -72,15 +76,16 @@ def test_offsets_by_intervals_have_theirs(held):
 @pytest.mark.parametrize("factor", [1.0, 0.0], ids=["multipliers", "intervals"])
 def test_levels_have_the_derivative_of_what_is_proved(held, factor):
     held, _ = held
-    enclosure = rj.Clarabel().enclose(held)
-    noise = np.random.default_rng(0).uniform(0.9, 1.1, enclosure.multipliers.shape)
+    proposal = proposal_of(rj.Clarabel(), held, LeastVolume())
+    noise = np.random.default_rng(0).uniform(0.9, 1.1, proposal.multipliers.shape)
     # off the middle, where a bound by intervals has no derivative
-    form = enclosure.form._replace(b=enclosure.form.b + 0.01)
-    multipliers = factor * noise * enclosure.multipliers
+    form = form_of(proposal.unknowns[0])
+    form = form._replace(b=form.b + 0.01)
+    multipliers = factor * noise * proposal.multipliers
     moved, direction = moves(held)
-    weights, moments = held_level(held, multipliers, form)
-    assert bool(weights.any()) == bool(factor)
-    mine = along(schur_slopes(held, weights, form, moments)[0], direction)
+    assert bool(held_level(held, multipliers, form).multipliers.any()) == bool(factor)
+    value, off = Sized(form, np.array(np.nan)), proposal._replace(multipliers=multipliers)
+    mine = along(level_slopes(held, value, off)[0], direction)
     proved = difference(lambda h: sound_level(moved(h), multipliers, form))
     assert float(mine) == pytest.approx(proved, rel=1e-5, abs=1e-6)
 
@@ -113,7 +118,7 @@ def test_where_the_ball_alone_bounds_a_direction_the_derivative_holds_too():
 def test_a_point_has_a_level_without_a_derivative():
     held = program(*case(2, seed=0))
     zero = NormalForm(np.zeros((2, 2)), np.zeros(2))
-    weights, moments = held_level(held, np.zeros(len(held.products.free)), zero)
+    weights, moments = held_level(held, np.zeros((1, len(held.products.free))), zero)
     assert not weights.any()
     assert not moments.any()
 
@@ -122,10 +127,12 @@ def test_a_point_has_a_level_without_a_derivative():
 def test_multipliers_that_prove_nothing_are_not_in_the_derivative():
     """Negative ones are clipped in the proof, and so they are where the optimum is borne out."""
     given = program(*case(1, seed=1))
-    found = rj.InteriorPoint().solve(given)
+    found = proposal_of(rj.InteriorPoint(), given)
     signed, small = ~given.products.free, abs(found.multipliers) < 1e-6
     assert (signed & small).any()
     spoilt = found._replace(multipliers=np.where(signed & small, -3.0, found.multipliers))
     mine, clean = judged_offsets(given, spoilt), judged_offsets(given, found)
     assert mine.optimal.all()
-    np.testing.assert_allclose(mine.held.multipliers, clean.held.multipliers, atol=1e-6)
+    goal, weights = Facets(given.objective.mid), np.ones(len(mine.value))
+    slopes = [goal.slopes(given, judged, weights)[0].facts for judged in (mine, clean)]
+    np.testing.assert_allclose(*slopes, atol=1e-6 * abs(slopes[1]).max())

@@ -10,12 +10,13 @@ from scipy.linalg import eigvalsh
 
 import reachjax as rj
 from reachjax.programs.presolve import presolved
+from reachjax.proofs.proposal import CLAIMING
 from reachjax.proofs.recheck import interval_offsets
 from reachjax.proofs.reported import judged_offsets
 from reachjax.solvers import clarabel as direct
 from reachjax.solvers import conic
 from reachjax.solvers.conic import STATUSES
-from tests.closed_loops import closed_loop, one_step, random_loop, step_program
+from tests.closed_loops import closed_loop, one_step, proposal_of, random_loop, step_program
 from tests.networks import box_region, directions, simulate
 
 SOLVERS = {
@@ -38,18 +39,18 @@ def setting():
 
 @pytest.fixture(scope="module", params=SOLVERS.values(), ids=SOLVERS.keys())
 def solution(request, setting):
-    return request.param.solve(setting[2])
+    return proposal_of(request.param, setting[2])
 
 
 def test_solvers_agree(setting, solution):
-    reference = rj.Clarabel().solve(setting[2])
+    reference = proposal_of(rj.Clarabel(), setting[2])
     # SCS stops at 1e-7 of feasibility, which leaves some 1e-5 in the value
-    np.testing.assert_allclose(solution.offsets, reference.offsets, atol=2e-5)
+    np.testing.assert_allclose(solution.unknowns, reference.unknowns, atol=2e-5)
 
 
 def test_called_directly_clarabel_answers_as_it_does_by_cvxpy(setting):
-    straight, by_name = SOLVERS["Clarabel"].solve(setting[2]), SOLVERS["by name"].solve(setting[2])
-    np.testing.assert_allclose(straight.offsets, by_name.offsets, atol=1e-8)
+    straight, by_name = (proposal_of(SOLVERS[name], setting[2]) for name in ("Clarabel", "by name"))
+    np.testing.assert_allclose(straight.unknowns, by_name.unknowns, atol=1e-8)
     np.testing.assert_allclose(straight.moments, by_name.moments, atol=1e-4)
     np.testing.assert_array_equal(straight.statuses, by_name.statuses)
 
@@ -73,7 +74,7 @@ def test_moments_are_semidefinite_with_corner_one_and_satisfy_facts_and_compleme
 def test_the_moment_attains_the_offset(setting, solution):
     program = setting[2]
     attained = np.einsum("fi,fi->f", program.objective.mid, solution.moments[:, :, -1])
-    np.testing.assert_allclose(attained, solution.offsets, atol=1e-4)
+    np.testing.assert_allclose(attained, solution.unknowns[:, 0], atol=1e-4)
 
 
 def test_signed_multipliers_are_nonnegative_to_tolerance(setting, solution):
@@ -123,7 +124,7 @@ def test_bounds_are_sound_under_every_status_that_cvxpy_has(setting, monkeypatch
             variable.save_value(None if "feasible" in word else value)
 
     monkeypatch.setattr(cp.Problem, "solve", solve)
-    solution = rj.SCS().solve(program)
+    solution = proposal_of(rj.SCS(), program)
     assert set(solution.statuses) == {STATUSES[word]}
     require_sound(data, region, program, solution)
     if word == "solver_error" or "feasible" in word:
@@ -132,7 +133,8 @@ def test_bounds_are_sound_under_every_status_that_cvxpy_has(setting, monkeypatch
 
 def require_sound(data, region, program, solution):
     bounds = judged_offsets(program, solution).value
-    certificate = rj.Certificate.from_solution(program, bounds, solution)
+    claims = solution.unknowns[:, 0]
+    certificate = rj.Certificate.of(program, solution, bounds=bounds, solver_offsets=claims)
     states = np.vstack([region.corners, region.sample(20_000, seed=0)])
     attained = (simulate(data, states, 1)[1] @ directions(3, extra=1).T).max(axis=0)
     assert np.all(certificate.bounds >= attained)
@@ -142,7 +144,7 @@ def require_sound(data, region, program, solution):
 def require_nothing_proposed(program, solution):
     bounds = judged_offsets(program, solution).value
     np.testing.assert_array_equal(bounds, interval_offsets(program))
-    assert np.isnan(solution.offsets).all()
+    assert np.isnan(solution.unknowns).all()
     assert np.isnan(solution.moments).all()
 
 
@@ -166,10 +168,10 @@ def test_bounds_are_sound_under_every_status_that_clarabel_has(setting, monkeypa
         return SimpleNamespace(solve=solve)
 
     monkeypatch.setattr(clarabel, "DefaultSolver", solver)
-    solution = rj.Clarabel().solve(program)
+    solution = proposal_of(rj.Clarabel(), program)
     assert set(solution.statuses) == {direct.STATUSES.get(word, rj.SolverStatus.FAILED)}
     require_sound(data, region, program, solution)
-    if direct.STATUSES.get(word) not in direct.ANSWERS:
+    if direct.STATUSES.get(word) not in CLAIMING:
         require_nothing_proposed(program, solution)
 
 
@@ -189,7 +191,7 @@ def test_clarabel_can_be_interrupted(setting, monkeypatch, interrupt):
 
     monkeypatch.setattr(clarabel, "DefaultSolver", solver)
     with pytest.raises(interrupt):
-        rj.Clarabel().solve(setting[2])
+        proposal_of(rj.Clarabel(), setting[2])
 
 
 def test_every_status_of_cvxpy_is_mapped():
@@ -234,9 +236,7 @@ def test_rows_at_rounding_level_and_empty_columns_do_not_reach_the_solver(settin
     np.testing.assert_allclose(sizes, 1.0, rtol=0.5)  # sums of pairs are estimated
 
 
-@pytest.mark.parametrize(
-    ("model", "name"), [(direct.FacetCone, "Clarabel"), (conic.FacetModel, "SCS")]
-)
+@pytest.mark.parametrize(("model", "name"), [(direct.Cone, "Clarabel"), (conic.Model, "SCS")])
 def test_the_model_is_built_once_for_all_facets(setting, monkeypatch, model, name):
     built = []
     original = model.__init__
@@ -246,7 +246,7 @@ def test_the_model_is_built_once_for_all_facets(setting, monkeypatch, model, nam
         original(self, *args)
 
     monkeypatch.setattr(model, "__init__", counted)
-    SOLVERS[name].solve(setting[2])
+    proposal_of(SOLVERS[name], setting[2])
     assert len(built) == 1
 
 
@@ -254,5 +254,5 @@ def test_a_facet_does_not_depend_on_the_facets_solved_before_it(setting):
     program = setting[2]
     order = np.arange(len(program.objective.mid))[::-1]
     turned = program.replace(objective=program.objective[order])
-    forward, backward = rj.Clarabel().solve(program), rj.Clarabel().solve(turned)
-    np.testing.assert_allclose(forward.offsets, backward.offsets[order], atol=1e-12)
+    forward, backward = (proposal_of(rj.Clarabel(), each) for each in (program, turned))
+    np.testing.assert_allclose(forward.unknowns, backward.unknowns[order], atol=1e-12)

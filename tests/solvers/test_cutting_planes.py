@@ -150,9 +150,9 @@ class Counting(rj.AbstractSolver):
 
     solved: list = field(default_factory=list, compare=False)
 
-    def solve(self, program):
+    def solve(self, program, goal):
         self.solved.append(len(program.products.free))
-        return rj.InteriorPoint().solve(program)
+        return rj.InteriorPoint().solve(program, goal)
 
 
 @pytest.mark.costly

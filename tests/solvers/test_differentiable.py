@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.programs.lmi import lagrangian_slopes
 from reachjax.proofs.proposal import OF_SOLVERS
+from reachjax.proofs.reported import judged_offsets
 from reachjax.solvers import Facets, proved
-from reachjax.solvers.clarabel import FacetCone
+from reachjax.solvers.clarabel import Cone
 from tests.closed_loops import closed_loop, random_loop, recursion, step_program
 from tests.differences import along, error_in_all_parts, norm, relative_error
 from tests.networks import box_region, simplex_region
@@ -106,9 +106,10 @@ def test_the_lagrangian_at_the_solution_is_the_offset():
     program = step_program(loop, X, X.bounding_box(), TEMPLATE.directions, 0, rj.LocalBounds())
     offsets, solution = jax.device_get(proved_offsets(program, rj.Clarabel()))
     facts, objective = program.facts.mid, program.objective.mid
+    goal, program = Facets(TEMPLATE.directions), jax.device_get(program)
+    judged = judged_offsets(program, solution)
     for facet in range(len(offsets)):
-        held = solution.multipliers, solution.moments, np.eye(len(offsets))[facet]
-        slopes = lagrangian_slopes(jax.device_get(program), *held)
+        slopes, _ = goal.slopes(program, judged, np.eye(len(offsets))[facet])
         # it is quadratic in the facts and linear in the objective
         value = np.sum(slopes.facts * facts) / 2 + np.sum(slopes.objective * objective)
         assert value == pytest.approx(offsets[facet], abs=1e-6)
@@ -338,9 +339,9 @@ class Stubborn(rj.AbstractSolver):
     changes: dict = dataclasses.field(default_factory=dict, hash=False)
     said: list = dataclasses.field(default_factory=list, hash=False, compare=False)
 
-    def solve(self, program):
+    def solve(self, program, goal):
         if not self.said:
-            found = rj.Clarabel().solve(program)
+            found = rj.Clarabel().solve(program, goal)
             noise = np.random.default_rng(0).normal(size=found.multipliers.shape)
             self.said.append(
                 found._replace(
@@ -384,10 +385,10 @@ def test_a_claim_that_is_borne_out_has_the_gradient_of_the_optimum_whatever_the_
             {"moments": -3.0},
             {"moments": 0.99},
             {"moments": np.nan},
-            {"offsets": 1.1},
-            {"offsets": 0.9},
+            {"unknowns": 1.1},
+            {"unknowns": 0.9},
         ],
-        lambda changes: changes.get("moments") == 0.99 or changes.get("offsets") == 0.9,
+        lambda changes: changes.get("moments") == 0.99 or changes.get("unknowns") == 0.9,
     ),
     ids=str,
 )
@@ -419,12 +420,12 @@ def test_what_a_solver_proposes_has_no_derivative():
 )
 @pytest.mark.costly
 def test_the_gradient_of_an_interval_bound_is_the_central_difference(monkeypatch, relaxation):
-    def fail(cone, row):
+    def fail(cone, constant):
         return rj.SolverStatus.FAILED, None
 
     args, f = planar(0), partial(value, relaxation=relaxation)
     optimum = f(*args)
-    monkeypatch.setattr(FacetCone, "solved", fail)
+    monkeypatch.setattr(Cone, "solved", fail)
     bound, gradient = jax.value_and_grad(f, argnums=(0, 1))(*args)
     assert bound > optimum + 0.1
     for part in ("weights", "A", "B", "c", "initial set"):

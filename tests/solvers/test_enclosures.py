@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.proofs.proposal import Enclosure
+from reachjax.proofs.proposal import Proposal
 from reachjax.proofs.recheck import sound_level
-from reachjax.proofs.reported import judged_form
+from reachjax.proofs.reported import judged_least
 from reachjax.sets import NormalForm
+from reachjax.solvers import LeastVolume
+from reachjax.solvers.least_volume import form_of
 from tests.closed_loops import closed_loop, random_loop, recursion, step_program
 from tests.differences import error_in_all_parts
 
@@ -34,7 +36,7 @@ def solved(request):
     """(loop, set, its program, what Clarabel proposes)."""
     loop, X = case(request.param, seed=request.param)
     held = program(loop, X)
-    return loop, X, held, rj.Clarabel().enclose(held)
+    return loop, X, held, rj.Clarabel().solve(held, LeastVolume())
 
 
 def successors(loop, X, count=4000):
@@ -46,8 +48,11 @@ def successors(loop, X, count=4000):
 def test_any_multipliers_prove_a_level_that_no_trajectory_exceeds(solved):
     loop, X, held, enclosure = solved
     reached, rng = np.asarray(successors(loop, X)), np.random.default_rng(0)
-    K, q = len(enclosure.multipliers), loop.states
-    forms = [enclosure.form, NormalForm(rng.normal(size=(q, q)), rng.normal(size=q))]
+    K, q = enclosure.multipliers.shape, loop.states
+    forms = [
+        form_of(enclosure.unknowns[0]),
+        NormalForm(rng.normal(size=(q, q)), rng.normal(size=q)),
+    ]
     garbage = [
         np.zeros(K),
         enclosure.multipliers,
@@ -64,36 +69,39 @@ def test_any_multipliers_prove_a_level_that_no_trajectory_exceeds(solved):
 
 def test_what_clarabel_proposes_is_proved_nearly_as_it_stands(solved):
     _, _, held, enclosure = solved
-    form, level, optimal = judged_form(held, enclosure)
+    form = form_of(enclosure.unknowns[0])
+    value, optimal = judged_least(held, enclosure, form)
     assert optimal
-    assert 1.0 <= level <= 1 + 1e-6
-    np.testing.assert_array_equal(form.A, enclosure.form.A)
+    assert 1.0 <= value.level <= 1 + 1e-6
+    np.testing.assert_array_equal(value.form.A, form.A)
 
 
 @pytest.mark.parametrize("broken", ["nothing", "nan", "singular", "tiny", "huge"])
 @pytest.mark.costly
 def test_whatever_form_is_proposed_the_ellipsoid_holds_the_successors(solved, broken):
     loop, X, held, enclosure = solved
-    A, b = enclosure.form
+    A, b = form_of(enclosure.unknowns[0])
+    nothing = Proposal.blank(held, LeastVolume())
     proposed = {
-        "nothing": Enclosure.blank(held),
-        "nan": enclosure._replace(form=NormalForm(np.nan * A, b)),
-        "singular": enclosure._replace(form=NormalForm(0.0 * A, b)),
-        "tiny": enclosure._replace(form=NormalForm(1e-9 * A, 1e-9 * b)),
-        "huge": enclosure._replace(form=NormalForm(1e9 * A, 1e9 * b)),
+        "nothing": (nothing, form_of(nothing.unknowns[0])),
+        "nan": (enclosure, NormalForm(np.nan * A, b)),
+        "singular": (enclosure, NormalForm(0.0 * A, b)),
+        "tiny": (enclosure, NormalForm(1e-9 * A, 1e-9 * b)),
+        "huge": (enclosure, NormalForm(1e9 * A, 1e9 * b)),
     }[broken]
-    form, level, optimal = judged_form(held, proposed)
+    value, optimal = judged_least(held, *proposed)
     assert not optimal
-    region = rj.Ellipsoid.enclosing(NormalForm(*map(jnp.asarray, form)), level)
+    region = rj.Ellipsoid.enclosing(NormalForm(*map(jnp.asarray, value.scaled)), value.level)
     assert region.contains(successors(loop, X)).all()
 
 
 def test_a_wrong_shape_of_multipliers_is_named(solved):
     _, _, held, enclosure = solved
-    with pytest.raises(ValueError, match=r"multipliers must be finite and have shape \(\d+,\)"):
-        sound_level(held, enclosure.multipliers[1:], enclosure.form)
-    with pytest.raises(ValueError, match="multipliers must be finite"):
-        sound_level(held, np.nan * enclosure.multipliers, enclosure.form)
+    form = form_of(enclosure.unknowns[0])
+    with pytest.raises(ValueError, match=r"multipliers must have shape \(1, \d+\)"):
+        sound_level(held, enclosure.multipliers[0], form)
+    with pytest.raises(ValueError, match="multipliers of program 0 contain NaN or infinity"):
+        sound_level(held, np.nan * enclosure.multipliers, form)
 
 
 def final(template, horizon, solver=rj.Auto(), relaxation=rj.LocalBounds()):  # noqa: B008

@@ -11,7 +11,6 @@ import pytest
 
 import reachjax as rj
 from reachjax.proofs.recheck import interval_offsets
-from reachjax.sets import NormalForm
 from tests.solvers.test_differentiable import TEMPLATE, planar
 from tests.solvers.test_enclosures import case
 
@@ -28,11 +27,8 @@ class Faulty(rj.AbstractSolver):
 
     spoil: Callable
 
-    def solve(self, program):
-        return self.spoil(rj.Clarabel().solve(program))
-
-    def enclose(self, program, form=None):
-        return self.spoil(rj.Clarabel().enclose(program, form))
+    def solve(self, program, goal):
+        return self.spoil(rj.Clarabel().solve(program, goal))
 
 
 def raising(error):
@@ -43,31 +39,30 @@ def raising(error):
 
 
 def changed(**changes):
-    """Fields replaced by functions of what they were; `statuses` is an enclosure's `status`."""
+    """Fields replaced by functions of what they were."""
 
     def spoil(found):
         for name, change in changes.items():
-            field = name if name in found._fields else "status"
-            found = found._replace(**{field: change(np.asarray(getattr(found, field)))})
+            found = found._replace(**{name: change(np.asarray(getattr(found, name)))})
         return found
 
     return spoil
 
 
 WRONG = {
-    "nothing": (lambda found: None, "a Solution was expected, but None arrived"),
+    "nothing": (lambda found: None, "a Proposal was expected, but None arrived"),
     "a list": (lambda found: [1.0, 2.0], r"but \[1\.0, 2\.0\] arrived"),
-    "a plain tuple": (tuple, "a Solution was expected, but a tuple arrived"),
+    "a plain tuple": (tuple, "a Proposal was expected, but a tuple arrived"),
     "too few multipliers": (
         changed(multipliers=lambda y: y[..., 1:]),
-        r"solution\.multipliers must be numbers of shape \(\d, \d+\), but an array of shape",
+        r"proposal\.multipliers must be numbers of shape \(\d, \d+\), but an array of shape",
     ),
     "ragged multipliers": (changed(multipliers=lambda y: [[1.0], [1.0, 2.0]]), "multipliers must"),
     "no multipliers": (changed(multipliers=lambda y: None), "but None arrived"),
     "text": (changed(multipliers=lambda y: y.astype(str)), "but an array of <U32 arrived"),
     "complex": (changed(multipliers=lambda y: y + 0j), "but an array of complex128 arrived"),
-    "moments of another shape": (changed(moments=lambda X: X[..., :-1]), "solution.moments must"),
-    "seconds as text": (changed(seconds=lambda s: "soon"), "solution.seconds must be numbers"),
+    "moments of another shape": (changed(moments=lambda X: X[..., :-1]), "proposal.moments must"),
+    "seconds as text": (changed(seconds=lambda s: "soon"), "proposal.seconds must be numbers"),
     "statuses as text": (changed(statuses=lambda s: "optimal"), "statuses must be whole numbers"),
     "an unknown status": (changed(statuses=lambda s: 0 * s + 17), "is 17, which no solver's"),
     "a negative status": (changed(statuses=lambda s: 0 * s - 1), "is -1, which no solver's"),
@@ -102,7 +97,7 @@ def test_facets_of_a_faulty_solver_have_the_bound_that_needs_none(fault, relaxat
     assert (proof.gaps >= 0).all()
 
 
-@pytest.mark.parametrize("fault", [f for f in WRONG if f != "a plain tuple"])
+@pytest.mark.parametrize("fault", WRONG)
 @pytest.mark.parametrize("shape", [None, np.eye(2)], ids=["free", "given"])
 @pytest.mark.costly
 def test_ellipsoids_of_a_faulty_solver_hold(fault, shape):
@@ -121,16 +116,16 @@ def test_ellipsoids_of_a_faulty_solver_hold(fault, shape):
 @pytest.mark.parametrize(
     "spoil",
     [
-        lambda found: found._replace(form=None),
-        lambda found: found._replace(form=NormalForm("A", "b")),
-        lambda found: found._replace(form=NormalForm(found.form.A[:1], found.form.b)),
+        lambda found: found._replace(unknowns=None),
+        lambda found: found._replace(unknowns=[["A", "b"]]),
+        lambda found: found._replace(unknowns=found.unknowns[:, 1:]),
     ],
     ids=["none", "text", "shape"],
 )
 @pytest.mark.costly
 def test_a_form_that_is_none_is_a_fault(spoil):
     loop, X0 = case(2, 0, hidden=(3,))
-    with pytest.warns(RuntimeWarning, match=r"enclosure\.form"):
+    with pytest.warns(RuntimeWarning, match=r"proposal\.unknowns"):
         _, proof = rj.reach_step(loop, X0, rj.EllipsoidTemplate(), solver=Faulty(spoil), samples=50)
     assert proof.statuses == (FAILED,)
 
@@ -171,8 +166,8 @@ def test_faults_inside_jit_are_failed_proposals_too(fault):
 def test_a_solver_may_be_wrong_in_a_compiled_step_too(answer, compiled):
     @dataclasses.dataclass(frozen=True)
     class Wrong(rj.AbstractSolver):
-        def solve(self, program):
-            return answer(rj.Clarabel().solve(program))
+        def solve(self, program, goal):
+            return answer(rj.Clarabel().solve(program, goal))
 
     loop, X0 = planar(0)
 

@@ -12,11 +12,19 @@ import reachjax as rj
 from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import ANSWERS
 from reachjax.proofs.recheck import interval_offsets
-from reachjax.proofs.reported import judged_form, judged_offsets, log_volume
+from reachjax.proofs.reported import judged_least, judged_offsets, judged_shape
 from reachjax.sets import NormalForm
-from reachjax.solvers import barrier, centring, primal_dual
-from reachjax.solvers.barrier import EllipsoidBarrier
-from tests.closed_loops import closed_loop, one_step, random_loop, recursion, step_program
+from reachjax.solvers import GivenShape, LeastVolume, barrier, primal_dual
+from reachjax.solvers.barrier import Barrier
+from reachjax.solvers.least_volume import form_of
+from tests.closed_loops import (
+    closed_loop,
+    one_step,
+    proposal_of,
+    random_loop,
+    recursion,
+    step_program,
+)
 from tests.differences import dot, error_in_all_parts
 from tests.networks import (
     affine_network,
@@ -111,16 +119,16 @@ DEGENERATE = {
 def answer(request):
     """(program, solution, Clarabel's)."""
     given = program(**request.param)
-    return given, SOLVER.solve(given), rj.Clarabel().solve(given)
+    return given, proposal_of(SOLVER, given), proposal_of(rj.Clarabel(), given)
 
 
 def test_a_run_that_stalls_goes_again_with_less_damping(monkeypatch):
     given = program(X=simplex)
-    expected = SOLVER.solve(given)
+    expected = proposal_of(SOLVER, given)
     monkeypatch.setattr(primal_dual, "DAMPING", 100.0)  # stalls
-    found = SOLVER.solve(given)
+    found = proposal_of(SOLVER, given)
     assert np.all(found.statuses == rj.SolverStatus.SOLVED)
-    np.testing.assert_allclose(found.offsets, expected.offsets, atol=1e-6)
+    np.testing.assert_allclose(found.unknowns, expected.unknowns, atol=1e-6)
 
 
 def test_it_agrees_with_clarabel(answer):
@@ -128,7 +136,7 @@ def test_it_agrees_with_clarabel(answer):
     solved = reference.statuses == rj.SolverStatus.SOLVED
     assert solved.any()
     size = interval_offsets(given) - given.objective.mid[:, -1]
-    apart = (solution.offsets - reference.offsets)[solved] / np.maximum(size[solved], 1e-9)
+    apart = (solution.unknowns - reference.unknowns)[solved, 0] / np.maximum(size[solved], 1e-9)
     # Clarabel itself moves by 1.5e-5 from a tolerance of 1e-8 to one of 1e-9
     np.testing.assert_allclose(apart, 0, atol=1e-5)
     # what the recheck proves is never looser
@@ -175,9 +183,9 @@ def test_no_sampled_successor_is_outside(seed):
 
 def test_a_run_that_is_stopped_early_says_so_and_is_sound():
     given = program()
-    best = SOLVER.solve(given).offsets
+    best = proposal_of(SOLVER, given).unknowns[:, 0]
     for limit in (1, 3, 6):
-        solution = rj.InteriorPoint(max_iterations=limit).solve(given)
+        solution = proposal_of(rj.InteriorPoint(max_iterations=limit), given)
         assert set(solution.statuses) == {rj.SolverStatus.LIMIT}
         assert np.isfinite(solution.multipliers).all()
         bounds, optimal, *_ = judged_offsets(given, solution)
@@ -188,9 +196,10 @@ def test_a_run_that_is_stopped_early_says_so_and_is_sound():
 
 def test_a_tolerance_that_is_out_of_reach_ends_inaccurate():
     given = program(relaxation=rj.PaperQC(repeated=False))
-    solution = rj.InteriorPoint(tolerance=1e-16).solve(given)
+    solution = proposal_of(rj.InteriorPoint(tolerance=1e-16), given)
     assert set(solution.statuses) == {rj.SolverStatus.INACCURATE}
-    np.testing.assert_allclose(solution.offsets, SOLVER.solve(given).offsets, atol=1e-7)
+    expected = proposal_of(SOLVER, given).unknowns
+    np.testing.assert_allclose(solution.unknowns, expected, atol=1e-7)
 
 
 GARBAGE = {
@@ -207,7 +216,7 @@ def test_garbage_ends_with_finite_multipliers_and_a_status(kind):
     given = program(hidden=(4,))
     rows = GARBAGE[kind](given.facts.mid, np.random.default_rng(0))
     given = given.with_midpoints(rows, given.objective.mid)
-    solution = SOLVER.solve(given)
+    solution = proposal_of(SOLVER, given)
     assert np.isfinite(solution.multipliers).all()
     assert np.all(solution.multipliers[:, ~given.products.free] >= 0)
     assert {rj.SolverStatus(int(code)).advice for code in solution.statuses}
@@ -225,7 +234,7 @@ def test_programs_that_are_not_numbers_get_a_blank_proposal(traced, bad):
     offsets, solution = (jax.jit(solve) if traced else solve)(given)
     assert np.isnan(offsets).all()
     assert np.all(solution.multipliers == 0)
-    assert np.isnan(solution.offsets).all()
+    assert np.isnan(solution.unknowns).all()
     assert np.isnan(solution.moments).all()
     assert set(np.asarray(solution.statuses)) == {rj.SolverStatus.FAILED}
 
@@ -311,7 +320,7 @@ def enclosed(request):
     """(program of an ellipsoid, what is proposed for it)."""
     n_x = request.param.get("n_x", 3)
     given = program(**{"X": round_of, **request.param, "rows": np.eye(n_x)})
-    return given, SOLVER.enclose(given)
+    return given, SOLVER.solve(given, LeastVolume())
 
 
 SIGNS = 1e-5
@@ -326,7 +335,7 @@ def least_log_volume(given, enclosure):
     symmetric part of `-2 X_21 (K^-1 P)'`, where `P` are the rows of the successor. The largest
     `det R` of these is that of `R = c / q D^-1`.
     """
-    n, q, X = len(given.transform), len(enclosure.form.b), enclosure.moments
+    n, q, X = len(given.transform), len(given.objective.mid), enclosure.moments[0]
     facts, products = given.facts.mid, given.products
     pairs = np.einsum("pi,pi->p", facts[products.left] @ X[:n, :n], facts[products.right])
     sums = np.bincount(products.multiplier, products.sign * pairs, len(products.free))
@@ -342,35 +351,36 @@ def least_log_volume(given, enclosure):
 
 def test_an_ellipsoid_is_the_smallest_of_its_relaxation(enclosed):
     given, enclosure = enclosed
-    assert int(enclosure.status) == rj.SolverStatus.SOLVED
-    form, level, optimal = judged_form(given, enclosure)
+    assert enclosure.statuses == rj.SolverStatus.SOLVED
+    value, optimal = judged_least(given, enclosure, form_of(enclosure.unknowns[0]))
     assert optimal
-    assert level == pytest.approx(1.0, abs=1e-6)
-    size = -np.linalg.slogdet(form.A)[1]
+    assert value.level == pytest.approx(1.0, abs=1e-6)
+    size = -np.linalg.slogdet(value.form.A)[1]
     assert size == pytest.approx(least_log_volume(given, enclosure), abs=1e-4)
 
 
 def test_ellipsoids_are_those_of_clarabel_where_it_solves(enclosed):
     given, enclosure = enclosed
-    reference = rj.Clarabel().enclose(given)
-    assert reference.status == rj.SolverStatus.SOLVED or len(given.products.free) > 20
-    if reference.status == rj.SolverStatus.SOLVED:
-        sizes = [-np.linalg.slogdet(found.form.A)[1] for found in (enclosure, reference)]
+    reference = rj.Clarabel().solve(given, LeastVolume())
+    assert reference.statuses == rj.SolverStatus.SOLVED or len(given.products.free) > 20
+    if reference.statuses == rj.SolverStatus.SOLVED:
+        forms = [form_of(found.unknowns[0]) for found in (enclosure, reference)]
+        sizes = [-np.linalg.slogdet(form.A)[1] for form in forms]
         assert sizes[0] == pytest.approx(sizes[1], abs=1e-5)
 
 
 def test_a_given_shape_gets_the_size_that_clarabel_gives_it(enclosed):
     given, enclosure = enclosed
     q = len(given.objective.mid)
-    shape = NormalForm(enclosure.form.A @ np.diag(np.linspace(1, 2, q)), 0.7 * enclosure.form.b)
-    ours, theirs = (solver.enclose(given, shape) for solver in (SOLVER, rj.Clarabel()))
-    assert int(ours.status) == rj.SolverStatus.SOLVED
-    assert judged_form(given, ours, shape)[2]
-    factor = np.sum(ours.form.A * shape.A) / np.sum(shape.A**2)
-    np.testing.assert_allclose(ours.form.A, factor * shape.A, rtol=1e-9)
-    np.testing.assert_allclose(ours.form.b, factor * shape.b, rtol=1e-9, atol=1e-12)
-    if theirs.status == rj.SolverStatus.SOLVED:
-        np.testing.assert_allclose(ours.form.A, theirs.form.A, rtol=1e-5, atol=1e-8)
+    A, b = form_of(enclosure.unknowns[0])
+    shape = NormalForm(A @ np.diag(np.linspace(1, 2, q)), 0.7 * b)
+    ours, theirs = (each.solve(given, GivenShape(shape)) for each in (SOLVER, rj.Clarabel()))
+    assert ours.statuses == rj.SolverStatus.SOLVED
+    value, optimal = judged_shape(given, ours, shape)
+    assert optimal
+    assert value.factor == ours.unknowns[0, 0]
+    if theirs.statuses == rj.SolverStatus.SOLVED:
+        np.testing.assert_allclose(ours.unknowns, theirs.unknowns, rtol=1e-5)
 
 
 @pytest.mark.costly
@@ -383,15 +393,15 @@ def test_all_neurons_of_a_step_that_clarabel_gives_up_on():
         rows=np.eye(6),
         relaxation=rj.PaperQC(repeated=False),
     )
-    assert int(SOLVER.enclose(given).status) == rj.SolverStatus.SOLVED
+    assert SOLVER.solve(given, LeastVolume()).statuses == rj.SolverStatus.SOLVED
 
 
 @pytest.mark.costly
 def test_a_shape_around_one_point_has_no_size():
     given = program(X=round_of, rows=np.eye(3))
     given = given.with_midpoints(given.facts.mid, 0 * given.objective.mid)
-    found = SOLVER.enclose(given, NormalForm(np.eye(3), np.zeros(3)))
-    assert int(found.status) == rj.SolverStatus.UNBOUNDED
+    found = SOLVER.solve(given, GivenShape(NormalForm(np.eye(3), np.zeros(3))))
+    assert found.statuses == rj.SolverStatus.UNBOUNDED
     assert np.all(found.multipliers == 0)
 
 
@@ -401,11 +411,12 @@ def test_ellipsoids_from_garbage_are_sound_or_blank(kind):
     given = program(X=round_of, hidden=(4,), rows=np.eye(3))
     rows = GARBAGE[kind](given.facts.mid, np.random.default_rng(0))
     given = given.with_midpoints(rows, given.objective.mid)
-    found = SOLVER.enclose(given)
+    found = SOLVER.solve(given, LeastVolume())
     assert np.isfinite(found.multipliers).all()
-    assert np.all(found.multipliers[~given.products.free] >= 0)
-    assert np.isfinite(found.form.A).all() == (found.status in ANSWERS)
-    assert np.isfinite(log_volume(*judged_form(given, found)[:2]))
+    assert np.all(found.multipliers[:, ~given.products.free] >= 0)
+    assert np.isfinite(found.unknowns).all() == (found.statuses[0] in ANSWERS)
+    value, _ = judged_least(given, found, form_of(found.unknowns[0]))
+    assert np.isfinite(value.log_volume)
 
 
 UNKNOWN = {
@@ -418,8 +429,8 @@ UNKNOWN = {
 
 @pytest.mark.parametrize("kind", UNKNOWN)
 def test_no_ellipsoid_is_proposed_from_what_is_no_number(kind):
-    found = SOLVER.enclose(UNKNOWN[kind](program(X=round_of, rows=np.eye(3))))
-    assert int(found.status) == rj.SolverStatus.FAILED
+    found = SOLVER.solve(UNKNOWN[kind](program(X=round_of, rows=np.eye(3))), LeastVolume())
+    assert found.statuses == rj.SolverStatus.FAILED
     assert np.all(found.multipliers == 0)
 
 
@@ -429,10 +440,10 @@ def test_a_path_that_is_lost_still_gives_an_ellipsoid(network):
     """Stable neurons that are kept have opposite facts, whose multipliers grow without bound."""
     relaxation = rj.LocalBounds(repeated=False, remove_stable=False)
     given = program(X=round_of, network=network, rows=np.eye(3), relaxation=relaxation)
-    found, reference = SOLVER.enclose(given), rj.Clarabel().enclose(given)
-    assert found.status in ANSWERS
-    sizes = [log_volume(*judged_form(given, each)[:2]) for each in (found, reference)]
-    assert sizes[0] <= sizes[1] + 0.2
+    both = [solver.solve(given, LeastVolume()) for solver in (SOLVER, rj.Clarabel())]
+    assert both[0].statuses[0] in ANSWERS
+    values = [judged_least(given, found, form_of(found.unknowns[0]))[0] for found in both]
+    assert values[0].log_volume <= values[1].log_volume + 0.2
 
 
 @pytest.mark.parametrize(
@@ -455,9 +466,10 @@ def test_gradients_of_ellipsoids_of_weights_that_are_no_numbers_are_none(shape):
 @pytest.mark.costly
 def test_the_barrier_s_derivatives_are_its_differences(shape, monkeypatch):
     monkeypatch.setattr(barrier, "DAMPING", 0.3)
-    given = None if shape is None else NormalForm(shape, np.array([0.1, -0.2]))
-    function = EllipsoidBarrier(presolved(program(n_x=2, X=round_of, rows=np.eye(2))), given)
-    function.price, weight, rng = 7.0, 0.1, np.random.default_rng(0)
+    goal = LeastVolume() if shape is None else GivenShape(NormalForm(shape, np.array([0.1, -0.2])))
+    function = Barrier(goal.pencil(program(n_x=2, X=round_of, rows=np.eye(2))))
+    function.cost[function.count] = 7.0 * function.unit
+    weight, rng = 0.1, np.random.default_rng(0)
     y = function.inside()
     for _ in range(5):  # away from the edge
         gradient, hessian = function.derivatives(y, weight)
@@ -477,9 +489,9 @@ def test_the_barrier_s_derivatives_are_its_differences(shape, monkeypatch):
 
 @pytest.mark.costly
 def test_programs_with_too_many_multipliers_are_left_alone(monkeypatch):
-    monkeypatch.setattr(centring, "MOST_MULTIPLIERS", 3)
-    found = SOLVER.enclose(program(X=round_of, rows=np.eye(3)))
-    assert int(found.status) == rj.SolverStatus.FAILED
+    monkeypatch.setattr(barrier, "MOST_MULTIPLIERS", 3)
+    found = SOLVER.solve(program(X=round_of, rows=np.eye(3)), LeastVolume())
+    assert found.statuses == rj.SolverStatus.FAILED
     assert np.all(found.multipliers == 0)
 
 
@@ -489,13 +501,15 @@ def test_auto_chooses_by_size_alone_and_asks_the_small_one_where_the_large_one_f
     auto = rj.Auto()
     assert auto.choice(small) == rj.Clarabel()
     assert auto.choice(large) == rj.InteriorPoint()
-    np.testing.assert_array_equal(auto.solve(small).offsets, rj.Clarabel().solve(small).offsets)
-    np.testing.assert_array_equal(auto.solve(large).offsets, SOLVER.solve(large).offsets)
+    for given, solver in ((small, rj.Clarabel()), (large, SOLVER)):
+        found, expected = (proposal_of(each, given).unknowns for each in (auto, solver))
+        np.testing.assert_array_equal(found, expected)
     many = program(hidden=(20, 20), relaxation=rj.LocalBounds())
     assert auto.choice(many) == rj.Clarabel()
     given = program(X=round_of, rows=np.eye(3), relaxation=rj.PaperQC(repeated=False))
-    np.testing.assert_array_equal(auto.enclose(given).form.A, SOLVER.enclose(given).form.A)
-    monkeypatch.setattr(centring, "MOST_MULTIPLIERS", 3)
-    np.testing.assert_array_equal(auto.enclose(given).form.A, rj.Clarabel().enclose(given).form.A)
+    for limit, solver in ((1500, SOLVER), (3, rj.Clarabel())):
+        monkeypatch.setattr(barrier, "MOST_MULTIPLIERS", limit)
+        found, expected = (each.solve(given, LeastVolume()).unknowns for each in (auto, solver))
+        np.testing.assert_array_equal(found, expected)
     with pytest.raises(TypeError, match=r"Auto\.small"):
         rj.Auto(small="clarabel")

@@ -175,11 +175,11 @@ class Counting(rj.AbstractSolver):
     asked: list = dataclasses.field(default_factory=list, hash=False, compare=False)
     failing: int | None = None
 
-    def solve(self, program):
+    def solve(self, program, goal):
         self.asked.append(program)
         if self.failing and len(self.asked) % self.failing == 0:
             raise ArithmeticError("one call in so many")
-        return rj.Clarabel().solve(program)
+        return rj.Clarabel().solve(program, goal)
 
 
 @pytest.mark.parametrize("compiled", [False, True])

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.primitives.equations import Equation, Rule, entrywise, on_host
+from reachjax.loops.primitives.picks import product_of
 from reachjax.loops.primitives.related import over_norm, over_sum
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import Reciprocal
@@ -67,7 +68,7 @@ def _contracted(recorder: Recorder, equation: Equation, operands: Sequence[Opera
         arranged(right, batch_right, over_right)[:, None],
     )
     one, other = np.broadcast_arrays(one, other)
-    products = recorder.product(recorder.picked(left, one), recorder.picked(right, other))
+    products = product_of(recorder, recorder.picked(left, one), recorder.picked(right, other))
     count = math.prod(equation.shape)
     sums = np.kron(np.eye(count), np.ones((1, one.shape[-1])))
     return recorder.mapped(products, sums, equation.shape)
@@ -103,7 +104,7 @@ def _multiplied(recorder: Recorder, one: Value, other: Value) -> Value:
         found = over_norm(recorder, *pair)
         if found is not None:
             return found
-    return recorder.product(one, other)
+    return product_of(recorder, one, other)
 
 
 @entrywise

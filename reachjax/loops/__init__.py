@@ -5,6 +5,7 @@ from reachjax.loops.discretisation import runge_kutta, zero_order_hold
 from reachjax.loops.networks import MLP, AbstractNetwork, Network
 from reachjax.loops.plants import AbstractPlant, AffinePlant, NonlinearPlant
 from reachjax.loops.residual import Residual
+from reachjax.loops.switching import Switched, one_of
 from reachjax.loops.units import (
     ISRU,
     AbstractActivation,
@@ -26,6 +27,7 @@ from reachjax.loops.units import (
     Softplus,
     Sqrt,
     Square,
+    Step,
     Tanh,
     XLogX,
 )
@@ -59,8 +61,11 @@ __all__ = [
     "Softplus",
     "Sqrt",
     "Square",
+    "Step",
+    "Switched",
     "Tanh",
     "XLogX",
+    "one_of",
     "runge_kutta",
     "zero_order_hold",
 ]

@@ -16,13 +16,14 @@ from reachjax.loops.interpreter import PASSED, Constants, Interpreter, bound, li
 from reachjax.loops.primitives import Equation, recorded
 from reachjax.loops.primitives.choices import chosen_by
 from reachjax.loops.primitives.functions import rule_of
-from reachjax.loops.primitives.jumps import WHOLE, entry_of, stack_of
+from reachjax.loops.primitives.jumps import WHOLE, entering, entry_of, stack_of
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import equations
 from reachjax.loops.values import (
     Choice,
     Comparison,
     Operand,
+    Pick,
     Unknown,
     UnsupportedError,
     Value,
@@ -104,6 +105,14 @@ class Recording(Interpreter):
         shape = next(each.shape for each in column if isinstance(each, Value))
         index = np.arange(joined.size).reshape(len(column), *shape)
         return self._recorder.picked(joined, index)
+
+    def entering(
+        self, which: Operand, count: int, operands: Sequence[Operand]
+    ) -> Sequence[Sequence[Operand]]:
+        """The operands of each branch: one that is picked out of several gets points elsewhere."""
+        if not isinstance(which, Pick):
+            return super().entering(which, count, operands)
+        return entering(self._recorder, which, count, operands)
 
     def either(self, which: Operand, cases: Sequence[Operand]) -> Operand:
         """The result of the branch that is taken, of which nobody knows which one it is."""

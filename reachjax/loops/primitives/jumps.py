@@ -24,6 +24,7 @@ from reachjax.loops.primitives.picks import (
     bits_of,
     both,
     chosen_among,
+    entered,
     evaluated,
     events_of,
     gated,
@@ -233,6 +234,22 @@ def _selected(
     if not isinstance(which, Pick):
         return again(recorder, equation, [which, *cases])
     return chosen_among(recorder, events_of(recorder, which, len(cases)), cases, equation.shape)
+
+
+def entering(
+    recorder: Recorder, which: Pick, count: int, operands: Sequence[Operand]
+) -> list[list[Operand]]:
+    """The operands of each of some branches, of which one is picked."""
+    within = Pick(which.which, np.clip(np.asarray(which.numbers).astype(int), 0, count - 1))
+    found = []
+    for event in events_of(recorder, within, count):
+        found.append([
+            entered(recorder, recorder.broadcast(event, each.shape), each)
+            if isinstance(event, Value) and isinstance(each, Value)
+            else each
+            for each in operands
+        ])  # fmt: skip
+    return found
 
 
 def picked_case(recorder: Recorder, which: Pick, cases: Sequence[Operand], shape: Shape) -> Operand:

@@ -20,7 +20,7 @@ import numpy as np
 from reachjax.loops.primitives.equations import NOT_FINITE, shaped
 from reachjax.loops.rationals import Rationals
 from reachjax.loops.recording import Recorder
-from reachjax.loops.units import AtUnit, Gated
+from reachjax.loops.units import AbstractUnit, AtUnit, Entered, Gated
 from reachjax.loops.units import Step as StepUnit
 from reachjax.loops.values import (
     Choice,
@@ -64,10 +64,22 @@ def gated(recorder: Recorder, gate: Value, value: Value) -> Value:
     """`gate * value`, entry by entry, of a gate that is zero or one."""
     if gate.place == value.place:
         return value
+    again = lambda s, y: gated(recorder, s, y)  # noqa: E731
+    return _of_two(recorder, Gated(), gate, value, again)
+
+
+def entered(recorder: Recorder, taken: Value, value: Value) -> Value:
+    """A value as a branch gets it that is taken or not: zeros and ones of the value's shape."""
+    again = lambda s, y: entered(recorder, s, y)  # noqa: E731
+    return _of_two(recorder, Entered(), taken, value, again)
+
+
+def _of_two(recorder: Recorder, unit: AbstractUnit, gate: Value, value: Value, again: Any) -> Value:
+    """What a layer of units makes of zeros and ones and of as many numbers."""
     n = value.size
     first, second = np.eye(2 * n, n), np.eye(2 * n, n, -n)
 
-    def apply(unit: AtUnit, s: Any, y: Any) -> Any:
+    def apply(at: AtUnit, s: Any, y: Any) -> Any:
         if isinstance(y, Rationals):
             return y.unknown()
         if isinstance(y, np.ndarray):
@@ -76,11 +88,12 @@ def gated(recorder: Recorder, gate: Value, value: Value) -> Value:
             both = jnp.concatenate([s, y])
         else:
             both = first @ s + second @ y
-        return unit(Gated(), both)[n:]
+        return at(unit, both)[n:]
 
     places = gate.place, value.place
-    step = Step(apply, places, again=lambda s, y: gated(recorder, s, y))
-    return recorder.layer(value.shape, step, ("gated", *places))
+    return recorder.layer(
+        value.shape, Step(apply, places, again=again), (type(unit).__name__, *places)
+    )
 
 
 def opposite(recorder: Recorder, bits: Operand) -> Operand:

@@ -24,7 +24,7 @@ from reachjax.loops.units.projection import ProjectionSlack, projected
 from reachjax.loops.units.relu import ReLU
 from reachjax.loops.units.saturating import ISRU, Asin, Asinh, Erf
 from reachjax.loops.units.smooth import Origin, Quadratic, SmoothUnit, UnboundedError
-from reachjax.loops.units.step import Floor, Gated, Step
+from reachjax.loops.units.step import Entered, Floor, Gated, Step
 from reachjax.loops.units.trigonometric import Atan, Cos, Sin, Sinc
 from reachjax.loops.units.within import Within
 
@@ -40,6 +40,7 @@ __all__ = [
     "Constraint",
     "Cos",
     "Disturbance",
+    "Entered",
     "Erf",
     "Exp",
     "Facts",

@@ -169,6 +169,57 @@ class Gated(AbstractUnit):
 
 
 @dataclasses.dataclass(frozen=True)
+class Entered(AbstractUnit):
+    """Numbers as a branch gets them: themselves, or where it surely is not taken any one of theirs.
+
+    Inputs are `k` times whether the branch is taken, zero or one, then `k` numbers; outputs are `k`
+    zeros, then the numbers. Of a branch that is not taken nothing counts. It gets a point, the
+    middle of what the numbers may be, over which no unit switches.
+
+    Example:
+        >>> lower, upper = np.array([0.0, 2.0]), np.array([0.0, 3.0])
+        >>> [end.tolist() for end in Entered().interval(lower, upper)]
+        [[0.0, 2.5], [0.0, 2.5]]
+    """
+
+    separable: ClassVar[bool] = False
+    nonexpansive: ClassVar[bool] = False
+
+    def __call__(self, y: Float[Array, "*c n"]) -> Float[Array, "*c n"]:
+        """The numbers, which do not matter where the branch is not taken."""
+        xp, k = namespace(y), y.shape[-1] // 2
+        return xp.concatenate([xp.zeros_like(y[..., :k]), y[..., k:]], axis=-1)
+
+    def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """The numbers, or their middle."""
+        xp, (low, high), (never, middle) = self._parts(lower, upper)
+        zero = xp.zeros_like(low)
+        ends = (xp.where(never, middle, end) for end in (low, high))
+        return tuple(xp.concatenate([zero, end], axis=-1) for end in ends)
+
+    def lines(self, lower: Array, upper: Array) -> Lines:
+        """The identity, or a constant."""
+        xp, (low, _), (never, middle) = self._parts(lower, upper)
+        zero = xp.zeros_like(low)
+        slope = xp.concatenate([zero, xp.where(never, 0.0, 1.0)], axis=-1)
+        offset = xp.concatenate([zero, xp.where(never, middle, 0.0)], axis=-1)
+        return Lines(Line(slope, offset), Line(slope, offset))
+
+    def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:
+        """The line, twice."""
+        slope, offset = self.lines(lower, upper).above
+        rest = z - slope * y - offset
+        return Facts((Block(rest, "at least", Mark.SECTOR), Block(-rest, "most", Mark.SECTOR)), ())
+
+    def _parts(self, lower: Array, upper: Array) -> tuple[Any, Any, Any]:
+        """The namespace, the numbers, and where the branch is surely not taken, with middles."""
+        (_, never), (low, high) = _gates(lower, upper), _halves(lower, upper)[1]
+        middle = low / 2 + high / 2
+        known = never & (abs(middle) < np.inf)
+        return namespace(lower, upper), (low, high), (known, middle)
+
+
+@dataclasses.dataclass(frozen=True)
 class Floor(AbstractUnit):
     """The largest whole number up to `y + above`, whatever its range is; at an edge both.
 

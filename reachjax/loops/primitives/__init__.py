@@ -23,7 +23,7 @@ from reachjax.loops.primitives import (
     powers,
     solvers,
 )
-from reachjax.loops.primitives.equations import JUMPS, NOT_FINITE, Equation, Rule, on_host
+from reachjax.loops.primitives.equations import NOT_FINITE, Equation, Rule, on_host
 from reachjax.loops.recording import Recorder
 from reachjax.loops.values import (
     Choice,
@@ -40,9 +40,6 @@ from reachjax.loops.values import (
 __all__ = ["Equation", "recorded"]
 
 # fmt: off
-DISCONTINUOUS = ("nextafter", "shift_left", "reduce_and", "reduce_or", "and", "or", "xor")
-"""Primitives that jump."""
-
 INFINITE = (
     "max", "min", "clamp", "select_n", "gt", "ge", "lt", "le", "eq", "ne", *moving.RULES,
 )
@@ -52,6 +49,7 @@ INFINITE = (
 INSTEAD = {
     "cbrt": "use y ** (1 / 3) of numbers above zero",
     "cumlogsumexp": "use jax.nn.logsumexp of each part",
+    "nextafter": "leave it out, and give what it moves by as a disturbance",
     "ragged_dot_general": "use jnp.dot of each group",
     "reduce": "use jnp.sum, jnp.prod, jnp.max or jnp.min",
     "reduce_precision": "leave it out, and give what it rounds by as a disturbance",
@@ -137,8 +135,6 @@ def _moved(recorder: Recorder, equation: Equation, operand: Any, others: Sequenc
 
 
 def _why(equation: Equation) -> str:
-    if equation.name in DISCONTINUOUS:
-        return JUMPS
     instead = INSTEAD.get(equation.name, OTHERWISE)
     return f"there are no bounds for it: {instead}"
 

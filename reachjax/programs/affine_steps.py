@@ -314,7 +314,7 @@ def _cut(unit: AbstractUnit, y: AffineForms, start: InitialColumns) -> Ends:
         return lower, upper
     if not start.cut.needs_programs:
         return y.ends(start, cut=True)
-    switching = np.flatnonzero(~unit.lines(lower, upper).affine)
+    switching = np.flatnonzero(unit.open(lower, upper))
     if len(switching):
         lower, upper = lower.copy(), upper.copy()
         lower[switching], upper[switching] = y[switching].ends(start, cut=True)

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from reachjax.loops.limits import ConstantLimits
-from reachjax.loops.primitives.equations import Equation, Rule
+from reachjax.loops.primitives.equations import NOT_FINITE, Equation, Rule
 from reachjax.loops.primitives.moving import ALONE
 from reachjax.loops.primitives.picks import (
     MANY,
@@ -156,6 +156,8 @@ def _events(recorder: Recorder, pick: Pick) -> list[Value]:
 
 def _scaled(recorder: Recorder, value: Value, pick: Pick, shape: Shape) -> Operand:
     """A product of a number with what is picked: a gated number for each case but one."""
+    if is_known(pick.numbers) and not np.all(np.isfinite(np.asarray(pick.numbers, float))):
+        raise UnsupportedError(NOT_FINITE)
     events = _events(recorder, pick)
     numbers = [np.broadcast_to(each, shape, subok=True) if is_known(each) else each
                for each in pick.numbers]  # fmt: skip
@@ -389,6 +391,11 @@ def whole_numbers(recorder: Recorder, equation: Equation, value: Value) -> Opera
     if ends is None or not np.issubdtype(equation.kind, np.integer):
         raise UnsupportedError(WHOLE)
     whole = [*range(int(np.trunc(ends[0])), int(np.trunc(ends[1])) + 1)]
+    kind = np.iinfo(equation.kind)
+    if whole[0] < kind.min or whole[-1] > kind.max:
+        raise UnsupportedError(
+            f"numbers from {whole[0]} to {whole[-1]} are not all of {equation.kind}: clip them"
+        )
     edges = [n if n < 0 else n + 1 for n in whole[:-1]]
     reached = [n >= 0 for n in whole[:-1]]
     return _staircase(recorder, value, whole[0], edges, reached, equation.kind)

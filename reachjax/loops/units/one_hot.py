@@ -110,6 +110,13 @@ class OneHot(AbstractUnit):
             blocks.append(Block(placed @ row, f"above {shift} further", Mark.SECTOR))
         return Facts(tuple(blocks), BINARY, ())
 
+    def open(self, lower: Array, upper: Array) -> Bool[Array, " n"]:
+        """Differences of numbers of which each may be the larger, and may be the largest."""
+        xp, possible = namespace(lower, upper), self._possible(lower, upper)
+        first, second = (np.array(each) for each in zip(*self.pairs, strict=True))
+        both = possible[..., first] & possible[..., second]
+        return xp.concatenate([xp.zeros_like(possible), both], axis=-1)
+
     def _possible(self, lower: Array, upper: Array) -> Bool[Array, "*c k"]:
         """Which numbers may be the largest; all where bounds contradict each other."""
         xp, k = namespace(lower, upper), self.count

@@ -54,11 +54,12 @@ def Switched(  # noqa: N802  (it stands for a network)
     if not callable(by):
         raise TypeError(f"Switched.by must be a function, but {described(by)} arrived")
     for each in given[1:]:
-        same_size(
-            "the first controller's numbers of inputs and outputs are",
-            "those of another are",
-            ((given[0].inputs, given[0].outputs), (each.inputs, each.outputs)),
-        )
+        for name in ("inputs", "outputs"):
+            same_size(
+                f"the first controller's number of {name} is",
+                f"the number of {name} of another one is",
+                (getattr(given[0], name), getattr(each, name)),
+            )
 
     def acting(nets: tuple[AbstractNetwork, ...], x: Array) -> Array:
         return jax.lax.switch(by(x), [net.__call__ for net in nets], x)

@@ -117,7 +117,7 @@ def of_decisions(
     if not values and equation.name in ALONE and len(picks) == 1:
         return _moved(recorder, equation, operands)
     if equation.name == "mul" and values:
-        return _scaled(recorder, *values, *picks, shape=equation.shape)
+        return _scaled(recorder, values[0], picks[0], equation.shape)
     additive = equation.name in SUMMED or not (alone or entrywise)
     if additive and (_is_float(equation) or equation.name in SUMMED):
         given = [number(recorder, e) if isinstance(e, Pick) else e for e in operands]

@@ -137,21 +137,24 @@ def stepped(recorder: Recorder, comparison: Comparison) -> Value:
 def _turned(recorder: Recorder, value: Value) -> Value | None:
     """`-value` where that is what others would write; None where it is not."""
 
-    def is_minus(term: Term) -> bool:
+    def is_times(term: Term, factor: float) -> bool:
         known = is_constant(term.factor) and is_constant(term.divisor)
-        return known and bool(np.all(term.factor == -1) and np.all(np.asarray(term.divisor) == 1))
+        same = known and np.all(np.asarray(term.factor) == factor)
+        return bool(same and np.all(np.asarray(term.divisor) == 1))
 
     terms = value.terms or ()
     plain = is_constant(value.offset) and not np.any(value.offset)
-    if len(terms) == 1 and plain and is_minus(terms[0]):
+    if len(terms) == 1 and plain and is_times(terms[0], 1):
+        return _turned(recorder, recorder.reshaped(terms[0].value, value.shape))
+    if len(terms) == 1 and plain and is_times(terms[0], -1):
         return recorder.reshaped(terms[0].value, value.shape)
     if len(terms) == 1 and not plain:
         inner = terms[0].value.terms or ()
         bare = is_constant(terms[0].value.offset) and not np.any(terms[0].value.offset)
-        if len(inner) == 1 and bare and is_minus(inner[0]):
+        if len(inner) == 1 and bare and is_times(inner[0], -1):
             base = recorder.reshaped(inner[0].value, value.shape)
             return recorder.shifted(base, -value.offset)
-    if len(terms) == 2 and plain and is_minus(terms[1]):
+    if len(terms) == 2 and plain and is_times(terms[1], -1):
         one, other = terms[0].value, terms[1].value
         if one.place > other.place:
             shape = value.shape

@@ -209,7 +209,8 @@ class Entered(AbstractUnit):
         """The line, twice."""
         slope, offset = self.lines(lower, upper).above
         rest = z - slope * y - offset
-        return Facts((Block(rest, "at least", Mark.SECTOR), Block(-rest, "most", Mark.SECTOR)), ())
+        blocks = Block(rest, "at least", Mark.SECTOR), Block(-rest, "at most", Mark.SECTOR)
+        return Facts(blocks, (), ())
 
     def _parts(self, lower: Array, upper: Array) -> tuple[Any, Any, Any]:
         """The namespace, the numbers, and where the branch is surely not taken, with middles."""

@@ -110,6 +110,10 @@ def of_decisions(
         return _looked_up(recorder, equation, operands, again)
     alone = all(each.is_single for each in picks)
     entrywise = equation.name in ENTRYWISE
+    apart = len({each.which.place for each in picks}) > 1
+    if apart and _is_float(equation) and equation.name in ("add", "add_any", "sub"):
+        given = [number(recorder, e) if isinstance(e, Pick) else e for e in operands]
+        return again(recorder, equation, given)  # a sum needs no common events
     if not values and (alone or entrywise):
         common = iter(together(recorder, picks))
         given = [next(common) if isinstance(each, Pick) else each for each in operands]

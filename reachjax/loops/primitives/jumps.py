@@ -31,6 +31,7 @@ from reachjax.loops.primitives.picks import (
     number,
     of_bits,
     opposite,
+    plain_stack,
     stacked,
     stepped,
     together,
@@ -212,7 +213,7 @@ def _looked_up(
     found = [again(recorder, equation, [table, each]) for each in places.numbers]
     which = Pick(recorder.picked(places.which, every), np.zeros((count, *equation.shape)))
     if not any(isinstance(each, Value) for each in found):
-        return Pick(which.which, np.stack([*map(np.asarray, found)]))
+        return Pick(which.which, plain_stack(found))
     return chosen_among(recorder, _events(recorder, which), found, equation.shape)
 
 

@@ -434,11 +434,13 @@ def evaluated(recorder: Recorder, evaluate: Callable[..., Any], operands: Sequen
         found.append(evaluate(*given))
     which = picks[0].which
     if isinstance(found[0], list | tuple):
-        return [merged(recorder, Pick(which, _stack(each))) for each in zip(*found, strict=True)]
-    return merged(recorder, Pick(which, _stack(found)))
+        return [
+            merged(recorder, Pick(which, plain_stack(each))) for each in zip(*found, strict=True)
+        ]
+    return merged(recorder, Pick(which, plain_stack(found)))
 
 
-def _stack(parts: Sequence[Any]) -> Any:
+def plain_stack(parts: Sequence[Any]) -> Any:
     """Plain arrays along a first axis, numpy's if all are."""
     if not all(isinstance(each, np.ndarray | np.generic) for each in parts):
         return jnp.stack(parts)

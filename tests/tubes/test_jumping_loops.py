@@ -116,7 +116,10 @@ def test_all_that_the_closed_law_allows_is_in_the_sets(name, relaxation):
     states = set(starting(*ends))
     for t in range(1, STEPS + 1):
         states = {after for x in states for after in law(x)}
-        A, b = (np.vectorize(Fraction)(np.asarray(part)) for part in tube.sets[t].normal_form)
+        A, b = (
+            np.vectorize(Fraction, otypes=[object])(np.asarray(part))
+            for part in tube.sets[t].facets
+        )
         points = np.array(sorted(states), object)
         if len(points) > 4000:  # exact numbers take their time
             keep = np.random.default_rng(t).choice(len(points), 4000, replace=False)
@@ -134,7 +137,7 @@ def test_verdicts_are_those_of_the_extremes(name):
     most = float(max(x[0] for x in states))
     loop, X0 = loop_of(name), rj.Box(*ends)
     wide, narrow = (rj.Box([-9.0, -9.0], [most + by, 9.0]) for by in (0.01, -0.01))
-    proved = rj.decide(loop, X0, 2, safe=wide)
-    refuted = rj.decide(loop, X0, 2, safe=narrow)
+    proved = rj.decide(loop, X0, 2, goal=wide)
+    refuted = rj.decide(loop, X0, 2, goal=narrow)
     assert proved.status is not rj.VerdictStatus.REFUTED
     assert refuted.status is rj.VerdictStatus.REFUTED

@@ -119,7 +119,7 @@ class Gated(AbstractUnit):
         return xp.concatenate([xp.zeros_like(s), xp.where(s > 0.5, y, 0.0)], axis=-1)
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Those of `y` where `s` is one, zero where it is zero, or all that is between."""
+        """The range of `y` where `s` is one, zero where it is zero, or the hull of both."""
         xp = namespace(lower, upper)
         (always, never), (low, high) = _gates(lower, upper), _halves(lower, upper)[1]
         zero = xp.zeros_like(low)
@@ -251,7 +251,7 @@ class Floor(AbstractUnit):
         return xp.round(y) if self.even else away
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Those of both ends; at an edge that on its other side."""
+        """The whole numbers of both ends; at an edge the one on its other side."""
         xp = namespace(lower, upper)
         return xp.ceil(lower + self.above) - 1.0, xp.floor(upper + self.above)
 

@@ -61,8 +61,9 @@ def test_a_public_name_stands_on_one_page_of_the_reference():
     ("word", "page"),
     {
         "nonlinear": "nonlinear",
-        "argmax": "nonlinear",
         "discontinuous": "nonlinear",
+        "argmax": "discrete",
+        "quantised": "discrete",
         "float32": "elsewhere",
         "gymnasium": "elsewhere",
         "obstacles": "requirements",

@@ -6,6 +6,7 @@ from reachjax.loops.networks import MLP, AbstractNetwork, Network
 from reachjax.loops.plants import AbstractPlant, AffinePlant, NonlinearPlant
 from reachjax.loops.residual import Residual
 from reachjax.loops.sampled import SampledPlant
+from reachjax.loops.switching import Switched, one_of
 from reachjax.loops.units import (
     ISRU,
     AbstractActivation,
@@ -27,6 +28,7 @@ from reachjax.loops.units import (
     Softplus,
     Sqrt,
     Square,
+    Step,
     Tanh,
     XLogX,
 )
@@ -61,8 +63,11 @@ __all__ = [
     "Softplus",
     "Sqrt",
     "Square",
+    "Step",
+    "Switched",
     "Tanh",
     "XLogX",
+    "one_of",
     "runge_kutta",
     "zero_order_hold",
 ]

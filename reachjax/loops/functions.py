@@ -17,11 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.interpreter import Constants
+from reachjax.loops.primitives.picks import as_pick
+from reachjax.loops.primitives.picks import number as number_of
 from reachjax.loops.readings import ConstantPart, Evaluation, Number, Recording, require_traced
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import Sizes, Trace, UpdatedError
 from reachjax.loops.units import AtUnit, evaluate
-from reachjax.loops.values import Comparison, Operand, Parameter, UnsupportedError, Value
+from reachjax.loops.values import Choice, Operand, Parameter, UnsupportedError, Value
 from reachjax.numerics.checks import described, is_concrete
 from reachjax.numerics.pytrees import pytree, static, unchecked
 
@@ -224,11 +226,12 @@ class Function:
             seen = self._constant_part()
             reading = Recording(Constants(seen.computed, seen.visited), recorder)
             (wanted,) = reading.walk(closed, [*self._given(), *recorder.inputs])
+            if isinstance(wanted, Choice):
+                wanted = number_of(recorder, as_pick(recorder, wanted))
         except UnsupportedError as error:
             raise TypeError(
                 f"the primitive {error.primitive!r}{error.line} cannot be certified: {error}"
             ) from None
-        assert not isinstance(wanted, Comparison)  # its result is a number
         return self.parameters, (recorder, wanted)
 
 

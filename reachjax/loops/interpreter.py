@@ -124,6 +124,12 @@ class Interpreter(abc.ABC):
     def either(self, which: Operand, cases: Sequence[Operand]) -> Operand:
         """One of several operands, by a number that depends on inputs."""
 
+    def entering(
+        self, which: Operand, count: int, operands: Sequence[Operand]
+    ) -> Sequence[Sequence[Operand]]:
+        """The operands of each of some branches, by a number that depends on inputs."""
+        return [operands] * count
+
     def walk(self, closed: Any, operands: Sequence[Operand], turn: int = 0) -> list[Operand]:
         """What a jaxpr makes of operands.
 
@@ -239,7 +245,11 @@ class Interpreter(abc.ABC):
         which, *given = operands
         branches = params["branches"]
         if not self.is_plain(which):
-            found = [self.walk(branch, given, k) for k, branch in enumerate(branches)]
+            entering = self.entering(which, len(branches), given)
+            found = [
+                self.walk(branch, own, k)
+                for k, (branch, own) in enumerate(zip(branches, entering, strict=True))
+            ]
             return [self.either(which, cases) for cases in zip(*found, strict=True)]
         if not is_known(which):
             raise UnsupportedError(

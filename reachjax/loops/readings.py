@@ -14,14 +14,16 @@ import numpy as np
 
 from reachjax.loops.interpreter import PASSED, Constants, Interpreter, bound, line_of
 from reachjax.loops.primitives import Equation, recorded
-from reachjax.loops.primitives.choices import ONLY, chosen_by
+from reachjax.loops.primitives.choices import chosen_by
 from reachjax.loops.primitives.functions import rule_of
+from reachjax.loops.primitives.jumps import WHOLE, entering, entry_of, stack_of
 from reachjax.loops.recording import Recorder
 from reachjax.loops.traces import equations
 from reachjax.loops.values import (
     Choice,
     Comparison,
     Operand,
+    Pick,
     Unknown,
     UnsupportedError,
     Value,
@@ -84,34 +86,42 @@ class Recording(Interpreter):
     def entry(self, operand: Operand, k: int) -> Operand:
         """An entry along the first axis."""
         if isinstance(operand, Comparison):
-            return Comparison(self.entry(operand.value, k))
+            return Comparison(self.entry(operand.value, k), operand.strict)
+        if isinstance(operand, Choice):
+            return entry_of(self._recorder, operand, k)
         if not isinstance(operand, Value):
-            raise UnsupportedError(ONLY)
+            raise UnsupportedError(WHOLE)
         index = np.arange(operand.size).reshape(operand.shape)[k]
         return self._recorder.taken(operand, index)
 
     def stacked(self, column: Sequence[Operand]) -> Operand:
         """Operands of one kind, or plain ones, as one."""
-        if all(isinstance(each, Comparison) for each in column):
-            return Comparison(self.stacked([each.value for each in column]))
-        if any(isinstance(each, Comparison) for each in column):
-            raise UnsupportedError(
-                "a comparison of numbers in one of its steps is none in another: compare in all"
-            )
+        if any(isinstance(each, Choice) for each in column):
+            kinds = {each.strict for each in column if isinstance(each, Comparison)}
+            if len(kinds) == 1 and all(isinstance(each, Comparison) for each in column):
+                return Comparison(self.stacked([each.value for each in column]), *kinds)
+            return stack_of(self._recorder, column)
         joined = self._recorder.joined(column)
         shape = next(each.shape for each in column if isinstance(each, Value))
         index = np.arange(joined.size).reshape(len(column), *shape)
         return self._recorder.picked(joined, index)
 
+    def entering(
+        self, which: Operand, count: int, operands: Sequence[Operand]
+    ) -> Sequence[Sequence[Operand]]:
+        """The operands of each branch: one that is picked out of several gets points elsewhere."""
+        if not isinstance(which, Pick):
+            return super().entering(which, count, operands)
+        return entering(self._recorder, which, count, operands)
+
     def either(self, which: Operand, cases: Sequence[Operand]) -> Operand:
-        """Results of branches, which must agree where the choice changes."""
+        """The result of the branch that is taken, of which nobody knows which one it is."""
         if all(each is cases[0] for each in cases):
             return cases[0]
         if not isinstance(which, Choice):
             raise UnsupportedError(
                 "which branch is taken must not depend on numbers that depend on inputs, other "
-                "than by comparing them: use jnp.where between functions that agree where it "
-                "changes"
+                "than by comparing them"
             )
         shape = np.shape(cases[0]) if is_plain(cases[0]) else cases[0].shape
         return chosen_by(self._recorder, which, cases, shape)

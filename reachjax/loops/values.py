@@ -35,6 +35,7 @@ class Value:
         offset: what is added to it; None where they are no such sum.
         source: what they are entries of, and which, if they are picked.
         fact: limits that are known besides, from those of other values.
+        binary: whether each number is zero or one.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class Value:
         self.place, self.shape, self.terms, self.offset = place, shape, terms, offset
         self.source = source
         self.fact: Fact | None = None
+        self.binary = False
 
     @property
     def size(self) -> int:
@@ -80,14 +82,15 @@ class Choice:
 
 
 class Comparison(Choice):
-    """Whether numbers are above zero; at zero it must not matter.
+    """Whether numbers are above zero.
 
     Attributes:
         value: these numbers.
+        strict: whether it is computed to be false at zero, where both are possible.
     """
 
-    def __init__(self, value: Value):
-        self.value = value
+    def __init__(self, value: Value, strict: bool):
+        self.value, self.strict = value, strict
 
     @property
     def shape(self) -> Shape:
@@ -118,15 +121,39 @@ class Index(Choice):
     Attributes:
         conditions: comparisons, or known truth values.
         last: whether it is the last one.
+        kind: of whole number.
     """
 
-    def __init__(self, conditions: Sequence[Any], last: bool = False):
-        self.conditions, self.last = tuple(conditions), last
+    def __init__(self, conditions: Sequence[Any], last: bool = False, kind: Any = int):
+        self.conditions, self.last, self.kind = tuple(conditions), last, kind
 
     @property
     def shape(self) -> Shape:
         """The shape of the array of places."""
         return np.shape(self.conditions[0])
+
+
+class Pick(Choice):
+    """One of `k` arrays of plain numbers, by which of as many events holds: one of them does.
+
+    Attributes:
+        which: `(k,)`, or `(k, *shape)` where each entry has events of its own: one for the event
+            that holds, zeros for the others.
+        numbers: `(k, *shape)`.
+    """
+
+    def __init__(self, which: Value, numbers: Any):
+        self.which, self.numbers = which, numbers
+
+    @property
+    def shape(self) -> Shape:
+        """The shape of the array."""
+        return np.shape(self.numbers)[1:]
+
+    @property
+    def is_single(self) -> bool:
+        """Whether one event decides about all entries."""
+        return len(self.which.shape) == 1
 
 
 class Unknown:

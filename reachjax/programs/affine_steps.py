@@ -405,8 +405,7 @@ def _cut(unit: AbstractUnit, y: AffineForms, start: InitialColumns) -> Ends:
         return lower, upper
     if not start.cut.needs_programs:
         return y.ends(start, cut=True)
-    switching = ~unit.lines(lower, upper).affine
-    switching = np.flatnonzero(np.tile(switching, unit.inputs))
+    switching = np.flatnonzero(np.tile(unit.open(lower, upper), unit.inputs))
     if len(switching):
         lower, upper = lower.copy(), upper.copy()
         lower[switching], upper[switching] = y[switching].ends(start, cut=True)

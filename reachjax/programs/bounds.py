@@ -117,9 +117,9 @@ def _settled(unit: AbstractUnit, y: Ball, z: Ball, lines: Lines) -> tuple[Lines,
     Kept, it would need multipliers of the size of `1 / MARGINAL`, and derivatives lose as many
     digits. A unit is nonexpansive, and so is such a line, so its output is off by twice the
     distance of an input from where it is affine, and by no more than its distance from the line.
-    That is said of one input alone, and of no layer that is not separable.
+    That is said of one input alone, and of no layer that is not separable, nor of units that jump.
     """
-    if not unit.separable:
+    if not (unit.separable and unit.nonexpansive):
         return lines, lines.affine, jnp.zeros_like(z.mid)
     spare, surely = MARGINAL * (abs(y.mid) + y.rad), lines.affine
     from_above = unit.lines(y.lower + spare, jnp.maximum(y.upper, y.lower + spare))

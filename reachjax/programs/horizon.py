@@ -171,7 +171,7 @@ class Horizon:
             self._width = max(self._width, y.columns.shape[1])
             if unit.curved:  # its range is that of its form, but for little
                 return ends
-            switching = np.flatnonzero(~unit.lines(*ends).affine)
+            switching = np.flatnonzero(unit.open(*ends))
             if multipliers is None or unit.free or not (len(switching) and self._count):
                 return ends
             inputs = y[switching]

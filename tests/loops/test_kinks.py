@@ -66,22 +66,6 @@ def test_a_learned_slope_has_a_derivative():
     np.testing.assert_allclose(jax.tree.leaves(slope), [-1.0])
 
 
-JUMPS = {
-    "relative to large numbers": lambda x: jnp.where(x > 1e6, 2 * x - 2e6, x - 1e6 + 1e-6),
-    "small": lambda x: jnp.where(x > 0, x, x + 1e-14),
-    "of smooth functions": lambda x: jnp.where(x > 0, jnp.cos(x), jnp.tanh(x)),
-    "where a value is not rational": lambda x: jnp.where(x > 1, jnp.exp(x), jnp.exp(2 * x - 1)),
-    "of another number": lambda x: jnp.where(x[::-1] > 0, 2 * x, x),
-    "by a learned threshold": Partial(lambda s, x: jnp.where(x > s, x, 0.0), 0.1),
-}
-
-
-@pytest.mark.parametrize("name", JUMPS)
-def test_what_may_jump_is_refused(name):
-    with pytest.raises(TypeError, match=r"'select_n'.* known to agree where it changes"):
-        network(JUMPS[name])
-
-
 def test_what_rounded_constants_jump_by_is_in_the_bounds():
     """`4 fl(0.1) - fl(0.3) - fl(0.1)` is not zero."""
     net = network(CONTINUOUS["constants that are rounded"])

@@ -177,9 +177,9 @@ REFUSED = {
         },
         r"node 'n' \(Cast\).*cannot be cast to int8",
     ),
-    "inputs that are cast to whole numbers": (
-        {"nodes": [node("Cast", "x", "n", to=7), node("Cast", "n", to=1)]},
-        r"node 'n' \(Cast\).*they jump",
+    "inputs that are cast to eight bits": (
+        {"nodes": [node("Cast", "x", "n", to=3), node("Cast", "n", to=1)]},
+        r"node 'n' \(Cast\).*only floats and whole numbers of 32 and 64 bits",
     ),
     "a network in sixteen bits": (
         {"nodes": [node("Relu", "x")], "inputs": [value("x", (1, 3), TensorProto.FLOAT16)],

@@ -26,6 +26,9 @@ KINDS: dict[int, np.dtype] = {
 }
 """Kinds of numbers by the number that ONNX gives them."""
 
+WHOLE = (6, 7)
+"""Whole numbers of 32 and of 64 bits, which are what they are for any network."""
+
 REAL = (FLOAT, DOUBLE)
 """Kinds in which a runtime computes nearly what is certified; 16 bits round by a part in 2,000."""
 

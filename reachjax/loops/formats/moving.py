@@ -106,10 +106,11 @@ def split(attributes: Attributes, x: Any, sizes: Any = None) -> list[Any]:
 def gathered(attributes: Attributes, x: Any, indices: Any) -> Any:
     """Entries by their places along an axis; negative ones count from the end."""
     axis = attributes["axis"]
-    size, places = np.shape(x)[axis], np.asarray(indices)
-    if ((places < -size) | (places >= size)).any():
+    size, places, xp = np.shape(x)[axis], indices, over(x, indices)
+    known = isinstance(places, np.ndarray)
+    if known and ((places < -size) | (places >= size)).any():
         raise ValueError(f"the places {places.ravel()[:4].tolist()} are not all among {size}")
-    return over(x).take(x, np.where(places < 0, places + size, places), axis=axis)
+    return xp.take(x, over(places).where(places < 0, places + size, places), axis=axis)
 
 
 def sliced(

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array
 
-from reachjax.loops.formats.kinds import BOOL, KINDS, REAL, kind_name, real
+from reachjax.loops.formats.kinds import BOOL, KINDS, REAL, WHOLE, kind_name, real
 from reachjax.loops.formats.onnx_files import FileNode, NetworkFile, read_file
 from reachjax.loops.formats.onnx_runtime import require_same
 from reachjax.loops.formats.operators import OPERATORS, SIZES
@@ -84,8 +84,9 @@ class Graph:
     structure: Structure = static()
 
     def __call__(self, x: Any) -> Any:
-        """The output of one input, flattened."""
-        return self.values(x)[self.structure.wanted].reshape(-1)
+        """The output of one input, flattened; whole numbers as real ones."""
+        found = self.values(x)[self.structure.wanted].reshape(-1)
+        return found if np.issubdtype(found.dtype, np.floating) else found.astype(x.dtype)
 
     def values(self, x: Any) -> dict[str, Any]:
         """The values of all nodes, by name."""
@@ -185,8 +186,6 @@ def culprit(graph: Graph) -> str:
     for number, node in enumerate(graph.structure.nodes):
         part = graph.up_to(number)
         value = part(np.zeros(graph.size()))
-        if value.dtype == bool:  # a comparison is a number only where it is used
-            continue
         try:
             Function.of(part, (graph.size(),), value.size, "the network")
         except (TypeError, ValueError):
@@ -248,8 +247,8 @@ def _built(file: NetworkFile) -> tuple[Graph, int]:
     )
     structure = Structure(tuple(nodes), tuple(weights), constants, file.given, file.wanted)
     outputs = np.size((known | values)[file.wanted])
-    if file.kinds[file.wanted] not in REAL:
-        raise ValueError(f"the output {file.wanted!r} must be real numbers of 32 or 64 bits")
+    if file.kinds[file.wanted] not in (*REAL, *WHOLE):
+        raise ValueError(f"the output {file.wanted!r} must be numbers of 32 or 64 bits")
     return Graph(tuple(parameters.values()), structure), outputs
 
 
@@ -295,8 +294,8 @@ def _require_told(
                 raise ValueError(
                     f"{told} is of {kind_name(kind)} by ONNX's rules, not {value.dtype}"
                 )
-        elif kind not in (*REAL, BOOL):
+        elif kind not in (*REAL, *WHOLE, BOOL):
             raise ValueError(
-                f"{told} computes in {kind_name(kind)} what depends on the input: only floats of "
-                "32 and 64 bits are near enough to real numbers"
+                f"{told} computes in {kind_name(kind)} what depends on the input: only numbers of "
+                "32 and 64 bits, and truth values, are known"
             )

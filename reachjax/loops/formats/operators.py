@@ -12,11 +12,22 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.formats import moving, reductions
 from reachjax.loops.formats.arrays import erf, over, sigmoid, softplus
-from reachjax.loops.formats.kinds import KINDS, REAL, cast, kind_name, power, quotient
+from reachjax.loops.formats.kinds import (
+    BOOL,
+    KINDS,
+    REAL,
+    WHOLE,
+    cast,
+    kind_name,
+    power,
+    quotient,
+)
 from reachjax.loops.formats.moving import Attributes
 
 Compute = Callable[..., Any]
@@ -131,15 +142,61 @@ def _dropped(attributes: Attributes, x: Any, ratio: Any = None, training: Any = 
 
 
 def _kept(attributes: Attributes, x: Any) -> Any:
-    """A cast between 32 and 64 bits: real numbers stay as they are."""
-    if x.dtype == bool:
-        raise ValueError("a comparison as a number jumps where it changes")
-    if attributes["to"] not in REAL:
+    """A cast: real numbers stay as they are between 32 and 64 bits, whole ones are cut off."""
+    to = attributes["to"]
+    if to in REAL:
+        return x if np.issubdtype(x.dtype, np.floating) else x.astype(float)
+    if to not in (*WHOLE, BOOL):
         raise ValueError(
-            f"numbers that depend on the input are cast to {kind_name(attributes['to'])}, so they "
-            "jump: only casts to 32 and 64 bit floats are continuous"
+            f"numbers that depend on the input are cast to {kind_name(to)}: only floats and whole "
+            "numbers of 32 and 64 bits, and truth values, are known"
         )
-    return x
+    return x != 0 if to == BOOL else x.astype(KINDS[to])
+
+
+def _divided(attributes: Attributes, x: Any, y: Any) -> Any:
+    """A quotient; of whole numbers it is cut off towards zero."""
+    if not np.issubdtype(x.dtype, np.integer):
+        return over(x, y).divide(x, y)
+    if over(x, y) is np:
+        return quotient(x, y)
+    x, y = jnp.broadcast_arrays(x, y)
+    return jax.lax.div(x, y.astype(x.dtype))
+
+
+def _winner(name: str) -> Compute:
+    """The place of the largest or the smallest entry along an axis: the first, or the last one."""
+
+    def compute(attributes: Attributes, x: Any) -> Any:
+        axis, xp = attributes["axis"], over(x)
+        if attributes.get("select_last_index", 0):
+            found = np.shape(x)[axis] - 1 - getattr(xp, name)(xp.flip(x, axis), axis=axis)
+        else:
+            found = getattr(xp, name)(x, axis=axis)
+        return xp.expand_dims(found, axis) if attributes["keepdims"] else found
+
+    return compute
+
+
+def _one_hot(attributes: Attributes, places: Any, depth: Any, values: Any) -> Any:
+    """One value at a place, counted from the end if it is negative, and another one elsewhere."""
+    count, xp = int(np.ravel(depth)[0]), over(places)
+    places = xp.where(places < 0, places + count, places)
+    off, on = np.ravel(values)
+    found = xp.where(xp.expand_dims(places, -1) == np.arange(count), on, off)
+    return xp.moveaxis(found, -1, attributes["axis"])
+
+
+def _hardmax(attributes: Attributes, x: Any) -> Any:
+    """One at the first of the largest entries, and zero elsewhere."""
+    axis, xp, shape = attributes["axis"], over(x), np.shape(x)
+    if attributes["opset"] < 13:  # over an axis and all behind it
+        axis %= x.ndim
+        x = x.reshape(math.prod(shape[:axis]), -1)
+        axis = -1
+    last = xp.moveaxis(x, axis, -1)
+    hit = xp.expand_dims(xp.argmax(last, axis=-1), -1) == np.arange(last.shape[-1])
+    return xp.moveaxis(xp.where(hit, 1.0, 0.0), -1, axis).reshape(shape)
 
 
 def _einsum(attributes: Attributes, *given: Any) -> Any:
@@ -207,17 +264,21 @@ FOLLOWED = {
     "Neg": "negative",
     "Not": "logical_not",
     "Or": "logical_or",
+    "Round": "round",
+    "Sign": "sign",
     "Sin": "sin",
     "Sinh": "sinh",
     "Sqrt": "sqrt",
     "Sub": "subtract",
     "Tan": "tan",
     "Tanh": "tanh",
+    "Xor": "logical_xor",
 }
 """Operators without attributes that numpy and JAX have, and what these call them."""
 
 REDUCED = ("axes", "keepdims", "noop_with_empty_axes")
 NORMALISED = ("axis", "epsilon", "stash_type")
+WINNING = ("axis", "keepdims", "select_last_index")
 
 COMPARED = {
     "Greater": "greater",
@@ -231,6 +292,7 @@ OPERATORS: dict[str, Operator] = {
     **{name: Operator(_entrywise(twin)) for name, twin in FOLLOWED.items()},
     **{name: Operator(_entrywise(twin), fixed=(0, 1)) for name, twin in COMPARED.items()},
     **{name: Operator(each, REDUCED, known=(1,)) for name, each in reductions.REDUCTIONS.items()},
+    **{name: Operator(_winner(name.lower()), WINNING) for name in ("ArgMax", "ArgMin")},
     "BatchNormalization": Operator(
         reductions.batch_normalised, ("epsilon", "momentum", "training_mode", "spatial")
     ),
@@ -246,19 +308,20 @@ OPERATORS: dict[str, Operator] = {
     "Conv": Operator(
         _convolved, ("auto_pad", "dilations", "group", "kernel_shape", "pads", "strides")
     ),
-    "Div": Operator(_entrywise("divide"), exact=lambda attributes, x, y: quotient(x, y)),
+    "Div": Operator(_divided, exact=lambda attributes, x, y: quotient(x, y)),
     "Dropout": Operator(_dropped, ("ratio", "seed"), known=(1, 2)),
     "Einsum": Operator(_einsum, ("equation",)),
     "Elu": Operator(_elu, ("alpha",)),
     "Erf": Operator(lambda attributes, x: erf(x)),
     "Expand": Operator(moving.expanded, known=(1,)),
     "Flatten": Operator(moving.flattened, ("axis",)),
-    "Gather": Operator(moving.gathered, ("axis",), known=(1,)),
+    "Gather": Operator(moving.gathered, ("axis",), fixed=(1,)),
     "Gelu": Operator(_gelu, ("approximate",)),
     "Gemm": Operator(_gemm, ("alpha", "beta", "transA", "transB")),
     "HardSigmoid": Operator(
         lambda a, x: over(x).clip(a["alpha"] * x + a["beta"], 0.0, 1.0), ("alpha", "beta")
     ),
+    "Hardmax": Operator(_hardmax, ("axis",)),
     "HardSwish": Operator(lambda a, x: x * over(x).clip(x / 6 + 0.5, 0.0, 1.0)),
     "Identity": Operator(lambda attributes, x: x),
     "LayerNormalization": Operator(reductions.layer_normalised, NORMALISED),
@@ -268,6 +331,7 @@ OPERATORS: dict[str, Operator] = {
     "Mean": Operator(_mean),
     "Min": Operator(_folded("minimum")),
     "Mish": Operator(lambda attributes, x: x * over(x).tanh(softplus(x))),
+    "OneHot": Operator(_one_hot, ("axis",), known=(1, 2)),
     "PRelu": Operator(_sloped),
     "Pow": Operator(_raised, fixed=(1,), exact=lambda attributes, x, y: power(x, y)),
     "RMSNormalization": Operator(reductions.rms_normalised, NORMALISED),

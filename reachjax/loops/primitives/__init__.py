@@ -1,7 +1,7 @@
 """What each primitive of a jaxpr is as steps of a recording.
 
 Affine ones and those that move entries become matrices and choices of entries; the others are units
-and what is made of them. Choices between numbers are continuous ones in disguise, or errors.
+and what is made of them. Choices between numbers are continuous ones in disguise, or jumps.
 """
 
 from __future__ import annotations
@@ -12,8 +12,18 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.primitives import affine, angles, bends, choices, folds, moving, powers, solvers
-from reachjax.loops.primitives.equations import JUMPS, NOT_FINITE, Equation, Rule, on_host
+from reachjax.loops.primitives import (
+    affine,
+    angles,
+    bends,
+    choices,
+    folds,
+    jumps,
+    moving,
+    powers,
+    solvers,
+)
+from reachjax.loops.primitives.equations import NOT_FINITE, Equation, Rule, on_host
 from reachjax.loops.recording import Recorder
 from reachjax.loops.values import (
     Choice,
@@ -30,12 +40,6 @@ from reachjax.loops.values import (
 __all__ = ["Equation", "recorded"]
 
 # fmt: off
-DISCONTINUOUS = (
-    "sign", "round", "floor", "ceil", "argmax", "argmin", "rem", "and", "or", "xor",
-    "nextafter", "shift_left", "reduce_and", "reduce_or",
-)
-"""Primitives that jump."""
-
 INFINITE = (
     "max", "min", "clamp", "select_n", "gt", "ge", "lt", "le", "eq", "ne", *moving.RULES,
 )
@@ -45,6 +49,7 @@ INFINITE = (
 INSTEAD = {
     "cbrt": "use y ** (1 / 3) of numbers above zero",
     "cumlogsumexp": "use jax.nn.logsumexp of each part",
+    "nextafter": "leave it out, and give what it moves by as a disturbance",
     "ragged_dot_general": "use jnp.dot of each group",
     "reduce": "use jnp.sum, jnp.prod, jnp.max or jnp.min",
     "reduce_precision": "leave it out, and give what it rounds by as a disturbance",
@@ -67,6 +72,7 @@ RULES: dict[str, Rule] = {
     **bends.RULES,
     **folds.RULES,
     **solvers.RULES,
+    **jumps.RULES,
 }
 
 
@@ -84,20 +90,27 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
             else "it computes in complex numbers: compute with their real and imaginary parts"
         )
     first, *others = operands
+    if all(map(is_plain, operands)):  # it was found on the way that nothing depends on inputs
+        return equation.evaluate(*operands)
     unknown = [each for each in operands if isinstance(each, Unknown)]
     if unknown and equation.name == "select_n" and all(each is others[0] for each in others):
         return others[0]
     if unknown and equation.name != "custom_linear_solve":  # which needs no factors
         raise unknown[0].error
-    rules = choices.RULES if any(isinstance(each, Choice) for each in operands) else RULES
     if isinstance(first, Comparison | Index) and equation.name in moving.ALONE:
         return _moved(recorder, equation, first, others)
-    rule = (RULES if equation.name == "not" else rules).get(equation.name)
-    if rule is None and rules is choices.RULES:
-        raise UnsupportedError(choices.ONLY)
-    if rules is choices.RULES and rule is not None:
-        return rule(recorder, equation, operands)
-    if rule is None or (equation.name == "convert_element_type" and not _is_float(equation)):
+    if any(isinstance(each, Choice) for each in operands):
+        travelling = choices.RULES.get(equation.name)
+        found = None if travelling is None else travelling(recorder, equation, operands)
+        if found is None:
+            found = jumps.of_decisions(recorder, equation, operands, recorded)
+        return found
+    if equation.name == "convert_element_type" and not _is_float(equation):
+        return jumps.whole_numbers(recorder, equation, first)
+    if jnp.issubdtype(equation.kind, jnp.integer) and equation.name not in jumps.OF_WHOLE:
+        raise UnsupportedError(jumps.WHOLE)
+    rule = RULES.get(equation.name)
+    if rule is None:
         raise UnsupportedError(_why(equation))
     plain = [*filter(is_plain, operands)]
     if equation.name not in INFINITE and not all(map(_is_finite, plain)):
@@ -113,16 +126,15 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
 def _moved(recorder: Recorder, equation: Equation, operand: Any, others: Sequence[Any]) -> Any:
     """Entries of truth values, or of places, are those of what decides about them."""
     if isinstance(operand, Comparison):
-        return Comparison(recorded(recorder, equation, [operand.value, *others]))
+        moved = recorded(recorder, equation, [operand.value, *others])
+        return Comparison(moved, operand.strict)
     if isinstance(operand, Index):
         conditions = [_moved(recorder, equation, each, others) for each in operand.conditions]
-        return Index(conditions, operand.last)
+        return Index(conditions, operand.last, operand.kind)
     return equation.evaluate(operand, *others)
 
 
 def _why(equation: Equation) -> str:
-    if equation.name in DISCONTINUOUS or equation.name == "convert_element_type":
-        return JUMPS
     instead = INSTEAD.get(equation.name, OTHERWISE)
     return f"there are no bounds for it: {instead}"
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.primitives.equations import Equation, Rule, entrywise, on_host
+from reachjax.loops.primitives.picks import is_binary, product_of
 from reachjax.loops.primitives.related import over_norm, over_sum
 from reachjax.loops.recording import Recorder
 from reachjax.loops.units import Reciprocal
@@ -66,6 +67,11 @@ def _contracted(recorder: Recorder, equation: Equation, operands: Sequence[Opera
         arranged(left, batch_left, over_left)[:, :, None],
         arranged(right, batch_right, over_right)[:, None],
     )
+    if is_binary(recorder, left) or is_binary(recorder, right):
+        products = product_of(recorder, recorder.picked(left, one), recorder.picked(right, other))
+        count = math.prod(equation.shape)
+        sums = np.kron(np.eye(count), np.ones((1, one.shape[-1])))
+        return recorder.mapped(products, sums, equation.shape)
     terms = one.shape[-1]
     pairs = one.reshape(-1, terms).T, other.reshape(-1, terms).T
     return recorder.inner_products(left, right, equation.shape, pairs)
@@ -101,7 +107,7 @@ def _multiplied(recorder: Recorder, one: Value, other: Value) -> Value:
         found = over_norm(recorder, *pair)
         if found is not None:
             return found
-    return recorder.product(one, other)
+    return product_of(recorder, one, other)
 
 
 @entrywise

@@ -1,4 +1,4 @@
-"""Maxima, limits, and choices by comparisons: rectifiers, and errors where values jump."""
+"""Maxima, limits, and choices by comparisons: rectifiers, and steps where values jump."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.primitives.equations import (
-    JUMPS,
-    Equation,
-    Rule,
-    entrywise,
-    shaped,
-)
-from reachjax.loops.primitives.kinks import bent
+from reachjax.loops.primitives.equations import Equation, Rule, entrywise, shaped
+from reachjax.loops.primitives.jumps import compared_equal
+from reachjax.loops.primitives.kinks import bent, halves
 from reachjax.loops.primitives.moving import chosen
+from reachjax.loops.primitives.picks import between, stepped
 from reachjax.loops.recording import Recorder
 from reachjax.loops.values import Comparison, Operand, UnsupportedError, Value, is_known
 
@@ -101,18 +97,18 @@ def _compared(recorder: Recorder, equation: Equation, operands: Sequence[Operand
     for each, sign in ((one, 1), (other, -1)):
         if _is_plain(each) and np.size(each) and np.all(np.isinf(np.asarray(each))):
             return sign * np.asarray(each) > 0
-    return Comparison(recorder.added(one, other, -1))
+    return Comparison(recorder.added(one, other, -1), strict=equation.name in ("gt", "lt"))
 
 
 @entrywise
-def _equal(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> np.ndarray:
-    """Numbers are equal to themselves, and to no infinity."""
+def _equal(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
+    """Numbers are equal to themselves, and to no infinity; to others they may be."""
     one, other = operands
     if isinstance(one, Value) and isinstance(other, Value) and one.place == other.place:
         return np.full(equation.shape, equation.name == "eq")
     if any(_is_plain(each) and np.all(~np.isfinite(np.asarray(each))) for each in (one, other)):
         return np.full(equation.shape, equation.name == "ne")
-    raise UnsupportedError(JUMPS)
+    return compared_equal(recorder, recorder.added(one, other, -1), equation.name == "eq")
 
 
 def _finite(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> np.ndarray:
@@ -129,28 +125,21 @@ def decided(
     if not isinstance(condition, Comparison):
         which = np.asarray(condition) if is_known(condition) else condition
         return chosen(recorder, which, [below, above])
-    return bent(recorder, shaped(recorder, condition.value, shape), below, above)
+    value = shaped(recorder, condition.value, shape)
+    found = bent(recorder, value, below, above)
+    if found is not None:
+        return found
+    gate = shaped(recorder, stepped(recorder, condition), shape)
+    return between(recorder, gate, *halves(recorder, value, below, above))
 
 
 def _selected(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
     which, *cases = operands
     cases = [shaped(recorder, each, equation.shape) for each in cases]
-    if isinstance(which, Value):
-        raise UnsupportedError(
-            "what is chosen must not depend on numbers that depend on inputs: use jnp.where"
-        )
     return chosen(recorder, np.asarray(which) if is_known(which) else which, cases)
 
 
-def _opposite(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
-    """What is not above zero; at zero it must not matter."""
-    if not isinstance(operands[0], Comparison):
-        raise UnsupportedError(JUMPS)
-    return Comparison(recorder.scaled(operands[0].value, np.array(-1.0)))
-
-
 RULES: dict[str, Rule] = {
-    "not": _opposite,
     "max": _maximum,
     "min": _minimum,
     "clamp": _clamped,

@@ -45,13 +45,6 @@ class Equation:
         return jax.tree.map(np.asarray, found) if all(map(on_host, operands)) else found
 
 
-JUMPS = (
-    "it is discontinuous, and bounds of what follows would be those of its range: use a continuous "
-    "function, such as jnp.clip(k * y, -1, 1) for a sign, or give what it jumps by as a "
-    "disturbance, as floor(y) is y + w with w in [-1, 0]"
-)
-
-
 NOT_FINITE = "one of its operands is a constant that is not finite: use a finite one in its place"
 
 

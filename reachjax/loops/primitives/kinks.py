@@ -16,8 +16,8 @@ import numpy as np
 
 from reachjax.loops.rationals import Rationals, aligned, evaluated
 from reachjax.loops.recording import Recorder
-from reachjax.loops.units import ReLU
-from reachjax.loops.values import Operand, UnsupportedError, Value
+from reachjax.loops.units import ReLU, SmoothUnit
+from reachjax.loops.values import Operand, Value
 from reachjax.numerics.rounding import TINY, gamma
 
 
@@ -60,11 +60,10 @@ def _affine(operand: Operand, ends: int | None = None) -> Affine:
     return found[operand.place]
 
 
-def bent(recorder: Recorder, condition: Value, below: Operand, above: Operand) -> Operand:
+def bent(recorder: Recorder, condition: Value, below: Operand, above: Operand) -> Operand | None:
     """`above` where the condition is above zero, else `below`.
 
-    Raises:
-        UnsupportedError: they are not known to agree where it is zero.
+    None where they are not known to agree where it is zero.
     """
     lines = [*_lines(condition)]
     for ends in (*(y.place for y in lines), None):
@@ -77,11 +76,7 @@ def bent(recorder: Recorder, condition: Value, below: Operand, above: Operand) -
         bend = _pieces(recorder, y, condition, below, above)
         if bend is not None:
             return bend
-    raise UnsupportedError(
-        "where values are chosen by a comparison, both must be functions of the one number that "
-        "is compared, known to agree where it changes, as in jnp.where(y > 0, y, 0.1 * y): use "
-        "jnp.maximum, jnp.minimum or jnp.clip"
-    )
+    return None
 
 
 def _loosened(recorder: Recorder, value: Value, jumps: list[Fraction]) -> Value:
@@ -157,18 +152,16 @@ def _pieces(
     recorder: Recorder, y: Value, condition: Value, below: Operand, above: Operand
 ) -> Operand | None:
     """A choice as one between two functions of `y`; None unless they are, and agree."""
-    on = _affine(condition, y.place)
-    scale = on.terms.get(y.place)
-    if scale is None or len(on.terms) != 1 or not all(scale.numbers):
+    found = _kink(condition, y)
+    if found is None:
         return None
-    kink = (-on.offset).over(scale)
-    signs = {each > 0 for each in scale.numbers if each is not None}
+    kink, rises = found
     at, lost = _meeting(*(_value_at(recorder, each, y, kink) for each in (above, below)))
     floats = kink.floats()
-    if floats is None or len(signs) != 1 or lost is None:
+    if floats is None or lost is None:
         return None
+    f, g = (above, below) if rises else (below, above)
     floats = _spread(floats, y)
-    f, g = (above, below) if signs == {True} else (below, above)
     rise = recorder.rectified(recorder.shifted(y, -floats) if np.any(floats) else y)
     more = recorder.shifted(rise, floats) if np.any(floats) else rise
     less = recorder.added(y, rise, -1)
@@ -184,6 +177,61 @@ def _pieces(
     if np.any(at):
         found = recorder.shifted(found, -_spread(at, condition))
     return _loosened(recorder, found, lost)
+
+
+def _kink(condition: Value, y: Value) -> tuple[Rationals, bool] | None:
+    """Where a condition is zero, and whether it rises there; None if it is no line of `y` alone."""
+    on = _affine(condition, y.place)
+    scale = on.terms.get(y.place)
+    if scale is None or len(on.terms) != 1 or not all(scale.numbers):
+        return None
+    signs = {each > 0 for each in scale.numbers if each is not None}
+    return ((-on.offset).over(scale), signs == {True}) if len(signs) == 1 else None
+
+
+def _side(recorder: Recorder, y: Value, at: np.ndarray, above: bool) -> Value:
+    """`max(y, at)` or `min(y, at)`, whose intervals end there."""
+    if above:
+        return recorder.shifted(recorder.rectified(recorder.shifted(y, -at)), at)
+    turned = recorder.scaled(y, np.array(-1.0))
+    return recorder.added(at, recorder.rectified(recorder.shifted(turned, at)), -1)
+
+
+def halves(
+    recorder: Recorder, condition: Value, below: Operand, above: Operand
+) -> tuple[Operand, Operand]:
+    """Two functions that a condition chooses between, each where it is chosen.
+
+    Smooth functions of the number that is compared get that number up to where it changes, and from
+    there on: `log(y)` where `y > 0.1` is `log(max(y, 0.1))`.
+    """
+    for y in _lines(condition):
+        found = _kink(condition, y)
+        floats = None if found is None else found[0].floats()
+        smooth = [_is_smooth(recorder, each, y) for each in (below, above)]
+        if found is None or floats is None or not any(smooth):
+            continue
+        kink, rises = found
+        at, same = _spread(floats, y), np.arange(y.size).reshape(condition.shape)
+        cases = []
+        for each, bends, is_above in zip((below, above), smooth, (not rises, rises), strict=True):
+            if bends:
+                side = _side(recorder, y, at, is_above)
+                each = _changed(recorder, each, y, side, kink, above=is_above)
+                each = recorder.picked(each, same) if isinstance(each, Value) else each
+            cases.append(each)
+        return cases[0], cases[1]
+    return below, above
+
+
+def _is_smooth(recorder: Recorder, operand: Operand, y: Value) -> bool:
+    """Whether an operand is a function of `y` alone, entry by entry, with smooth units."""
+    if not isinstance(operand, Value):
+        return False
+    places = recorder.between(operand, y)
+    steps = [recorder.steps[place] for place in places if place != y.place]
+    known = y.place in places and all(step is not None and step.entrywise for step in steps)
+    return known and any(isinstance(step.unit, SmoothUnit) for step in steps if step)
 
 
 def _meeting(

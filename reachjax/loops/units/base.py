@@ -201,6 +201,10 @@ class AbstractUnit(AbstractActivation):
         (low, under), (high, over) = ends
         return low - under, high + over
 
+    def open(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
+        """Inputs whose bounds are worth a program each: here those of units that are not affine."""
+        return ~self.lines(lower, upper).affine
+
     @abc.abstractmethod
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:
         """What holds for inputs `y`, values `z` and bounds `lower <= y <= upper`.

@@ -1,0 +1,110 @@
+"""Functions that jump are traced: every kind of number has their values, intervals hold them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from tests.loops.traced import assert_sound
+
+T, ROWS = jnp.array([1.0, -2.0, 3.0]), jnp.array([[1.0, 2.0], [0.5, -1.0], [-3.0, 0.0]])
+W = jnp.array([[1.0, 0.3], [-0.2, 1.1], [0.7, -0.9]])
+Partial = jax.tree_util.Partial
+
+
+def hypot(x, y):
+    """It is no length, whatever its name."""
+    return jnp.sign(x) + y
+
+
+JUMPS = {
+    "sign": jnp.sign,
+    "heaviside": lambda x: jnp.heaviside(x, 0.5),
+    "sign times a number": lambda x: jnp.sign(x) * x[::-1],
+    "size by a sign": lambda x: jnp.sign(x) * x,
+    "comparison times a number": lambda x: (x > 0) * x[::-1],
+    "numbers of truth values": lambda x: (x > 0).astype(float),
+    "whole numbers of truth values": lambda x: (x > 0).astype(int) * x,
+    "one of two functions": lambda x: jnp.where(x > 0, x + 1.0, 2.0 * x - 1.0),
+    "one of two numbers": lambda x: jnp.where(x >= 0.3, 0.1, 0.3),
+    "one of two smooth ones": lambda x: jnp.where(x > 0.1, jnp.log(x), 0.0),
+    "one of two smooth ones below": lambda x: jnp.where(x > 0.1, 0.0, jnp.sqrt(0.2 - x)),
+    "branches": lambda x: lax.cond(x[0] > 0, lambda x: x, lambda x: x[::-1] + 1.0, x),
+    "branches of pairs": lambda x: jnp.stack(
+        lax.cond(x[0] > 0, lambda x: (x[0], 1.0), lambda x: (x[1], 0.0), x)
+    ),
+    "select": lambda x: jnp.select([x < 0, x < 1], [x + 2, 3 * x], 0.5),
+    "select of constants": lambda x: jnp.select([x < 0, x < 1], [2.0, 3.0], 0.5),
+    "both hold": lambda x: ((x > 0) & (x < 1)) * 1.0,
+    "one holds": lambda x: jnp.where((x > 0.5) | (x < -0.5), 1.0, x),
+    "one alone holds": lambda x: jnp.where((x > 0.5) ^ (x[::-1] < 0.2), 1.0, x),
+    "neither": lambda x: jnp.where(~((x > 0.5) | (x < -0.5)), 1.0, x),
+    "all": lambda x: jnp.where(jnp.all(x > 0), x, -x),
+    "any": lambda x: jnp.where(jnp.any(x > 0), x + 1, -x),
+    "how many": lambda x: jnp.sum(x > 0) * x,
+    "round": lambda x: jnp.round(jnp.clip(x, -1, 1) / 0.25) * 0.25,
+    "round to digits": lambda x: jnp.round(jnp.clip(x, -1, 1), 1),
+    "floor": lambda x: jnp.floor(2.0 * jnp.clip(x, -1, 1)),
+    "ceil": lambda x: jnp.ceil(2.0 * jnp.clip(x, -1, 1)) * x,
+    "round away": lambda x: lax.round(2.0 * jnp.clip(x, -1, 1)),
+    "floor of anything": jnp.floor,
+    "ceil of anything": lambda x: jnp.ceil(3.0 * x),
+    "round of anything": lambda x: jnp.round(3.0 * x),
+    "whole quotient": lambda x: jnp.clip(x, -1, 1) // 0.3,
+    "remainder": lambda x: jnp.clip(x, -1, 1) % 0.3,
+    "remainder of the sign of the number": lambda x: jnp.fmod(jnp.clip(x, -1, 1), 0.3),
+    "entries by whole numbers": lambda x: T[jnp.clip(x[0] + 1.0, 0.0, 2.0).astype(int)] * x,
+    "argmax": lambda x: T[jnp.argmax(W @ x)] * jnp.ones(1),
+    "argmin": lambda x: T[jnp.argmin(W @ x)] * x,
+    "argmax of two": lambda x: T[jnp.argmax(x)] * x,
+    "rows of a table": lambda x: ROWS[jnp.argmax(W @ x)],
+    "taken rows": lambda x: jnp.take(ROWS, jnp.argmax(W @ x), axis=0),
+    "one hot": lambda x: jax.nn.one_hot(jnp.argmax(W @ x), 3) @ ROWS,
+    "one hot of numbers": lambda x: (jax.nn.one_hot(jnp.argmax(W @ x), 3) @ (W @ x))[None],
+    "the chosen number": lambda x: (W @ x)[jnp.argmax(W @ x)][None],
+    "whole results": lambda x: jnp.argmax(W @ x)[None] + 1,
+    "half of a whole number": lambda x: (jnp.argmax(W @ x) // 2)[None] * x,
+    "switch": lambda x: lax.switch(jnp.argmax(W @ x), [jnp.sin, lambda x: 2 * x, jnp.negative], x),
+    "argmax of rows": lambda x: (jnp.argmax(W * x, axis=0) == 1) * x,
+    "table of parameters": Partial(lambda t, x: t[jnp.argmax(W @ x)] * x, T),
+    "where of parameters": Partial(lambda t, x: jnp.where(x > t[0] - 0.9, t[1], t[2] * x), T),
+    "masks in a scan": lambda x: lax.scan(
+        lambda c, m: (jnp.where(m[0], c + 1.0, c - m[1]), c), 0.0, (x > 0, x)
+    )[0] * x,
+    "actions in a scan": lambda x: lax.scan(
+        lambda c, w: (c + T[jnp.argmax(w * x)], c), 0.0, W
+    )[0] * x,
+    "entries of a table": lambda x: T[(x > 0).astype(int)] * x,
+    "entries of what is given": lambda x: (W @ x)[(x > 0).astype(int)],
+    "rows of a table by each": lambda x: ROWS[(x > 0).astype(int)].ravel(),
+    "a function of the name of one of JAX": lambda x: jax.jit(hypot)(x[0], x[1])[None],
+    "relative to large numbers": lambda x: jnp.where(x > 1e6, 2 * x - 2e6, x - 1e6 + 1e-6),
+    "smooth functions": lambda x: jnp.where(x > 0, jnp.cos(x), jnp.tanh(x)),
+    "not rational": lambda x: jnp.where(x > 1, jnp.exp(x), jnp.exp(2 * x - 1)),
+    "by another number": lambda x: jnp.where(x[::-1] > 0, 2 * x, x),
+    "by a learned threshold": Partial(lambda s, x: jnp.where(x > s, x, 0.0), 0.1),
+    "equal": lambda x: jnp.where(x == 0.25, 2.0, x),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_functions_that_jump_are_sound(name):
+    assert_sound(JUMPS[name])
+
+
+ON = np.array([[0.0, 0.0], [0.3, 0.3], [-0.0, 0.5], [0.25, -0.25], [1.0, 1.0]])
+BESIDE = np.concatenate([ON, np.nextafter(ON, np.inf), np.nextafter(ON, -np.inf)])
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_values_on_the_surfaces_are_within_the_bounds_of_a_point(name):
+    from tests.loops.traced import interval, network
+
+    function = JUMPS[name]
+    net = network(function)
+    expected = np.asarray(jax.vmap(function)(BESIDE))
+    for x, value in zip(BESIDE, expected, strict=True):
+        low, high = interval(net, x, x)
+        slack = 1e-13 * (1 + abs(value))
+        assert np.all((low - slack <= value) & (value <= high + slack)), (x, low, value, high)

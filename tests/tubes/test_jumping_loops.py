@@ -1,0 +1,143 @@
+"""Loops that jump: whatever the closed law allows lies in their sets, on the surfaces and beside.
+
+Numbers are small multiples of powers of two, so that trajectories are exact fractions.
+"""
+
+import itertools
+from fractions import Fraction
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import reachjax as rj
+
+STEPS, H = 3, Fraction(1, 4)
+
+
+def signs(y):
+    """All that a sign may be."""
+    return (-1, 0, 1) if y == 0 else (1,) if y > 0 else (-1,)
+
+
+def steps(y):
+    """All that a step may be."""
+    return (0, 1) if y == 0 else (int(y > 0),)
+
+
+def nearest(y):
+    """Whole numbers that are as near as any."""
+    return {(y + Fraction(1, 2)) // 1, -((Fraction(1, 2) - y) // 1)}
+
+
+def relay(x):
+    return [(x[0] + H * x[1], x[1] - s * H) for s in signs(x[0] + x[1])]
+
+
+def thermostat(x):
+    """Colder than 0 it turns on, warmer than 1 off; else it stays as it is."""
+    cold, warm = steps(-x[0]), steps(x[0] - 1)
+    after = {1 if c else 0 if w else x[1] for c in cold for w in warm}
+    return [(x[0] + H * (on - Fraction(1, 2) - x[0] / 4), on) for on in after]
+
+
+def friction(x):
+    return [(x[0] + H * x[1], x[1] - H * (x[0] + s / Fraction(2))) for s in signs(x[1])]
+
+
+def quantised(x):
+    u = max(Fraction(-1), min(Fraction(1), -x[0] - x[1]))
+    return [(x[0] + H * x[1], x[1] + H * n / 4) for n in nearest(4 * u)]
+
+
+def best(x):
+    scores = (x[0] - x[1], x[0] / 2 + Fraction(1, 4), x[1])
+    winners = [k for k, score in enumerate(scores) if score == max(scores)]
+    return [(x[0] + H * x[1], x[1] + H * (-1, 2, 1)[k]) for k in winners]
+
+
+h = float(H)
+LAWS = {
+    "a relay": (
+        lambda x, u: jnp.stack([x[0] + h * x[1], x[1] - h * jnp.sign(x[0] + x[1])]),
+        relay, ([-0.5, -0.5], [0.5, 0.5]),
+    ),
+    "a thermostat": (
+        lambda x, u: jnp.stack([x[0] + h * (u[0] - 0.5 - x[0] / 4), u[0]]),
+        thermostat, ([-0.5, 0.0], [1.5, 0.0]),
+    ),
+    "friction": (
+        lambda x, u: jnp.stack([x[0] + h * x[1], x[1] - h * (x[0] + jnp.sign(x[1]) / 2)]),
+        friction, ([-0.5, -0.5], [0.5, 0.5]),
+    ),
+    "a quantised input": (
+        lambda x, u: jnp.stack(
+            [x[0] + h * x[1], x[1] + h * jnp.round(4 * jnp.clip(-x[0] - x[1], -1, 1)) / 4]
+        ),
+        quantised, ([-0.25, -0.25], [0.25, 0.25]),
+    ),
+    "the best of three": (
+        lambda x, u: jnp.stack([x[0] + h * x[1], x[1] + h * jnp.array([-1.0, 2.0, 1.0])[
+            jnp.argmax(jnp.stack([x[0] - x[1], x[0] / 2 + 0.25, x[1]]))]]),
+        best, ([-0.5, -0.5], [0.5, 0.5]),
+    ),
+}  # fmt: skip
+
+
+def loop_of(name):
+    def controller(x):
+        return jnp.where(x[:1] < 0, 1.0, jnp.where(x[:1] > 1, 0.0, x[1:]))
+
+    plant = rj.NonlinearPlant(LAWS[name][0], states=2, inputs=1)
+    return rj.ClosedLoop(plant, rj.Network(controller, 2, 1))
+
+
+def starting(lower, upper):
+    """A grid of fractions, whose points are on surfaces or not, and points next to these."""
+    axes = [
+        sorted({Fraction(a) + (Fraction(b) - Fraction(a)) * Fraction(k, 8) for k in range(9)})
+        for a, b in zip(lower, upper, strict=True)
+    ]
+    tiny, points = Fraction(1, 2**60), []
+    for x in itertools.product(*axes):
+        for shift in (-tiny, Fraction(0), tiny):
+            moved = (x[0] + shift, x[1])
+            if lower[0] <= moved[0] <= upper[0]:
+                points.append(moved)
+    return points
+
+
+@pytest.mark.parametrize("relaxation", [rj.LinearBounds(), rj.BranchAndCut()], ids=str)
+@pytest.mark.parametrize("name", LAWS)
+def test_all_that_the_closed_law_allows_is_in_the_sets(name, relaxation):
+    _, law, ends = LAWS[name]
+    tube = rj.reach(loop_of(name), rj.Box(*ends), STEPS, rj.Template.octagonal(2),
+                    relaxation=relaxation, gap=1e-3)  # fmt: skip
+    states = set(starting(*ends))
+    for t in range(1, STEPS + 1):
+        states = {after for x in states for after in law(x)}
+        A, b = (
+            np.vectorize(Fraction, otypes=[object])(np.asarray(part))
+            for part in tube.sets[t].facets
+        )
+        points = np.array(sorted(states), object)
+        if len(points) > 4000:  # exact numbers take their time
+            keep = np.random.default_rng(t).choice(len(points), 4000, replace=False)
+            points = points[keep]
+            states = {tuple(x) for x in points}
+        assert np.all((points @ A.T).max(axis=0) <= b), t
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_verdicts_are_those_of_the_extremes(name):
+    _, law, ends = LAWS[name]
+    states = set(starting(*ends))
+    for _ in range(2):
+        states = {after for x in states for after in law(x)}
+    most = float(max(x[0] for x in states))
+    loop, X0 = loop_of(name), rj.Box(*ends)
+    wide, narrow = (rj.Box([-9.0, -9.0], [most + by, 9.0]) for by in (0.01, -0.01))
+    proved = rj.decide(loop, X0, 2, goal=wide)
+    refuted = rj.decide(loop, X0, 2, goal=narrow)
+    assert proved.status is not rj.VerdictStatus.REFUTED
+    assert refuted.status is rj.VerdictStatus.REFUTED

@@ -81,7 +81,7 @@ def _of_two(recorder: Recorder, unit: AbstractUnit, gate: Value, value: Value, a
 
     def apply(at: AtUnit, s: Any, y: Any) -> Any:
         if isinstance(y, Rationals):
-            return y.unknown()
+            return y.widened(1.0)
         if isinstance(y, np.ndarray):
             both = np.concatenate([s, y])
         elif isinstance(y, jax.Array):

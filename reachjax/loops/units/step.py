@@ -131,8 +131,8 @@ class Gated(AbstractUnit):
         xp = namespace(lower, upper)
         (always, never), (low, high) = _gates(lower, upper), _halves(lower, upper)[1]
         slope = xp.where(always, 1.0, xp.where(never, 0.0, 0.5))
-        gap = larger(abs(low), abs(high)) / 2
-        gap = xp.where(always | never, 0.0, gap)
+        size = larger(abs(low), abs(high))  # half of the least number is zero
+        gap = xp.where(always | never | (size == 0), 0.0, size / 2 + TINY)
         zero = xp.zeros_like(low)
         slope, below, above = (xp.concatenate([zero, part], axis=-1) for part in (slope, -gap, gap))
         return Lines(Line(slope, below), Line(slope, above))
@@ -151,7 +151,8 @@ class Gated(AbstractUnit):
         )
         both = _either(xp, always, never, off, on)
         low, high = (xp.concatenate(ends, axis=-1) for ends in zip(idle, both, strict=True))
-        return low - gamma(4) * abs(low), high + gamma(4) * abs(high)
+        flushed = xp.where((slope == 0) | (slope == 1), 0.0, TINY)  # else nothing is rounded
+        return low - gamma(4) * abs(low) - flushed, high + gamma(4) * abs(high) + flushed
 
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:
         """The four inequalities of a product whose one factor is zero or one."""

@@ -432,12 +432,22 @@ def evaluated(recorder: Recorder, evaluate: Callable[..., Any], operands: Sequen
     for k in range(len(picks[0].numbers)):
         given = [each.numbers[k] if isinstance(each, Pick) else each for each in operands]
         found.append(evaluate(*given))
-    which = picks[0].which
-    if isinstance(found[0], list | tuple):
-        return [
-            merged(recorder, Pick(which, plain_stack(each))) for each in zip(*found, strict=True)
-        ]
-    return merged(recorder, Pick(which, plain_stack(found)))
+    made = [*zip(*found, strict=True)] if isinstance(found[0], list | tuple) else [found]
+    results = []
+    for each in made:
+        numbers = plain_stack(each)
+        which = _fitted(recorder, picks[0].which, np.shape(numbers)[1:])
+        results.append(merged(recorder, Pick(which, numbers)))
+    return results if isinstance(found[0], list | tuple) else results[0]
+
+
+def _fitted(recorder: Recorder, which: Value, shape: Shape) -> Value:
+    """Events of entries of an array, for those of a larger one that it is broadcast to."""
+    count, *own = which.shape
+    if not own or tuple(own) == tuple(shape):
+        return which
+    placed = recorder.reshaped(which, (count, *[1] * (len(shape) - len(own)), *own))
+    return recorder.broadcast(placed, (count, *shape))
 
 
 def plain_stack(parts: Sequence[Any]) -> Any:

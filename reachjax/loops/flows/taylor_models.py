@@ -125,7 +125,7 @@ class TaylorModels(AbstractNumber):
         return Ball.between(*self.ends())
 
     def zeros(self) -> TaylorModels:
-        """As many numbers that are zero."""
+        """A vector of zeros, as many as there are numbers."""
         xp = namespace(self.rows)
         return TaylorModels(xp.zeros_like(self.rows), xp.zeros_like(self.radii), self.symbols)
 
@@ -283,7 +283,7 @@ def product(one: Any, other: Any) -> Any:
 
 
 def zeros(number: Any) -> Any:
-    """As many zeros of the same kind."""
+    """A vector of zeros, as many and of the kind that is given."""
     if isinstance(number, TaylorModels):
         return number.zeros()
     if isinstance(number, Ball):

@@ -101,6 +101,16 @@ def quotient(p: Any, x: Any, u: Any) -> Any:
     return x + 0.1 * jnp.stack([jnp.exp(-x[1]) - 1, p * u[0] / (1 + x[0] ** 2)])
 
 
+def car(p: Any, x: Any, u: Any) -> Any:
+    """Three states: a place, and a heading that is steered less far away."""
+    return x + 0.2 * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), p * u[0] / (1 + x[0] ** 2)])
+
+
+def bell(p: Any, x: Any, u: Any) -> Any:
+    """One state."""
+    return 0.5 * x + jnp.exp(-p * x**2) / 3 + 0.1 * u
+
+
 def pushed(p: Any, x: Any, u: Any, w: Any) -> Any:
     """The pendulum, with a disturbance."""
     return sine(p, x, u) + 0.05 * w
@@ -142,14 +152,15 @@ def side(x: Any) -> Any:
     return (x[0] > 0.1).astype(int)
 
 
-def net(activation: Any = rj.Tanh(), seed: int = 0) -> rj.MLP:  # noqa: B008  (immutable)
-    """Two states, one input."""
-    return rj.MLP.from_layers(he_network((2, 4, 3, 1), seed), activation)
+def net(activation: Any = rj.Tanh(), seed: int = 0, n: int = 2) -> rj.MLP:  # noqa: B008  (immutable)
+    """So many states, one input."""
+    return rj.MLP.from_layers(he_network((n, 4, 3, 1), seed), activation)
 
 
-def nonlinear(f: Callable, activation: Any = rj.Tanh(), **options: Any) -> rj.ClosedLoop:  # noqa: B008
+def nonlinear(f: Callable, activation: Any = None, n: int = 2, **options: Any) -> rj.ClosedLoop:
     """A plant of a function, under a network of layers."""
-    return rj.ClosedLoop(rj.NonlinearPlant(Partial(f, 1.5), 2, 1), net(activation), **options)
+    plant = rj.NonlinearPlant(Partial(f, 1.5), n, 1)
+    return rj.ClosedLoop(plant, net(activation or rj.Tanh(), n=n), **options)
 
 
 def of_arrays(n_x: int = 2, seed: int = 3, activation: Any = rj.ReLU(), **options: Any) -> Loop:  # noqa: B008
@@ -165,11 +176,11 @@ def of_arrays(n_x: int = 2, seed: int = 3, activation: Any = rj.ReLU(), **option
     return Loop(lambda: plain().loop, lambda: initial_set("box", n_x, n_x), start, plain)
 
 
-def disturbed(W: str, V: str) -> Loop:
+def disturbed(W: str, V: str, n: int = 2) -> Loop:
     """A loop into which disturbances and noise enter."""
     return Loop(
-        lambda: disturbed_loop(2, disturbance_set(W, 2), disturbance_set(V, 2, seed=3), seed=1),
-        lambda: rj.Box([-0.1, -0.1], [0.4, 0.4]),
+        lambda: disturbed_loop(n, disturbance_set(W, n), disturbance_set(V, n, seed=3), seed=1),
+        lambda: rj.Box(np.full(n, -0.1), np.full(n, 0.4)),
         options={"gap": 0.1},  # no products
     )
 
@@ -196,6 +207,9 @@ LOOPS = {
     "residual": of_arrays(skip=True),
     "unlimited": of_arrays(boxed=False),
     "varying": of_arrays(steps=START + HORIZON),
+    "hard, one state": of_arrays(1, activation=rj.HardTanh()),
+    "leaky, six states": of_arrays(6, activation=rj.LeakyReLU(0.1)),
+    "residual, three states": of_arrays(3, skip=True),
     "one state": of_arrays(1),
     "three states": of_arrays(3),
     "six states": of_arrays(6),
@@ -211,6 +225,8 @@ LOOPS = {
     "disturbed in a polytope": disturbed("polytope", "intersection"),
     "disturbed in a ball": disturbed("ellipsoid", "polytope"),
     "disturbed in both": disturbed("intersection", "varying box"),
+    "disturbed, one state": disturbed("polytope", "ellipsoid", 1),
+    "disturbed, three states": disturbed("box", "intersection", 3),
     "tanh": of_functions(lambda: rj.ClosedLoop(LINE, net()), kept=True),
     "sigmoid": of_functions(lambda: rj.ClosedLoop(LINE, net(rj.Sigmoid()), UNIT), kept=True),
     "traced": of_functions(
@@ -221,6 +237,10 @@ LOOPS = {
     "oscillator": of_functions(lambda: nonlinear(oscillator)),
     "oscillator, hard": of_functions(lambda: nonlinear(oscillator, rj.HardTanh())),
     "tank": of_functions(lambda: nonlinear(tank)),
+    "car": of_functions(
+        lambda: nonlinear(car, rj.ReLU(), 3), initial=lambda: rj.Box([0, 0, 0.2], [0.1, 0.2, 0.5])
+    ),
+    "bell": of_functions(lambda: nonlinear(bell, n=1), initial=lambda: rj.Box([-1.0], [0.5])),
     "quotient": of_functions(lambda: nonlinear(quotient, rj.ReLU())),
     "pushed": of_functions(
         lambda: rj.ClosedLoop(
@@ -255,15 +275,23 @@ LOOPS = {
 }
 """Loops by name: of every kind of unit, plant, input set and disturbance."""
 
+
+def narrow(widths: Iterable[float]) -> Callable[[int], rj.Box]:
+    """Boxes whose first sides have these widths."""
+    low, sizes = np.array([-0.2, 0.3, 0.1, 0.0, 0.2, -0.1]), np.array([*widths, 0.3, 0.2, 0.1, 0.2])
+    return lambda n: rj.Box(low[:n], low[:n] + sizes[:n])
+
+
 SETS = {
-    kind: functools.partial(initial_set, kind, 2, 2)
+    kind: functools.partial(initial_set, kind, seed=2)
     for kind in ("polytope", "simplex", "ellipsoid", "intersection", "far intersection")
 } | {
-    "flat": lambda: rj.Box([-0.2, 0.3], [0.4, 0.3]),
-    "point": lambda: rj.Box([-0.2, 0.3], [-0.2, 0.3]),
-    "thin": lambda: rj.Box([-0.2, 0.3], [0.4, 0.3 + 1e-12]),
+    "flat": narrow([0.6, 0.0]),
+    "point": lambda n: rj.Box(0.1 * np.arange(n), 0.1 * np.arange(n)),
+    "thin": narrow([0.6, 1e-12]),
+    "wide": lambda n: rj.Box(-1.5 * np.ones(n), np.ones(n)),
 }
-"""Initial sets in the plane, beside those of loops."""
+"""Initial sets of so many states, beside those of loops."""
 
 RANDOM = np.random.default_rng(0).normal(size=(5, 2))
 VARYING = np.stack([(1.0 + t) * RANDOM for t in range(HORIZON)])
@@ -397,7 +425,7 @@ def _loop(name: str) -> rj.ClosedLoop:
 
 @functools.cache
 def _initial(loop: str, kind: str) -> rj.AbstractSet:
-    return LOOPS[loop].initial() if kind == "own" else SETS[kind]()
+    return LOOPS[loop].initial() if kind == "own" else SETS[kind](_loop(loop).states)
 
 
 @functools.cache
@@ -431,6 +459,27 @@ def _in_numpy(plain: Controlled, x: np.ndarray, start: int) -> np.ndarray:
     return np.stack(states, axis=1)
 
 
+ROUND_ROWS = (
+    *itertools.product(["relu"], ["simplex", "ellipsoid", "intersection"], ROUND),
+    *itertools.product(["one state", "three states"], ["own", "intersection"], ["mixed"]),
+    *itertools.product(["one state", "three states", "six states"], ["ellipsoid"], ["ellipsoids"]),
+    *itertools.product(
+        ["varying", "inputs in a pentagon", "sine", "sine, tanh", "disturbed"],
+        ["own"],
+        ["ellipsoids"],
+    ),
+    ("sine, tanh", "own", "mixed"),
+)
+"""Loops, sets and templates of ellipsoids."""
+
+BY_PROGRAMS = (
+    *("varying", "unlimited", "inputs in a pentagon", "tanh", "sine, tanh", "oscillator", "tank"),
+    *("one state", "three states", "six states", "hard", "hard, one state", "leaky, six states"),
+    *("residual, three states", "disturbed in a polytope", "pushed"),
+)
+"""Loops whose tubes are bounded by programs of one step as well."""
+
+
 def _rows() -> Iterator[Case]:
     for loop, method in itertools.product(LOOPS, ["default", "forms"]):
         yield Case(loop, method)
@@ -438,18 +487,25 @@ def _rows() -> Iterator[Case]:
         yield Case(loop, method)
     for initial, method in itertools.product(SETS, ["default", "forms", "programs"]):
         yield Case("relu", method, initial)
+    for initial in SETS:
+        yield Case("sine, tanh", "default", initial)
+        yield Case("three states", "forms", initial)
+    for initial in ("simplex", "ellipsoid", "intersection"):
+        yield Case("disturbed", "default", initial)
     for template, method in itertools.product(TEMPLATES, ["default", "forms", "programs", "paper"]):
         if METHODS[method].balls or template not in ROUND:
             yield Case("relu", method, "own", template)
-    for initial, template in itertools.product(["simplex", "ellipsoid", "intersection"], ROUND):
-        yield Case("relu", "programs", initial, template)
-    for loop, template in itertools.product(["one state", "three states"], ROUND):
-        if template != "given shape":
-            yield Case(loop, "programs", "own", template)
-    for loop in ("varying", "inputs in a pentagon", "sine", "sine, tanh", "disturbed"):
-        yield Case(loop, "programs", "own", "ellipsoids")
-    for loop in ("varying", "inputs in a pentagon", "tanh", "oscillator", "three states"):
+    yield Case("relu", "paper, plain", "own", "ellipsoids")
+    for loop, initial, template in ROUND_ROWS:
+        yield Case(loop, "programs", initial, template)
+    for loop in BY_PROGRAMS:
         yield Case(loop, "programs")
+    yield Case("three states", "programs", "simplex")
+    yield Case("disturbed in a ball", "paper")
+    for method in ("no programs", "cuts", "paper"):
+        yield Case("inputs in a pentagon", method)
+    for method in ("few programs", "cells of forms", "cells of branches", "cells of programs"):
+        yield Case("pushed", method)
 
 
 CASES = tuple(dict.fromkeys(_rows()))

@@ -2,7 +2,8 @@
 
 `python -m pytest` takes one case of each claim, of laws the basic ones: what somebody needs to
 trust an installation, in minutes. With a path, or `--every-case`, all cases are taken; with
-`--other-cases` those that it leaves out.
+`--other-cases` those of the library that it leaves out; with `--experiments` those about
+experiments, notebooks and site.
 """
 
 from collections import defaultdict
@@ -33,7 +34,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--other-cases",
         action="store_true",
-        help="the cases that are not taken by default, for a machine that has run those",
+        help="the cases of the library that are not taken by default, for after those",
+    )
+    parser.addoption(
+        "--experiments",
+        action="store_true",
+        help=f"all cases about experiments, notebooks and site: {' '.join(ELSEWHERE)}",
     )
 
 
@@ -42,6 +48,9 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "costly: a claim that only `--every-case` or a path runs")
     config.addinivalue_line("markers", "basic: a case that is taken wherever one of its claim is")
     draw_from(config.getoption("seed"))
+    if config.getoption("experiments"):
+        config.args[:] = ELSEWHERE
+        config.args_source = pytest.Config.ArgsSource.ARGS
 
 
 def draw_from(seed: int) -> None:
@@ -86,7 +95,7 @@ def _is_elsewhere(path: Path, config: pytest.Config) -> bool:
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave unread, in a bare run, the files of claims that are not about the library."""
-    if _everything(config) or config.getoption("other_cases"):
+    if _everything(config):
         return None
     return True if _is_elsewhere(collection_path, config) else None
 

@@ -2,12 +2,14 @@
 
 import functools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import reachjax as rj
 from tests.cases import HORIZON, Case, each
-from tests.laws.changes import CHANGES, changed, same, wider
+from tests.closed_loops import autonomous
+from tests.laws.changes import CHANGES, at, changed, parts_of, same, wider
 
 
 def read(path, tube, loop=None):
@@ -77,17 +79,19 @@ def made(kind):
     return partition() if kind == "partition" else ATTACKED[kind].tube
 
 
-def loop_of(tube):
-    """The loop of a tube or a partition."""
-    return tube[0].loop if isinstance(tube, rj.PartitionedTube) else tube.loop
+def given(kind):
+    """The loop that has to be given with a file of a kind; None where the file has it."""
+    case = ATTACKED.get(kind)
+    return None if case is None or case.of.kept else case.closed_loop
 
 
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_tube_that_was_changed_is_not_read(kind, change, tmp_path):
     tube = changed(made(kind), change)
+    loop = None if given(kind) is None else tube.loop
     with pytest.raises((rj.DisagreementError, rj.UnreadableError)):
-        read(tmp_path / "tube.reach", tube, loop_of(tube))
+        read(tmp_path / "tube.reach", tube, loop)
 
 
 def test_a_partition_is_read_as_it_was(tmp_path):
@@ -104,14 +108,30 @@ def test_cells_that_leave_something_out_are_not_read(tmp_path):
             read(tmp_path / "tube.reach", spoilt)
 
 
-@pytest.mark.parametrize("kind", ["branches", "programs", "ellipsoids"])
-def test_a_bound_that_is_not_proved_is_named(kind, tmp_path):
-    tube = changed(made(kind), "lower bounds and no witnesses")
-    tube.save(tmp_path / "tube.reach")
+@pytest.mark.costly
+def test_a_disagreement_says_what_was_said_and_what_is_proved(tmp_path):
+    """Of the unit ball in eight dimensions the sum of all entries is bounded by the root of 8."""
+    A = np.zeros((8, 8))
+    A[0] = 1.0
+    ball = rj.Ellipsoid(np.zeros(8), np.eye(8))
+    tube = rj.reach(autonomous(A), ball, 1, rj.Template.box(8))
+    proof, X = tube.proof(1), tube.sets[1]
+    facet = int(np.argmax(X.A[:, 0]))
+    lower = X.b.at[facet].set(2.7)
+    proof = proof.replace(bounds=lower, witnesses=jnp.full(len(lower), -1e300))
+    parts = parts_of(tube) | at(tube, 1, X.replace(b=lower), proof)
+    forged = rj.ReachTube.sealed(**parts)
+    forged.save(tmp_path / "tube.reach")
     rj.load(tmp_path / "tube.reach")  # nothing was asked
-    with pytest.raises(rj.DisagreementError, match="the recheck of step 3 proves") as caught:
-        rj.load(tmp_path / "tube.reach", recheck=True)
+    with pytest.raises(rj.DisagreementError, match=r"recheck of step 1 proves 2\.828") as caught:
+        read(tmp_path / "tube.reach", forged)
     error = caught.value
-    assert error.step == 3
-    assert error.said < error.proved
-    assert error.said == np.asarray(tube.proof(3).bounds)[error.facet] or kind == "ellipsoids"
+    assert (error.step, error.facet, error.said) == (1, facet, 2.7)
+    assert error.proved == pytest.approx(np.sqrt(8))
+
+
+@each(rows=[case for kind, case in ATTACKED.items() if kind not in ("cells", "cells of branches")])
+def test_a_tube_that_was_read_goes_on_as_the_one_that_was_written(case, tmp_path):
+    tube = case.reach(steps=1)
+    again = read(tmp_path / "tube.reach", tube, None if case.of.kept else case.closed_loop)
+    assert same(tube.extended(1, **case.options).sets, again.extended(1, **case.options).sets)

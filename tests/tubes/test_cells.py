@@ -44,40 +44,6 @@ def tube(request) -> rj.ReachTube:
     return rj.reach(loop_of(X0.dimension), X0, 3, rj.Template.box(X0.dimension), relaxation)
 
 
-def test_no_state_is_outside(tube):
-    states = np.asarray(tube.simulate(5000, seed=1))
-    for t, region in enumerate(tube.sets):
-        assert np.asarray(region.contains(states[:, t], 1e-12)).all()
-
-
-def test_cells_prove_no_less_than_one_cell_does(tube):
-    for t in (1, 2, 3):
-        proof = tube.proof(t)
-        assert isinstance(proof, rj.CellCertificate)
-        assert 1 <= proof.cells <= 24
-        assert (proof.recheck() == proof.bounds).all()
-        assert (proof.recheck([-1]) >= proof.bounds - 1e-12).all()
-
-
-@pytest.mark.parametrize(
-    "axes", [[], [0], [0, -1], [0, -1, -1, -1], [7, -1, -1], [-2], [-1, -1], [0, 0, -1, -1]]
-)
-def test_what_leaves_something_out_is_no_tree(tube, axes):
-    with pytest.raises(ValueError, match="axes must be those of a tree"):
-        tube.proof(1).recheck(axes)
-
-
-def test_any_tree_is_sound(tube):
-    rng, n = np.random.default_rng(0), tube.loop.states
-    for _ in range(3):
-        axes = [int(rng.integers(n)), int(rng.integers(n)), -1, -1, -1]
-        try:
-            found = tube.proof(3).recheck(axes)
-        except ValueError:  # the set reaches one half only
-            continue
-        assert (found >= np.asarray(tube.proof(3).witnesses) - 1e-12).all()
-
-
 @pytest.mark.costly
 def test_a_gap_that_may_stay_open_takes_fewer_cells():
     given = loop_of(2), STARTS["two"], 3, rj.Template.box(2)

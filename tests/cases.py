@@ -197,6 +197,7 @@ def jumping(make: Callable, size: float = 0.5, smooth: bool = False) -> Loop:
     return of_functions(make, initial=around, smooth=smooth, options={"gap": 1e-2})
 
 
+FILE = "tests/data/networks/torch_tanh.onnx"
 UNIT = rj.Box([-1.0], [1.0])
 LINE = rj.AffinePlant([[1.0, 0.25], [0.0, 1.0]], [[0.0], [0.25]])
 
@@ -229,6 +230,9 @@ LOOPS = {
     "disturbed, three states": disturbed("box", "intersection", 3),
     "tanh": of_functions(lambda: rj.ClosedLoop(LINE, net()), kept=True),
     "sigmoid": of_functions(lambda: rj.ClosedLoop(LINE, net(rj.Sigmoid()), UNIT), kept=True),
+    "of a file": of_functions(
+        lambda: rj.ClosedLoop(LINE, rj.Network.from_onnx(FILE), UNIT), kept=True
+    ),
     "traced": of_functions(
         lambda: rj.ClosedLoop(LINE, rj.Network(Partial(law, jnp.array([[1.5, 1.0]])), 2, 1), UNIT)
     ),

@@ -5,7 +5,7 @@ import pickle
 import pytest
 
 import reachjax as rj
-from tests.cases import HORIZON, each
+from tests.cases import HORIZON, Case, each
 from tests.laws.changes import same
 
 
@@ -49,3 +49,14 @@ def test_nothing_is_left_of_a_call_that_proved_nothing(case):
 @each()
 def test_the_same_call_gives_the_same_tube(case):
     assert same(claims(case.reach()), claims(case.tube))
+
+
+@each(lambda case: case.template != "varying" and not case.searches_cells)
+def test_the_first_step_is_that_of_a_call_for_one_step(case):
+    assert same(claims(case.reach(steps=1))[0][1], case.tube.sets[1])
+
+
+def test_a_tube_goes_on_to_where_its_loop_ends():
+    case = Case("varying")
+    with pytest.raises(ValueError, match="horizon"):
+        case.tube.extended(1)

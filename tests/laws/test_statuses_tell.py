@@ -53,3 +53,10 @@ def test_without_time_sets_hold_and_none_says_that_more_was_done(case):
         ) + 1e-9  # fmt: skip
         for status, is_closed in zip(proof.statuses, closed, strict=True):
             assert status is not rj.SolverStatus.SOLVED or is_closed
+
+
+@each(lambda case: case.method in ("programs", "paper") and case.loop in ("relu", "varying"))
+def test_programs_of_sets_that_are_not_flat_are_solved(case):
+    if case.initial not in ("point", "flat", "thin"):
+        for k in range(1, HORIZON + 1):
+            assert set(case.tube.proof(k).statuses) == {rj.SolverStatus.SOLVED}

@@ -92,7 +92,13 @@ def test_what_sets_stay_in_is_proved_and_nothing_refutes_it(case):
     assert all(len(margins) == HORIZON + 1 for margins in found[0].margins.values())
 
 
-@each(rows=[Case(loop) for loop in ("relu", "varying", "one state", "three states", "hard")])
+ROWS = (
+    *(Case(loop) for loop in ("relu", "varying", "one state", "three states", "hard")),
+    Case("relu", "default", "ellipsoid"),
+)
+
+
+@each(rows=ROWS)
 def test_verdicts_change_where_bounds_are(case):
     """A little above and below what the last set says of each direction."""
     A, b = (np.asarray(part) for part in case.tube.sets[HORIZON].facets)

@@ -66,15 +66,6 @@ def curved(f=sine, p=0.5):
 
 
 @pytest.mark.costly
-def test_a_network_of_a_file_is_kept(path):
-    net = rj.Network.from_onnx("tests/data/networks/torch_tanh.onnx")
-    loop = rj.ClosedLoop(rj.AffinePlant(0.9 * np.eye(2), [[0.0], [0.1]]), net)
-    tube = rj.reach(loop, rj.Box([-0.1, -0.1], [0.1, 0.1]), 2, BOX)
-    tube.save(path)
-    equal(tube, rj.load(path, recheck=True))
-
-
-@pytest.mark.costly
 def test_another_process_reads_the_same(tube, path):
     tube.save(path)
     script = (

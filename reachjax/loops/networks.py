@@ -15,7 +15,7 @@ from typing import Any
 
 from jaxtyping import Array, ArrayLike, Float
 
-from reachjax.loops.functions import Function
+from reachjax.loops.tracing.functions import Function
 from reachjax.loops.units import AbstractActivation, AtUnit, ReLU, evaluate
 from reachjax.numerics.checks import Numbers, same_size, whole_number
 from reachjax.numerics.files import existing_file
@@ -144,7 +144,7 @@ class MLP(AbstractNetwork):
             ValueError: it holds something else than a chain of linear layers, or computes something
                 else, or the order of its layers or the activation cannot be told.
         """
-        from reachjax.loops.formats.flax_layers import flax_layers, read_activation
+        from reachjax.loops.readers.flax_layers import flax_layers, read_activation
 
         known = read_activation(activation)
         read = flax_layers(source, known, module)
@@ -226,7 +226,7 @@ class Network(AbstractNetwork):
             >>> Network.from_file(path)([-3.0]).tolist()  # |x|
             [3.0]
         """
-        from reachjax.loops.formats.chains import ENDINGS, read_chain
+        from reachjax.loops.readers.chains import ENDINGS, read_chain
 
         path = existing_file("path", path)
         if path.suffix == ".onnx":
@@ -270,7 +270,7 @@ class Network(AbstractNetwork):
             TypeError: an operator's function has no bounds, or a name is no text.
             ValueError: it is no ONNX file, or is not understood; the error names the node.
         """
-        from reachjax.loops.formats.onnx_graphs import culprit, read_graph
+        from reachjax.loops.readers.onnx_graphs import culprit, read_graph
 
         path = existing_file("path", path)
         for name, value in (("inputs", inputs), ("output", output)):

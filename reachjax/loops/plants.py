@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.loops.functions import Function
+from reachjax.loops.tracing.functions import Function
 from reachjax.loops.units import AtUnit, evaluate
 from reachjax.numerics.checks import Numbers, whole_number, within_time_axis
 from reachjax.numerics.pytrees import Replaceable, converted, pytree

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.functions import Compiled
+from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units import Facts
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.numerics.rounding import Ball

@@ -18,6 +18,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.methods.cell_tree import CellTree, Node
+from reachjax.methods.problem import AbstractMethod, Problem
+from reachjax.methods.propagation import GAP, SAMPLES, Options
+from reachjax.methods.searches import AbstractSearch, Bar, Question
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
     is_concrete,
@@ -30,21 +34,17 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.files import writable
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.interruptions import Interrupted
 from reachjax.numerics.logs import logged
 from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.numerics.seals import Seal, require_sealed, seal_of
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.sets import AbstractSet, Template
 from reachjax.solvers import AbstractSolver, Auto
-from reachjax.tubes.cell_tree import CellTree, Node
 from reachjax.tubes.displays import SAMPLES as SHOWN
 from reachjax.tubes.displays import display, picture, table
-from reachjax.tubes.interruptions import Interrupted
-from reachjax.tubes.kept import keep
-from reachjax.tubes.methods import AbstractMethod, Problem
-from reachjax.tubes.propagation import GAP, SAMPLES, Options
 from reachjax.tubes.reach import ReachTube, tube_of
-from reachjax.tubes.seals import Seal, require_sealed, seal_of
-from reachjax.tubes.searches import AbstractSearch, Bar, Question
+from reachjax.tubes.saving import keep
 from reachjax.tubes.tables import frame, rows
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class PartitionedTube(Replaceable):
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Axes:
         """Draw the sets of all cells: `reachjax.plot_tube(tube, ax, **options)`."""
-        from reachjax.tubes.plotting import plot_tube
+        from reachjax.verdicts.plotting import plot_tube
 
         return plot_tube(self, ax, **options)
 

@@ -16,6 +16,17 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
+from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
+from reachjax.methods.propagation import (
+    GAP,
+    SAMPLES,
+    Options,
+    Progress,
+    check_problem,
+    propagated,
+)
+from reachjax.methods.spans import spans_by_forms
+from reachjax.methods.witnesses import initial_states
 from reachjax.numerics.checks import (
     floats_of,
     is_concrete,
@@ -25,28 +36,17 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.files import writable
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.interruptions import Interrupted
 from reachjax.numerics.logs import logged
 from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
+from reachjax.numerics.seals import Seal, require_sealed, seal_of
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof, told
-from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet, AbstractTemplate, Polytope
 from reachjax.solvers import AbstractSolver, Auto
 from reachjax.tubes.displays import SAMPLES as SHOWN
 from reachjax.tubes.displays import display, picture, table
-from reachjax.tubes.interruptions import Interrupted
-from reachjax.tubes.kept import keep
-from reachjax.tubes.methods import AbstractMethod, Problem, ReachSet, at
-from reachjax.tubes.propagation import (
-    GAP,
-    SAMPLES,
-    Options,
-    Progress,
-    check_problem,
-    propagated,
-)
-from reachjax.tubes.seals import Seal, require_sealed, seal_of
-from reachjax.tubes.spans import spans_by_forms
+from reachjax.tubes.saving import keep
 from reachjax.tubes.tables import frame, rows
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ class ReachTube(Replaceable):
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Axes:
         """Draw the sets over simulated states: `reachjax.plot_tube(tube, ax, **options)`."""
-        from reachjax.tubes.plotting import plot_tube
+        from reachjax.verdicts.plotting import plot_tube
 
         return plot_tube(self, ax, **options)
 

@@ -17,6 +17,9 @@ from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
+from reachjax.methods.ladder import Ladder
+from reachjax.methods.steps import Setting, Step, boxed
+from reachjax.methods.successors import goals_of
 from reachjax.numerics.budget import ENDLESS
 from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Origin, Program
@@ -37,10 +40,7 @@ from reachjax.sets import AbstractSet, AbstractTemplate, Polytope
 from reachjax.sets.cells import from_tree
 from reachjax.solvers import Auto
 from reachjax.tubes.disagreements import DisagreementError
-from reachjax.tubes.ladder import Ladder
 from reachjax.tubes.reach import ReachTube
-from reachjax.tubes.steps import Setting, Step, boxed
-from reachjax.tubes.successors import goals_of
 
 Again = tuple[AbstractProof, Float[np.ndarray, " f"]]
 """A proof with all that it rests on made again, and the bounds that it proves."""

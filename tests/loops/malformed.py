@@ -15,9 +15,9 @@ import onnx
 import scipy.io
 from onnx import helper
 
-from reachjax.loops.formats import onnx_graphs, onnx_runtime
-from reachjax.loops.formats.chains import read_chain
-from reachjax.loops.formats.onnx_graphs import read_graph
+from reachjax.loops.readers import onnx_graphs, onnx_runtime
+from reachjax.loops.readers.chains import read_chain
+from reachjax.loops.readers.onnx_graphs import read_graph
 from tests.loops.onnx_models import make_model, node, tensor
 
 

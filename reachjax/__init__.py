@@ -84,6 +84,7 @@ from reachjax.sets import (
     Polytope,
     Template,
 )
+from reachjax.sets.pictures import plot_set
 from reachjax.solvers import (
     SCS,
     AbstractSolver,
@@ -102,12 +103,11 @@ from reachjax.training import (
 )
 from reachjax.tubes.disagreements import DisagreementError
 from reachjax.tubes.loading import load
-from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
+from reachjax.tubes.partitions import PartitionedTube, plot_tube, reach_partitioned
 from reachjax.tubes.reach import ReachTube, reach, reach_step
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.verdicts.decide import decide
 from reachjax.verdicts.largest import LargestSet, largest_set
-from reachjax.verdicts.plotting import plot_cells, plot_set, plot_tube
 from reachjax.verdicts.soundness import UnsoundError
 from reachjax.verdicts.specification import shortfall
 from reachjax.verdicts.verdict import (
@@ -119,7 +119,7 @@ from reachjax.verdicts.verdict import (
 )
 from reachjax.verdicts.verify import verify
 from reachjax.verdicts.winning import winning_set
-from reachjax.verdicts.winning_sets import WinningSet
+from reachjax.verdicts.winning_sets import WinningSet, plot_cells
 
 __version__ = "0.1.0"
 

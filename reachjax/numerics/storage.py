@@ -31,6 +31,13 @@ PACKAGE = __name__.partition(".")[0]
 SEAL = "seal"
 """A field with a hash of all others, which differs where another version writes them otherwise."""
 
+MOVED = {
+    "reachjax.loops.formats": "reachjax.loops.readers",
+    "reachjax.loops.functions": "reachjax.loops.tracing.functions",
+    "reachjax.tubes.kept": "reachjax.tubes.saving",
+}
+"""Modules, and folders of them, that files written earlier name otherwise."""
+
 PLAIN = bool | int | float | str | None
 
 
@@ -127,7 +134,7 @@ def _class(name: str) -> Any:
     if module.partition(".")[0] != PACKAGE:
         raise ValueError(f"it names {name}, which is not of {PACKAGE}")
     try:
-        found = importlib.import_module(module)
+        found = importlib.import_module(_moved(module))
         for part in path.split("."):
             found = getattr(found, part)
     except (ImportError, AttributeError):
@@ -137,6 +144,14 @@ def _class(name: str) -> Any:
     if found.__module__.partition(".")[0] != PACKAGE or found.__qualname__ != path:
         raise ValueError(f"it names {name}, which is not of {PACKAGE}")
     return found
+
+
+def _moved(module: str) -> str:
+    """The name of a module today, as `MOVED` has it for itself or for its folder."""
+    folder, _, last = module.rpartition(".")
+    if folder in MOVED:
+        module = f"{MOVED[folder]}.{last}"
+    return MOVED.get(module, module)
 
 
 def _enumeration(name: str) -> type[enum.Enum]:

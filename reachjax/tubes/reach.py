@@ -43,11 +43,11 @@ from reachjax.numerics.seals import Seal, require_sealed, seal_of
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.sets import AbstractSet, AbstractTemplate, Polytope
+from reachjax.sets.pictures import Flowpipe, draw_flowpipes
+from reachjax.sets.unusable import ThinSetError
 from reachjax.solvers import AbstractSolver, Auto
-from reachjax.tubes.displays import SAMPLES as SHOWN
-from reachjax.tubes.displays import display, picture, table
+from reachjax.tubes.displays import DRAWN, SHOWN, display, frame, picture, rows, table
 from reachjax.tubes.saving import keep
-from reachjax.tubes.tables import frame, rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -180,13 +180,21 @@ class ReachTube(Replaceable):
             >>> table.groupby("t").bound.max().round(6).to_dict()
             {1: 1.0, 2: 0.5}
         """
-        return frame(rows(self))
+        return frame(rows(self.template, self.certificates))
 
-    def plot(self, ax: Axes | None = None, **options: Any) -> Axes:
-        """Draw the sets over simulated states: `reachjax.plot_tube(tube, ax, **options)`."""
-        from reachjax.verdicts.plotting import plot_tube
+    def plot(
+        self, ax: Axes | None = None, samples: int = DRAWN, coordinates: tuple[int, int] = (0, 1)
+    ) -> Axes:
+        """Draw the sets over simulated states, see `reachjax.plot_tube`."""
+        return draw_flowpipes([self.flowpipe(samples)], ax, coordinates)
 
-        return plot_tube(self, ax, **options)
+    def flowpipe(self, samples: int) -> Flowpipe:
+        """The sets, with the states of simulated trajectories; none of a set too thin to sample."""
+        try:
+            states = np.asarray(self.simulate(samples))
+        except ThinSetError:
+            states = np.zeros((0, self.horizon + 1, self.loop.states))
+        return self.sets, states
 
     def _repr_html_(self) -> str:
         steps = [_shown(self, t) for t in range(1, self.horizon + 1)]

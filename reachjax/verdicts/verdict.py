@@ -12,7 +12,7 @@ import dataclasses
 import enum
 import html
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from jaxtyping import Float
 from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.proofs.proposal import AS_ASKED, SolverStatus
 from reachjax.sets import PolyhedralSet
+from reachjax.sets.pictures import draw_boxes
 from reachjax.tubes.displays import display, picture, table
 
 if TYPE_CHECKING:
@@ -76,6 +77,25 @@ class DecidedCell(NamedTuple):
     upper: Float[np.ndarray, " n_x"]
     status: VerdictStatus
     margin: float
+
+
+CELL_COLORS = {
+    VerdictStatus.PROVED: "tab:green",
+    VerdictStatus.UNKNOWN: "tab:gray",
+    VerdictStatus.REFUTED: "tab:red",
+}
+
+
+def draw_cells(
+    cells: Sequence[DecidedCell], ax: Axes | None = None, coordinates: tuple[int, int] = (0, 1)
+) -> Axes:
+    """Draw cells by their statuses: the proved below the undecided, these below the refuted."""
+    groups = {}
+    for status, color in CELL_COLORS.items():
+        # white edges would hide cells as narrow as those at a boundary
+        edge = color if status is VerdictStatus.UNKNOWN else "white"
+        groups[status.value] = color, edge, [cell for cell in cells if cell.status is status]
+    return draw_boxes(groups, ax, coordinates)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,9 +189,7 @@ class Verdict:
     def _drawn(self, ax: Axes) -> None:
         """Draw the cells, or the margins over time."""
         if self.cells and len(self.cells[0].lower) > 1:
-            from reachjax.verdicts.plotting import plot_cells
-
-            plot_cells(self, ax)
+            draw_cells(self.cells, ax)
             return
         for k, name in enumerate(self.margins):
             times = np.arange(len(self.margins[name]))

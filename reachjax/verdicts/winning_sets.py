@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
-from reachjax.numerics.checks import Numbers, same_size
+from reachjax.numerics.checks import Numbers, require_kind, same_size
+from reachjax.numerics.flags import lenient
 from reachjax.numerics.seals import Seal
 from reachjax.sets import Box
 from reachjax.tubes.displays import display, picture, table
-from reachjax.verdicts.verdict import DecidedCell, VerdictStatus
+from reachjax.verdicts.verdict import DecidedCell, Verdict, VerdictStatus, draw_cells
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,11 +59,9 @@ class WinningSet:
         drawn = picture(self.plot) if self.domain.dimension > 1 else ""
         return display(repr(self), table(["", "cells", "volume", "part"], rows), drawn)
 
-    def plot(self, ax: Axes | None = None, **options: Any) -> Axes:
-        """Draw the cells: `reachjax.plot_cells(found, ax, **options)`."""
-        from reachjax.verdicts.plotting import plot_cells
-
-        return plot_cells(self, ax, **options)
+    def plot(self, ax: Axes | None = None, coordinates: tuple[int, int] = (0, 1)) -> Axes:
+        """Draw the cells, see `reachjax.plot_cells`."""
+        return draw_cells(self.cells, ax, coordinates)
 
     def _part(self, status: VerdictStatus) -> str:
         """The part of the domain with this status, whose flat coordinates count for nothing."""
@@ -107,3 +106,29 @@ class WinningSet:
                 inside = np.all((lower <= some) & (some <= upper), axis=2)
                 found[first : first + AT_ONCE] = np.any(inside, axis=1)
         return found.reshape(points.shape[:-1])
+
+
+@lenient
+def plot_cells(
+    verdict: Verdict | WinningSet, ax: Axes | None = None, coordinates: tuple[int, int] = (0, 1)
+) -> Axes:
+    """Draw which cells of an initial set or a domain are proved, refuted and undecided.
+
+    Of sets of more than two dimensions it draws the cells' shadows, the undecided ones above the
+    proved ones, and the refuted ones above all.
+
+    Args:
+        verdict: of `decide(..., cells=...)` or `winning_set`.
+        ax: where to draw; a new figure by default.
+        coordinates: the two states to draw, counted from 0: the horizontal axis, then the vertical
+            one.
+
+    Raises:
+        TypeError: it is no verdict.
+        ValueError: it has no cells, or the coordinates are not two of its states.
+    """
+    expected = "a Verdict, as decide(...) returns it, or a WinningSet"
+    require_kind("verdict", verdict, (Verdict, WinningSet), expected)
+    if not verdict.cells:
+        raise ValueError("verdict has no cells: give decide(..., cells=...) a number of them")
+    return draw_cells(verdict.cells, ax, coordinates)

@@ -52,8 +52,8 @@ from reachjax.methods.cells import Cells
 from reachjax.methods.problem import AbstractMethod, Problem, ReachSet
 from reachjax.methods.recursion import Recursion
 from reachjax.numerics.archives import UnreadableError
+from reachjax.numerics.budget import Interrupted
 from reachjax.numerics.compilations import keep_compilations
-from reachjax.numerics.interruptions import Interrupted
 from reachjax.programs.basis import ChangeOfBasis, change_of_basis
 from reachjax.programs.relaxations import (
     AbstractRelaxation,
@@ -65,12 +65,9 @@ from reachjax.programs.relaxations import (
     PaperQC,
 )
 from reachjax.proofs.branches import BranchCertificate, Rung
-from reachjax.proofs.cells import CellCertificate
+from reachjax.proofs.by_forms import CellCertificate, LinearCertificate
+from reachjax.proofs.by_products import Certificate, EllipsoidCertificate, MixedCertificate
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
-from reachjax.proofs.ellipsoids import EllipsoidCertificate
-from reachjax.proofs.facets import Certificate
-from reachjax.proofs.linear import LinearCertificate
-from reachjax.proofs.mixed import MixedCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import (
     AbstractSet,
@@ -101,10 +98,10 @@ from reachjax.training import (
     unsolved,
     volume_penalty,
 )
-from reachjax.tubes.disagreements import DisagreementError
 from reachjax.tubes.loading import load
 from reachjax.tubes.partitions import PartitionedTube, plot_tube, reach_partitioned
 from reachjax.tubes.reach import ReachTube, reach, reach_step
+from reachjax.tubes.repeats import DisagreementError
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.verdicts.decide import decide
 from reachjax.verdicts.largest import LargestSet, largest_set

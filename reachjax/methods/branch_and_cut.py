@@ -31,7 +31,7 @@ from reachjax.programs.held import attained, held_bounds, sources
 from reachjax.programs.moving import Moving, moving
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate, Rung
-from reachjax.proofs.facets import Certificate
+from reachjax.proofs.by_products import Certificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.proofs.replayed import Replay, replayed
 from reachjax.sets import Box, Polytope

@@ -38,7 +38,7 @@ from reachjax.numerics.checks import is_concrete, owned
 from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.affine_steps import step_columns
 from reachjax.programs.unrolled import ByForms, unrolled
-from reachjax.proofs.cells import CellCertificate
+from reachjax.proofs.by_forms import CellCertificate
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import Polytope

@@ -33,8 +33,7 @@ from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet, Box
 from reachjax.solvers.branching import Found, Tree, affine_leaf, attained_multipliers
-from reachjax.solvers.conic_programs import ConicPrograms
-from reachjax.solvers.linear_programs import LinearPrograms
+from reachjax.solvers.linear_programs import ConicPrograms, LinearPrograms
 
 LEAST_RANGE = 1e-6
 """A facet's range counts as this part of what affine forms say, at least."""

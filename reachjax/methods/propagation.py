@@ -1,17 +1,21 @@
-"""Sets one after the other, by forms, branches or programs, from the initial set or a later one."""
+"""Which method a relaxation stands for."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
+from functools import singledispatch
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from reachjax.loops import ClosedLoop
-from reachjax.methods.choice import method_of
+from reachjax.methods.affine_forms import AffineForms
+from reachjax.methods.branch_and_cut import Branching
+from reachjax.methods.cells import Cells
 from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
+from reachjax.methods.recursion import Recursion
 from reachjax.methods.witnesses import Simulations
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import (
@@ -26,11 +30,53 @@ from reachjax.numerics.checks import (
     wrapped,
 )
 from reachjax.numerics.derivatives import first_order
-from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
+from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut, LinearBounds
 from reachjax.proofs.certificates import AbstractProof
-from reachjax.sets import AbstractSet, AbstractTemplate, Box
+from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
 from reachjax.sets.unusable import ThinSetError, UnusableSetError
 from reachjax.solvers import AbstractSolver, Auto
+
+
+@singledispatch
+def method_of(
+    relaxation: AbstractRelaxation | AbstractMethod,
+    problem: Problem,
+    window: int | None,
+    solver: AbstractSolver,
+) -> AbstractMethod:
+    """The method that bounds a problem as a relaxation asks: a method is one already.
+
+    Args:
+        relaxation: what a user gave.
+        problem: the problem.
+        window: over how many steps programs reach back; None for as many as may be.
+        solver: what solves semidefinite programs.
+    """
+    return (
+        relaxation
+        if isinstance(relaxation, AbstractMethod)
+        else Recursion(relaxation, window, solver)
+    )
+
+
+@method_of.register
+def _(
+    relaxation: LinearBounds, problem: Problem, window: int | None, solver: AbstractSolver
+) -> AbstractMethod:
+    return AffineForms(relaxation.programs)
+
+
+@method_of.register
+def _(
+    relaxation: BranchAndCut, problem: Problem, window: int | None, solver: AbstractSolver
+) -> AbstractMethod:
+    if window is not None or not isinstance(problem.template, Template):
+        return Recursion(relaxation, window, solver)
+    branching = Branching(relaxation, solver)
+    if problem.loop.curved and relaxation.cells > 1 and problem.X0.parts[1] is None:
+        return Cells(branching, relaxation.cells)
+    return branching
+
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 """Wraps the iteration over time steps, such as `tqdm.tqdm` or `rich.progress.track`."""

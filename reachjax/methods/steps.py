@@ -23,7 +23,7 @@ from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.sets import AbstractSet, Box, Polytope
 from reachjax.sets.unusable import ThinSetError
 from reachjax.solvers import AbstractSolver
-from reachjax.solvers.cut_pool import NONE
+from reachjax.solvers.cutting_planes import NONE
 
 
 def boxed(X: AbstractSet, name: str) -> Box:

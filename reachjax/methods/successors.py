@@ -28,9 +28,8 @@ from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.host import all_finite
 from reachjax.programs.lmi import Program
+from reachjax.proofs.by_products import Certificate, MixedCertificate
 from reachjax.proofs.certificates import AbstractCertificate
-from reachjax.proofs.facets import Certificate
-from reachjax.proofs.mixed import MixedCertificate
 from reachjax.sets import (
     AbstractSet,
     AbstractTemplate,

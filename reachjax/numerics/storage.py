@@ -34,6 +34,23 @@ SEAL = "seal"
 MOVED = {
     "reachjax.loops.formats": "reachjax.loops.readers",
     "reachjax.loops.functions": "reachjax.loops.tracing.functions",
+    "reachjax.loops.residual": "reachjax.loops.networks",
+    "reachjax.loops.switching": "reachjax.loops.networks",
+    "reachjax.loops.units.clip": "reachjax.loops.units.piecewise",
+    "reachjax.loops.units.hard_tanh": "reachjax.loops.units.piecewise",
+    "reachjax.loops.units.leaky_relu": "reachjax.loops.units.piecewise",
+    "reachjax.loops.units.relu": "reachjax.loops.units.piecewise",
+    "reachjax.loops.units.within": "reachjax.loops.units.powers",
+    "reachjax.proofs.cells": "reachjax.proofs.by_forms",
+    "reachjax.proofs.linear": "reachjax.proofs.by_forms",
+    "reachjax.proofs.ellipsoids": "reachjax.proofs.by_products",
+    "reachjax.proofs.facets": "reachjax.proofs.by_products",
+    "reachjax.proofs.mixed": "reachjax.proofs.by_products",
+    "reachjax.sets.box": "reachjax.sets.base",
+    "reachjax.sets.normal_form": "reachjax.sets.base",
+    "reachjax.sets.ellipsoid_template": "reachjax.sets.templates",
+    "reachjax.sets.mixed_template": "reachjax.sets.templates",
+    "reachjax.sets.template": "reachjax.sets.templates",
     "reachjax.tubes.kept": "reachjax.tubes.saving",
 }
 """Modules, and folders of them, that files written earlier name otherwise."""

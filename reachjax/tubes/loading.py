@@ -11,7 +11,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.methods.problem import Problem
 from reachjax.methods.propagation import Options, check_problem
 from reachjax.methods.searches import Bar
-from reachjax.numerics.archives import UnreadableError
+from reachjax.numerics.archives import UnreadableError, existing_file
 from reachjax.numerics.checks import (
     owned,
     require_bar,
@@ -19,7 +19,6 @@ from reachjax.numerics.checks import (
     require_kind,
     wrapped,
 )
-from reachjax.numerics.files import existing_file
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.numerics.storage import read

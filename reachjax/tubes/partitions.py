@@ -22,7 +22,8 @@ from reachjax.methods.cell_tree import CellTree, Node
 from reachjax.methods.problem import AbstractMethod, Problem
 from reachjax.methods.propagation import GAP, SAMPLES, Options
 from reachjax.methods.searches import AbstractSearch, Bar, Question
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.archives import writable
+from reachjax.numerics.budget import Budget, Interrupted
 from reachjax.numerics.checks import (
     is_concrete,
     owned,
@@ -32,9 +33,7 @@ from reachjax.numerics.checks import (
     require_executor,
     require_kind,
 )
-from reachjax.numerics.files import writable
 from reachjax.numerics.flags import lenient
-from reachjax.numerics.interruptions import Interrupted
 from reachjax.numerics.logs import logged
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.numerics.seals import Seal, require_sealed, seal_of

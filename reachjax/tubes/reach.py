@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
+from reachjax.methods.affine_forms import spans_by_forms
 from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
 from reachjax.methods.propagation import (
     GAP,
@@ -25,8 +26,9 @@ from reachjax.methods.propagation import (
     check_problem,
     propagated,
 )
-from reachjax.methods.spans import spans_by_forms
 from reachjax.methods.witnesses import initial_states
+from reachjax.numerics.archives import writable
+from reachjax.numerics.budget import Interrupted
 from reachjax.numerics.checks import (
     floats_of,
     is_concrete,
@@ -34,9 +36,7 @@ from reachjax.numerics.checks import (
     require_double_precision,
     whole_number,
 )
-from reachjax.numerics.files import writable
 from reachjax.numerics.flags import lenient
-from reachjax.numerics.interruptions import Interrupted
 from reachjax.numerics.logs import logged
 from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
 from reachjax.numerics.seals import Seal, require_sealed, seal_of

@@ -1,8 +1,4 @@
-"""What the proofs of a tube rest on, made again from its loop, initial set, template and start.
-
-From a proof comes only what it proposes, of which any is sound: multipliers, slopes, cells, which
-products of facts, ellipsoids. Each step rests on the sets that are proved by then.
-"""
+"""What a tube says and its certificates do not prove."""
 
 from __future__ import annotations
 
@@ -33,14 +29,35 @@ from reachjax.programs.relaxations import (
 from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.programs.windows import Window
 from reachjax.proofs.branches import BranchCertificate
-from reachjax.proofs.cells import CellCertificate
+from reachjax.proofs.by_forms import CellCertificate, LinearCertificate
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
-from reachjax.proofs.linear import LinearCertificate
 from reachjax.sets import AbstractSet, AbstractTemplate, Polytope
 from reachjax.sets.cells import from_tree
 from reachjax.solvers import Auto
-from reachjax.tubes.disagreements import DisagreementError
 from reachjax.tubes.reach import ReachTube
+
+
+class DisagreementError(ValueError):
+    """A tube says what its own certificates do not prove.
+
+    Attributes:
+        step: how many steps after the initial set; None if it is not about one.
+        facet: the number of the facet; None if it is not about one.
+        said: what the tube says.
+        proved: what is proved, or simulated.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        step: int | None = None,
+        facet: int | None = None,
+        said: Any = None,
+        proved: Any = None,
+    ):
+        super().__init__(message)
+        self.step, self.facet, self.said, self.proved = step, facet, said, proved
+
 
 Again = tuple[AbstractProof, Float[np.ndarray, " f"]]
 """A proof with all that it rests on made again, and the bounds that it proves."""

@@ -22,9 +22,8 @@ from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.methods.cell_tree import CellTree, Node
 from reachjax.methods.searches import AbstractSearch, Bar, Question
 from reachjax.methods.witnesses import Simulations
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import Budget, Interrupted
 from reachjax.numerics.flags import lenient
-from reachjax.numerics.interruptions import Interrupted
 from reachjax.sets import AbstractSet
 from reachjax.verdicts.cell_tasks import CellTask, outcome_of
 from reachjax.verdicts.findings import Findings

@@ -31,7 +31,7 @@ from reachjax.methods.propagation import (
 )
 from reachjax.methods.steps import boxed
 from reachjax.methods.witnesses import Simulated, Simulations
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import Budget, Interrupted
 from reachjax.numerics.checks import (
     owned,
     require_bar,
@@ -42,7 +42,6 @@ from reachjax.numerics.checks import (
     whole_number,
 )
 from reachjax.numerics.flags import lenient
-from reachjax.numerics.interruptions import Interrupted
 from reachjax.numerics.logs import logged
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate

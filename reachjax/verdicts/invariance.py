@@ -20,8 +20,7 @@ from jaxtyping import Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.methods.witnesses import initial_states
-from reachjax.numerics.budget import Budget
-from reachjax.numerics.interruptions import Interrupted
+from reachjax.numerics.budget import Budget, Interrupted
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope

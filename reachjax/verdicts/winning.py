@@ -24,7 +24,7 @@ from reachjax.loops.scenarios import Scenarios
 from reachjax.methods.cell_tree import CellTree, Node
 from reachjax.methods.propagation import known_numbers
 from reachjax.methods.searches import AbstractSearch, Bar, Question
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import Budget, Interrupted
 from reachjax.numerics.checks import (
     require_bar,
     require_double_precision,
@@ -34,7 +34,6 @@ from reachjax.numerics.checks import (
     whole_number,
 )
 from reachjax.numerics.flags import lenient
-from reachjax.numerics.interruptions import Interrupted
 from reachjax.numerics.logs import logged
 from reachjax.numerics.seals import seal_of
 from reachjax.programs.relaxations import BranchAndCut

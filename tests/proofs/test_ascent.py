@@ -9,8 +9,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.loops.scenarios import Scenarios
-from reachjax.methods.ascent import ascended
-from reachjax.methods.witnesses import Simulations
+from reachjax.methods.witnesses import Simulations, ascended
 from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
 from tests.networks import plant, simulate
 from tests.quick_cases import some

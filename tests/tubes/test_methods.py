@@ -11,7 +11,7 @@ from reachjax.methods.branch_and_cut import Branching
 from reachjax.methods.cells import Cells
 from reachjax.methods.problem import AbstractMethod
 from reachjax.methods.recursion import Recursion
-from reachjax.tubes.disagreements import DisagreementError
+from reachjax.tubes.repeats import DisagreementError
 from tests.networks import he_network
 
 HORIZON = 3

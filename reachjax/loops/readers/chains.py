@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.loops.readers.arrays import over, sigmoid
+from reachjax.loops.readers.arrays import over, require_finite, sigmoid
 from reachjax.loops.readers.matlab import Unread, read_variables
-from reachjax.loops.readers.points import require_finite
 from reachjax.numerics.pytrees import pytree, static
 
 Numbers = Array | np.ndarray

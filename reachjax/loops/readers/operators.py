@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from reachjax.loops.readers import moving, reductions
+from reachjax.loops.readers import moving
 from reachjax.loops.readers.arrays import erf, over, sigmoid, softplus
 from reachjax.loops.readers.kinds import (
     BOOL,
@@ -291,10 +291,10 @@ COMPARED = {
 OPERATORS: dict[str, Operator] = {
     **{name: Operator(_entrywise(twin)) for name, twin in FOLLOWED.items()},
     **{name: Operator(_entrywise(twin), fixed=(0, 1)) for name, twin in COMPARED.items()},
-    **{name: Operator(each, REDUCED, known=(1,)) for name, each in reductions.REDUCTIONS.items()},
+    **{name: Operator(each, REDUCED, known=(1,)) for name, each in moving.REDUCTIONS.items()},
     **{name: Operator(_winner(name.lower()), WINNING) for name in ("ArgMax", "ArgMin")},
     "BatchNormalization": Operator(
-        reductions.batch_normalised, ("epsilon", "momentum", "training_mode", "spatial")
+        moving.batch_normalised, ("epsilon", "momentum", "training_mode", "spatial")
     ),
     "Cast": Operator(
         _kept,
@@ -324,9 +324,9 @@ OPERATORS: dict[str, Operator] = {
     "Hardmax": Operator(_hardmax, ("axis",)),
     "HardSwish": Operator(lambda a, x: x * over(x).clip(x / 6 + 0.5, 0.0, 1.0)),
     "Identity": Operator(lambda attributes, x: x),
-    "LayerNormalization": Operator(reductions.layer_normalised, NORMALISED),
+    "LayerNormalization": Operator(moving.layer_normalised, NORMALISED),
     "LeakyRelu": Operator(lambda a, x: over(x).where(x >= 0, x, a["alpha"] * x), ("alpha",)),
-    "LogSoftmax": Operator(reductions.LOG_SOFTMAX, ("axis",)),
+    "LogSoftmax": Operator(moving.LOG_SOFTMAX, ("axis",)),
     "Max": Operator(_folded("maximum")),
     "Mean": Operator(_mean),
     "Min": Operator(_folded("minimum")),
@@ -334,7 +334,7 @@ OPERATORS: dict[str, Operator] = {
     "OneHot": Operator(_one_hot, ("axis",), known=(1, 2)),
     "PRelu": Operator(_sloped),
     "Pow": Operator(_raised, fixed=(1,), exact=lambda attributes, x, y: power(x, y)),
-    "RMSNormalization": Operator(reductions.rms_normalised, NORMALISED),
+    "RMSNormalization": Operator(moving.rms_normalised, NORMALISED),
     "Range": Operator(moving.ranged, known=(0, 1, 2)),
     "Reciprocal": Operator(lambda attributes, x: 1.0 / x),
     "Relu": Operator(lambda attributes, x: over(x).maximum(x, 0.0)),
@@ -347,7 +347,7 @@ OPERATORS: dict[str, Operator] = {
     "Sigmoid": Operator(lambda attributes, x: sigmoid(x)),
     "Size": Operator(lambda attributes, x: np.array(np.size(x), np.int64)),
     "Slice": Operator(moving.sliced, ("starts", "ends", "axes"), known=(1, 2, 3, 4)),
-    "Softmax": Operator(reductions.SOFTMAX, ("axis",)),
+    "Softmax": Operator(moving.SOFTMAX, ("axis",)),
     "Softplus": Operator(lambda attributes, x: softplus(x)),
     "Softsign": Operator(lambda attributes, x: x / (1 + over(x).abs(x))),
     "Split": Operator(moving.split, ("axis", "split", "num_outputs"), known=(1,)),

@@ -1,9 +1,9 @@
-"""Templates: what the sets that reachability computes look like; first, polytopes."""
+"""Templates: what the sets that reachability computes look like: polytopes, ellipsoids, or both."""
 
 from __future__ import annotations
 
 import abc
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import Protocol, Self
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +20,9 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.pytrees import Replaceable, converted, pytree
 from reachjax.sets import fit
-from reachjax.sets.base import AbstractSet
-from reachjax.sets.polyhedral_set import MOST_DIMENSIONS, PolyhedralSet
+from reachjax.sets.base import MOST_DIMENSIONS, AbstractSet, PolyhedralSet
+from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.polytope import Polytope
-
-if TYPE_CHECKING:
-    from reachjax.sets.ellipsoid_template import EllipsoidTemplate
 
 
 class Simulated(Protocol):
@@ -225,3 +222,107 @@ class Template(AbstractTemplate):
             )
         fitting = fit.edges if n == 2 else fit.axes
         return cls(np.stack([fitting(trajectories[:, k], count) for k in range(1, horizon + 1)]))
+
+
+@pytree
+class EllipsoidTemplate(AbstractTemplate):
+    """Ellipsoids: of minimum volume, the paper's problem (sdp::ellips), or of a given shape.
+
+    Args:
+        shape: `(n, n)`, symmetric and positive definite, up to a factor. Only the size is then
+            sought, around the successor of the centre; the sets are larger, and their derivatives
+            exact. None for the ellipsoid of minimum volume, whose derivative is that of a point
+            close to it (see `reachjax.solvers.least_volume`), and whose thinnest half-axis is at
+            least some 1e-8 of the others: around a flat set there is no least one.
+
+    Raises:
+        ValueError: `shape` is not square, symmetric and positive definite.
+
+    Example:
+        >>> EllipsoidTemplate(shape=[[4.0, 0.0], [0.0, 1.0]]).dimension
+        2
+    """
+
+    shape: Float[Array, "n n"] | None = converted(converter=Numbers("(n, n)"), default=None)
+
+    def __post_init__(self):
+        if self.shape is not None and is_concrete(self.shape):
+            try:
+                Ellipsoid(jnp.zeros(len(self.shape)), self.shape)
+            except ValueError as error:
+                message = str(error).replace("Ellipsoid.", "EllipsoidTemplate.")
+                raise ValueError(message) from None
+
+    @property
+    def dimension(self) -> int | None:
+        """The number of coordinates; None if any shape will do."""
+        return None if self.shape is None else len(self.shape)
+
+    @property
+    def parts(self) -> tuple[None, Self]:
+        """No facets, and the template itself."""
+        return None, self
+
+    @property
+    def summary(self) -> str:
+        """What they are."""
+        return "ellipsoids"
+
+
+@pytree
+class MixedTemplate(AbstractTemplate):
+    """Polytopes cut by ellipsoids: both are sought at each step, and their intersection is kept.
+
+    A step solves the programs of both templates, each over the facts of both parts of the set
+    before, so that each part is the smaller for the other.
+
+    Args:
+        facets: the directions of the polytope.
+        ellipsoid: of minimum volume by default.
+
+    Raises:
+        TypeError: a part is of another kind.
+        ValueError: the dimensions differ.
+
+    Example:
+        >>> MixedTemplate(Template.box(2)).summary
+        'facets=4, ellipsoids'
+    """
+
+    facets: Template
+    ellipsoid: EllipsoidTemplate = EllipsoidTemplate()
+
+    def __post_init__(self):
+        facets = "a template such as Template.box(n)"
+        require_kind("MixedTemplate.facets", self.facets, Template, facets)
+        ellipsoid = "a template such as EllipsoidTemplate()"
+        require_kind("MixedTemplate.ellipsoid", self.ellipsoid, EllipsoidTemplate, ellipsoid)
+        same_size(
+            "MixedTemplate.facets has dimension",
+            "MixedTemplate.ellipsoid has dimension",
+            (self.dimension, self.ellipsoid.dimension or self.dimension),
+        )
+
+    @property
+    def dimension(self) -> int:
+        """The number of coordinates."""
+        return self.facets.dimension
+
+    @property
+    def parts(self) -> tuple[Template, EllipsoidTemplate]:
+        """The templates of facets and of ellipsoids."""
+        return self.facets, self.ellipsoid
+
+    @property
+    def steps(self) -> int | None:
+        """The number of steps that the facets are given for."""
+        return self.facets.steps
+
+    def at(self, k: int) -> Self:
+        """What the set after `k` steps looks like, `k` being 1 or more."""
+        return self.replace(facets=self.facets.at(k))
+
+    @property
+    def summary(self) -> str:
+        """What both parts say."""
+        return f"{self.facets.summary}, {self.ellipsoid.summary}"

@@ -1,4 +1,4 @@
-"""Proofs of intersections of facets and an ellipsoid."""
+"""Proofs by products of facts: of facets, of ellipsoids, and of intersections of both."""
 
 from __future__ import annotations
 
@@ -10,9 +10,108 @@ from jaxtyping import Array, Float
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.lmi import Program
 from reachjax.proofs.certificates import AbstractCertificate
-from reachjax.proofs.ellipsoids import EllipsoidCertificate
-from reachjax.proofs.facets import Certificate
+from reachjax.proofs.proposal import Proposal
+from reachjax.proofs.recheck import sound_level
+from reachjax.proofs.reported import judged_offsets
 from reachjax.sets import NormalForm
+
+
+@pytree
+class Certificate(AbstractCertificate):
+    """Proof of the offsets of one step, `directions x[t] <= bounds`: one program a facet.
+
+    Attributes:
+        solver_offsets: `(f,)`, what the solver itself claimed; not bounds.
+    """
+
+    solver_offsets: Float[Array | np.ndarray, " f"]
+
+    def __repr__(self) -> str:
+        return f"Certificate(facets={len(self.bounds)}, products={self.multipliers.shape[-1]})"
+
+    def recheck(
+        self, multipliers: Float[np.ndarray, "f K"] | None = None
+    ) -> Float[np.ndarray, " f"]:
+        """Prove the offsets anew, from the program and these or other multipliers.
+
+        Sound for any multipliers: negative ones are clipped where the sign matters, and what
+        the matrix inequality misses is paid for.
+
+        Raises:
+            ValueError: the multipliers contain NaN or infinity, or have another shape.
+
+        Example:
+            >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template, reach_step
+            >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+            >>> _, certificate = reach_step(loop, Box([1.0], [2.0]), Template.box(1))
+            >>> certificate.recheck().round(6).tolist()
+            [1.0, -0.5]
+            >>> garbage = -certificate.multipliers
+            >>> bool((certificate.recheck(garbage) >= [1.0, -0.5]).all())
+            True
+        """
+        proposed = self._proposed(multipliers)
+        program = jax.device_get(self.program)
+        back = _left_inverse(np.asarray(program.transform))
+        moments = back @ np.asarray(self.moments) @ back.T
+        claims, codes = np.asarray(self.solver_offsets)[:, None], np.asarray(self.codes)
+        proposal = Proposal(claims, proposed, moments, codes, np.asarray(self.seconds))
+        return judged_offsets(program, proposal).value
+
+
+def _left_inverse(T: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "m n"]:
+    """A pseudo-inverse of a matrix whose rows and columns may be of very different sizes."""
+    rows = _sizes(T, axis=1)
+    columns = _sizes(T / rows[:, None], axis=0)
+    return np.linalg.pinv(T / rows[:, None] / columns) / rows / columns[:, None]
+
+
+def _sizes(T: np.ndarray, axis: int) -> np.ndarray:
+    size = abs(T).max(axis=axis, initial=0.0)
+    return np.where(size > 0, size, 1.0)
+
+
+@pytree
+class EllipsoidCertificate(AbstractCertificate):
+    """Proof of the ellipsoid of one step, `|A x[t] + b| <= s`: one program, so `f = 1`.
+
+    The set holds that ellipsoid; what is bounded, by 1, is `|A x[t] + b| / s`. `A` and `b` are
+    those of the proof: from centre and shape of the set others would follow, in which the same
+    numbers round otherwise.
+
+    Attributes:
+        form: `A` and `b`.
+        level: `s`.
+    """
+
+    form: NormalForm
+    level: Float[Array | np.ndarray, ""]
+
+    def __repr__(self) -> str:
+        return f"EllipsoidCertificate(products={self.multipliers.shape[-1]})"
+
+    def recheck(
+        self, multipliers: Float[np.ndarray, "1 K"] | None = None
+    ) -> Float[np.ndarray, " 1"]:
+        """What `|A x + b| / s` surely does not exceed, by these or other multipliers.
+
+        Sound for any multipliers; for the certificate's own it is 1 at most.
+
+        Raises:
+            ValueError: the multipliers contain NaN or infinity, or have another shape.
+
+        Example:
+            >>> from reachjax import AffinePlant, ClosedLoop, Ellipsoid, EllipsoidTemplate, MLP
+            >>> from reachjax import reach_step
+            >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+            >>> X0 = Ellipsoid([1.0], [[1.0]])
+            >>> following, certificate = reach_step(loop, X0, EllipsoidTemplate())
+            >>> following.shape.round(6).tolist(), certificate.recheck().round(6).tolist()
+            ([[0.25]], [1.0])
+        """
+        proposed = self._proposed(multipliers)
+        program, form, level = jax.device_get((self.program, self.form, self.level))
+        return np.array([sound_level(program, proposed, form) / level])
 
 
 @pytree

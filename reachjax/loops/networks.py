@@ -3,6 +3,11 @@
 The forward pass is written once, for any kind of number: `propagate` is given what to do at a
 nonlinear layer. With plain evaluation it is the network; with intervals or rows over a basis it
 yields bounds and the program that certifies the loop.
+
+A residual network adds to a linear map of its input, `pi(x) = S x + net(x)`. A switched controller
+is a function of JAX: which network acts is a place, such as `jnp.argmax` of the entries of a state
+that hold the last decision; a disturbance chooses among some vectors by the largest of as many
+numbers.
 """
 
 from __future__ import annotations

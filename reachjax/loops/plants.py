@@ -1,6 +1,10 @@
 """Plants: what follows a state under an input.
 
 The affine one, time-invariant or time-varying, is `x[t+1] = A_t x[t] + B_t u[t] + c_t + E_t w[t]`.
+
+A continuous one, `dx/dt = A x + B u + c`, is sampled with a constant input in between. With `M = [A
+B c; 0 0 0]` the state and the input after a time `h` are `exp(h M) [x, u, 1]`. The zero-order hold
+is exact; one step of the classical Runge-Kutta method is its Taylor polynomial of degree four.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Sets between samples: polytopes that hold all states from one sample to the next one."""
+"""Sets of a template by affine forms, without any program: around the states of each step, and
+around all states between two samples.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which method a relaxation stands for."""
+"""Sets one after the other, by forms, branches or programs, from the initial set or a later one."""
 
 from __future__ import annotations
 

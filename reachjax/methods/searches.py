@@ -1,4 +1,8 @@
-"""Cells that are bounded by an executor, or one after the other where there is none.
+"""The loop of every search over cells: which are asked about next, who answers, what follows.
+
+A search says what is to be found out next, and what follows from an answer. Answers come from any
+method: forms of many cells in one compiled call, programs over one, a whole tube. Who runs them,
+workers that die, and progress bars are dealt with here.
 
 A worker may die, and an executor with it. Cells that were in flight are taken back then, and
 bounded once more in the calling process, as are all that come after them.

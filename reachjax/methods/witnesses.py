@@ -1,7 +1,13 @@
-"""Projected gradient ascent: scenarios whose trajectories go far.
+"""Simulated trajectories as lower bounds of what is reachable.
 
-The loop is piecewise affine, so an ascent ends at a corner of a piece or on the edge of the set. A
-solver's proposal is often the best state already, up to its tolerance, and a few steps remove that.
+A witness is an initial state whose trajectory attains a value of a direction: no sound offset can
+be smaller. Candidates are the corners of the initial set, points drawn from it, and what gradient
+ascent finds from these and from the states that the dual of a semidefinite program proposes. Of a
+loop with disturbances or noise it is a whole scenario (`loops.scenarios`).
+
+The ascent is a projected one. The loop is piecewise affine, so an ascent ends at a corner of a
+piece or on the edge of the set. A solver's proposal is often the best state already, up to its
+tolerance, and a few steps remove that.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """What a call may spend: one clock that every loop asks, and the work of its programs.
 
 A limit is a limit: whatever may take long asks the clock before it begins, or is given what is
-left. A part of the time is a budget too, so that nobody takes what others were to have.
+left. A part of the time is a budget too, so that nobody takes what others were to have. What was
+found when a call is interrupted is not lost.
 """
 
 from __future__ import annotations

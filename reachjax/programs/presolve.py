@@ -1,7 +1,15 @@
-"""Symmetric matrices that are sums of products of two rows, on the host.
+"""Presolve: the program as a solver should see it, with nothing empty, no noise, nothing implied.
 
-`G_k = sum w sym(l' r)` over the pairs that belong to `k`. Sums and inner products need Gram
-matrices of the rows alone; only conic solvers ask for the `G_k`.
+`presolved` applies it, and `NormalProgram.invert` leads back from what a solver finds.
+
+Rows whose coefficients are rounding noise are dropped (one of size 1e-16 scaled up to 1 made a
+solver report "solved" for an offset below the true support), so are columns that the others use at
+that level or not at all, and products that say nothing beyond an ellipsoid's own fact. What stays
+is brought to unit size.
+
+A presolved program is held by symmetric matrices that are sums of products of two rows. `G_k = sum
+w sym(l' r)` over the pairs that belong to `k`. Sums and inner products need Gram matrices of the
+rows alone; only conic solvers ask for the `G_k`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,16 @@
-"""The scaling of a basis: `xi = T eta`, the entries of `eta` being in `[-1, 1]`.
+"""Windows: the loop unrolled over its last steps, from a set of states, over one basis.
 
-The optimal value of a program does not depend on it, but its derivative at inexact multipliers
-does: with the scaling's share, facts of thin sets keep their size and errors cancel.
+The basis is `[x[t], z[t], ..., z[t + w - 1], 1]`: a state and the outputs of the units of `w`
+steps. States after `x[t]` are rows over it, and the sets that are known to hold them add facts. A
+window of one step is the paper's recursion; one that begins at the initial set forgets nothing.
+
+A window grows by one step at a time, by functions that are compiled once. Units that bounds prove
+to be affine leave the basis; outside of `jax.jit` their columns can be left out as well
+(`drop_columns`), so that a window of many steps has as many columns as it has units that switch.
+
+**Scaling.** The scaling of a basis: `xi = T eta`, the entries of `eta` being in `[-1, 1]`. The
+optimal value of a program does not depend on it, but its derivative at inexact multipliers does:
+with the scaling's share, facts of thin sets keep their size and errors cancel.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 A cell that is too thin to be told from an empty set is made larger, and then holds points beside
 the set; none is left out unless a separating direction proves it empty.
+
+Parts cover a set if what each leaves out of it is beside a box.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 An optimal value that comes out of a linear-programming code is only as good as its tolerance, so
 what is used in a certificate is rebuilt from the dual solution: for any `y >= 0`,
 `a . x = y'A x + r . x <= y'b + |r| . max|x|` on the polytope, with `r = a - A'y` (weak duality).
+
+So is how far two polytopes are apart: by weak duality, or by one facet alone.
 """
 
 from __future__ import annotations

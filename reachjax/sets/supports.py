@@ -8,7 +8,10 @@ of the facet's corners.
 
 A set that is empty, unbounded or too thin raises an error on plain arrays. Inside `jax.jit`, where
 it may come from weights that went astray in training, its values and slopes are NaN. What has a
-formula has it there, without a call to the host (`formulas`).
+formula has it there, without a call to the host.
+
+The formulas are: the ends of a polytope whose facets are all along the axes, and a polygon's area.
+In compiled code a call to the host costs more than the forms that bound a loop.
 """
 
 from __future__ import annotations

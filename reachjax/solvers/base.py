@@ -1,4 +1,13 @@
-"""What a solver is: from a program and a goal to a proposal."""
+"""What a solver is: from a program and a goal to a proposal.
+
+Solvers are written by users too. Whatever one does (an exception, `None`, arrays of another shape
+or kind, a status that there is none, multipliers that are no numbers) is a failed proposal: the
+bound is then the one that needs no solver, the status is `FAILED`, and a warning says why. What is
+fit passes as it is; numbers of another precision become float64.
+
+Only `SetupError` is raised, which says that the solver was chosen or set up wrongly, and
+`NotImplementedError`: it does not know what is sought.
+"""
 
 from __future__ import annotations
 

@@ -5,6 +5,9 @@ held at zero. One model grows with the horizon, and each program begins at the b
 before ended, so most of them take a few pivots. Rows and objectives are of unit size: HiGHS's
 tolerances are absolute. What comes back is a proposal: multipliers prove what `programs.horizon`
 makes of them.
+
+Where the initial state is in an ellipsoid, its columns are in the unit ball: one second-order cone,
+and Clarabel solves the programs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,30 @@
-"""Cholesky factors where rounding may have cost a matrix its definiteness."""
+"""An infeasible-start primal-dual method for the offset of a facet, in numpy.
+
+    minimise b   over b, y   with   S = b e' e - C - sum_k y_k G_k >= 0,   y_k >= 0 unless free,
+    maximise <C, X>          with   X >= 0,  X_ee = 1,  <G_k, X> = z_k >= 0 (0 where free).
+
+Any pencil of one unknown is of this kind, with a matrix of its own in the place of `-e' e`.
+
+Cones of general conic solvers hold a dense block of `n (n + 1) / 2` rows for a matrix inequality of
+size `n`. Here a multiplier's matrix is a sum of products of two rows, so Gram matrices of rows are
+enough (`Generators.schur`), and an iteration costs `O(n^3)` for as many multipliers as columns.
+
+The offset counts as a last, free multiplier with generator `-e' e`. The direction is that of
+Helmberg, Rendl, Vanderbei and Wolkowicz (HKM), with Mehrotra's predictor and corrector: with
+`W = S^-1`,
+
+    dX = s mu W - X - sym(X dS W),    y_k dz_k + z_k dy_k = s mu - y_k z_k.
+
+Every equation of `X` is relaxed by `kappa mu y_k`: where `X` has no interior (dead neurons, flat
+sets, products that others imply), the multipliers of the central path would grow without bound.
+What this adds to the objective vanishes with `mu`. Runs that stall go again with less of it.
+
+**Where it starts.** Always at the same point: 16 to 25 iterations on programs that grew by 60
+products a round. Runs from an iterate of the round before, moved inwards, stalled.
+
+**When it stalls.** The iterate with the smallest residuals is kept. It is reported as inaccurate,
+its multipliers are nonnegative and finite, and what they prove is what counts (`recheck`).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""What a tube says and its certificates do not prove."""
+"""What the proofs of a tube rest on, made again from its loop, initial set, template and start.
+
+From a proof comes only what it proposes, of which any is sound: multipliers, slopes, cells, which
+products of facts, ellipsoids. Each step rests on the sets that are proved by then.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,12 @@
-"""Boxes and ellipsoids as points of a vector space, to be enlarged, moved and differentiated.
+"""The largest initial set of a kind from which a specification is proved, as far as is found.
 
-All of it is numpy: values that cost thousands of evaluations are had without a compilation.
+Any box or ellipsoid begins. It is shrunk until it is proved; then its size climbs along the
+gradient of affine forms, inside a barrier of their margins; then it grows about its center and side
+by side for as long as `decide` proves it. What is returned is proved; that nothing larger is, is
+not said: neither is the problem concave, nor is what a relaxation proves all that is true.
+
+Regions are points of a vector space meanwhile, all of it in numpy: values that cost thousands of
+evaluations are had without a compilation.
 """
 
 from __future__ import annotations

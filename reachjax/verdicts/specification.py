@@ -1,4 +1,11 @@
-"""At which times sets are goals, or to be avoided."""
+"""Reach-avoid requirements and how far a tube is from breaking them.
+
+The paper's equations (reach_avoid): every state is in the goal at the horizon, and outside the
+avoided sets, or inside a safe set, all along. A margin is a distance in the units of the state,
+certified by the tube's sets; it can be differentiated as the sets can.
+
+Goals and sets to avoid may be those of some times only.
+"""
 
 from __future__ import annotations
 

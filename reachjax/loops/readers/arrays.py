@@ -1,4 +1,9 @@
-"""Points at which a file's function is evaluated once, in numpy, before anything is built on it."""
+"""Functions of arrays that numpy and `jax.numpy` both have, by the kind of their arguments.
+
+A file's function is traced by JAX, and evaluated in numpy before that: in 64 bits whatever JAX's
+flags are, and without compiling anything. Points are where
+it is evaluated.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""ONNX's operators that move entries, and compute none: shapes, slices, indices."""
+"""ONNX's operators of arrays: those that move entries, and those over axes.
+
+They move shapes, slices and indices, and find sums, norms, largest entries, softmax and
+normalisations.
+"""
 
 from __future__ import annotations
 

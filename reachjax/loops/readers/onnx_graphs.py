@@ -1,4 +1,7 @@
-"""One comparison of what was read from an ONNX file with onnxruntime, where it is installed."""
+"""ONNX graphs as functions of JAX: their weights are parameters, all else is structure.
+
+What was read is compared once with onnxruntime, where that is installed.
+"""
 
 from __future__ import annotations
 

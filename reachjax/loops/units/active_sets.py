@@ -7,6 +7,13 @@ to linearly independent facets `S` (Caratheodory). With excesses `y' = C y - d` 
 
 both are linear in `y'`. Their matrices are computed in rational arithmetic and rounded once, so
 that which facets are independent is known, and each entry is off by one rounding.
+
+Given a box of excesses `y'`, a set `S` of facets can be active only if its multipliers can be
+positive and the slacks of the others too. In each such case the multipliers are linear in `y'`,
+and `y'_i = sum_j G_ij m_j - s_i`, with no slack for the members of `S`. What holds in all
+cases holds.
+Boxes are enlarged by some roundings of their ends: a compiler may round these anew where it uses
+them again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,17 @@
-"""Units that are linear in pieces: ReLU, leaky ReLU, limits, hard tanh."""
+"""Units that are linear in pieces: rectified, leaky, clipped, and the hard hyperbolic tangent.
+
+**Rectified**, `z = max(y, 0)`. It satisfies the paper's (relu::sector): `z >= 0`, `z - y >= 0` and
+`z (z - y) = 0`. When bounds `l <= y <= u` are known, `z <= max(u, 0)` and `z - y <= max(-l, 0)` as
+well. The product of the two differences is the triangle relaxation; `z_i (z_j - y_j) + z_j (z_i -
+y_i)` is lemma 1's restriction of slopes between two of them.
+
+**Leaky**, `z = max(y, a y)` with `0 <= a < 1`. `z = a y + (1 - a) max(y, 0)`, so what holds of
+`max(y, 0)` holds of `z - a y` up to the factor `1 - a`: `z - a y >= 0`, `z - y >= 0`, their product
+is zero, and bounds of `y` cap both.
+
+**Clipped** to an interval: two layers of rectified units (the paper's (proj_NN)),
+`v = max(y - lower, 0) + lower`, then `z = upper - max(upper - v, 0)`.
+"""
 
 from __future__ import annotations
 

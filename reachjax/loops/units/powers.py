@@ -1,4 +1,4 @@
-"""Numbers that are known to be small, whatever bounds say of how they came about."""
+"""Square, square root and reciprocal, and numbers that are known to be small."""
 
 from __future__ import annotations
 

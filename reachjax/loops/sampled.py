@@ -14,11 +14,11 @@ from reachjax.loops.flows.flow import AbstractFlow, Flow
 from reachjax.loops.flows.linear import LinearFlow
 from reachjax.loops.flows.series import Tape
 from reachjax.loops.flows.steps import Settings
-from reachjax.loops.functions import Function
-from reachjax.loops.limits import Limits
 from reachjax.loops.plants import AbstractPlant, AffinePlant
+from reachjax.loops.tracing.functions import Function
+from reachjax.loops.tracing.limits import Limits
+from reachjax.loops.tracing.values import UnsupportedError, Value
 from reachjax.loops.units import AtUnit, UnboundedError, evaluate
-from reachjax.loops.values import UnsupportedError, Value
 from reachjax.numerics.checks import Numbers, is_concrete, real_number, whole_number
 from reachjax.numerics.pytrees import converted, pytree, static
 from reachjax.numerics.rounding import Ball, namespace

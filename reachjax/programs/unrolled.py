@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.functions import Compiled
+from reachjax.loops.tracing.functions import Compiled
 from reachjax.numerics.host import in_numpy
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms

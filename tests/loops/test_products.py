@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.loops.limits import Limits
+from reachjax.loops.tracing.limits import Limits
 from reachjax.loops.units import Bilinear, Lines
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.bounds import successor_box

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes.by_branching import Branching
-from reachjax.tubes.by_cells import Cells
-from reachjax.tubes.by_forms import AffineForms
-from reachjax.tubes.by_programs import Recursion
-from reachjax.tubes.disagreements import DisagreementError
-from reachjax.tubes.methods import AbstractMethod
+from reachjax.methods.affine_forms import AffineForms
+from reachjax.methods.branch_and_cut import Branching
+from reachjax.methods.cells import Cells
+from reachjax.methods.problem import AbstractMethod
+from reachjax.methods.recursion import Recursion
+from reachjax.tubes.repeats import DisagreementError
 from tests.networks import he_network
 
 HORIZON = 3

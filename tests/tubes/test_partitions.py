@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.methods.cell_tree import CellTree, Node
 from reachjax.sets.cells import grid, halves_along
-from reachjax.tubes.cell_tree import CellTree, Node
 from tests.closed_loops import autonomous, closed_loop, random_loop, recursion
 
 RECURSION = {"relaxation": rj.LocalBounds(), "window": 1}

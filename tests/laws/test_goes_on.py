@@ -5,7 +5,7 @@ import pickle
 import pytest
 
 import reachjax as rj
-from tests.cases import HORIZON, Case, each
+from tests.cases import FEW, HORIZON, Case, each
 from tests.laws.changes import same
 
 
@@ -27,7 +27,7 @@ def claims(tube):
     return tube.sets, [(proof.bounds, proof.witnesses) for proof in tube.certificates[1:]]
 
 
-@each(lambda case: not case.searches_cells)
+@each(lambda case: not case.searches_cells, basic=FEW)
 def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(case):
     with pytest.raises(rj.Interrupted, match=rf"after 1 of {HORIZON} steps") as stopped:
         case.reach(progress=Stopping(1))
@@ -39,19 +39,19 @@ def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(case):
     assert same(claims(rest), claims(case.tube))
 
 
-@each()
+@each(basic=FEW)
 def test_nothing_is_left_of_a_call_that_proved_nothing(case):
     with pytest.raises(KeyboardInterrupt) as stopped:
         case.reach(progress=Stopping(0))
     assert not isinstance(stopped.value, rj.Interrupted)
 
 
-@each()
+@each(basic=FEW)
 def test_the_same_call_gives_the_same_tube(case):
     assert same(claims(case.reach()), claims(case.tube))
 
 
-@each(lambda case: case.template != "varying" and not case.searches_cells)
+@each(lambda case: case.template != "varying" and not case.searches_cells, basic=FEW)
 def test_the_first_step_is_that_of_a_call_for_one_step(case):
     assert same(claims(case.reach(steps=1))[0][1], case.tube.sets[1])
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.cases import HORIZON, Case, each
+from tests.cases import FEW, HORIZON, Case, each
 from tests.laws.changes import smaller
 
 GAP, ACCURACY = 1e-4, 1e-7
@@ -17,7 +17,7 @@ def room(case, k):
     return case.options.get("gap", GAP) * np.ptp(values, axis=0) + ACCURACY * (1 + abs(limits))
 
 
-@each(lambda case: (case.by.closes or case.by.grows) and case.template == "axes")
+@each(lambda case: (case.by.closes or case.by.grows) and case.template == "axes", basic=FEW)
 def test_bounds_are_no_larger_of_a_smaller_set(case):
     small = case.reach(X0=smaller(case.X0, 0.2))
     for k in range(HORIZON + 1):

@@ -5,7 +5,7 @@ import pytest
 
 import reachjax as rj
 from tests.campaign.faults import FAULTS, Faulty
-from tests.cases import HORIZON, LOOPS, ROUNDING, Case, each
+from tests.cases import FEW, HORIZON, LOOPS, ROUNDING, Case, each
 
 
 def outside(case, tube, first=0):
@@ -33,7 +33,7 @@ def test_no_state_is_outside_in_between_samples(case):
             assert case.excess(span, inner) <= ROUNDING
 
 
-@each(lambda case: case.method in ("forms", "programs") and case.template == "axes")
+@each(lambda case: case.method in ("forms", "programs") and case.template == "axes", basic=FEW)
 def test_no_state_is_outside_of_all_cells(case):
     options = {"start": case.of.start, **case.options}
     cells = rj.reach_partitioned(

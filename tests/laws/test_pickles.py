@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.cases import LOOPS, Case, each
+from tests.cases import FEW, LOOPS, Case, each
 from tests.laws.changes import another, same
 
 COPIES = {
@@ -32,7 +32,7 @@ def test_a_copy_of_a_tube_is_the_same_proof(case):
         np.testing.assert_array_equal(again.proof(2).recheck(), case.tube.proof(2).recheck())
 
 
-@each()
+@each(basic=FEW)
 def test_no_part_of_a_tube_can_be_exchanged(case):
     tube, loop = case.tube, case.closed_loop
     other = rj.reach(

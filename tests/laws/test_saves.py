@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.cases import HORIZON, Case, each
+from tests.cases import FEW, HORIZON, Case, each
 from tests.closed_loops import autonomous
 from tests.laws.changes import CHANGES, at, changed, parts_of, same, wider
 
@@ -34,7 +34,7 @@ def test_a_tube_is_read_as_it_was(case, tmp_path):
             rj.load(path)
 
 
-@each()
+@each(basic=FEW)
 def test_a_file_belongs_to_its_loop(case, tmp_path):
     case.tube.save(tmp_path / "tube.reach")
     others = Case("relu"), Case("one state"), Case("sine"), Case("sine, tanh")
@@ -130,7 +130,10 @@ def test_a_disagreement_says_what_was_said_and_what_is_proved(tmp_path):
     assert error.proved == pytest.approx(np.sqrt(8))
 
 
-@each(rows=[case for kind, case in ATTACKED.items() if kind not in ("cells", "cells of branches")])
+GOING_ON = [case for kind, case in ATTACKED.items() if "cells" not in kind]
+
+
+@each(rows=GOING_ON, basic=FEW)
 def test_a_tube_that_was_read_goes_on_as_the_one_that_was_written(case, tmp_path):
     tube = case.reach(steps=1)
     again = read(tmp_path / "tube.reach", tube, None if case.of.kept else case.closed_loop)

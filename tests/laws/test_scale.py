@@ -6,7 +6,7 @@ import pytest
 from jax.tree_util import Partial
 
 import reachjax as rj
-from tests.cases import HORIZON, Case, each, swinging
+from tests.cases import FEW, HORIZON, Case, each, swinging
 
 UNITS = {
     "powers of two": np.array([2.0**7, 2.0**-9]),
@@ -82,7 +82,7 @@ ROWS = (
 )
 
 
-@each(rows=ROWS)
+@each(rows=ROWS, basic=FEW)
 @pytest.mark.parametrize("units", UNITS)
 def test_other_units_give_the_same_sets_and_verdicts(case, units):
     D = UNITS[units]

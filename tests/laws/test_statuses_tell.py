@@ -4,7 +4,7 @@ import numpy as np
 
 import reachjax as rj
 from reachjax.proofs.proposal import AS_ASKED
-from tests.cases import HORIZON, ROUNDING, each
+from tests.cases import FEW, HORIZON, ROUNDING, each
 
 
 def ranges(case, k):
@@ -41,7 +41,7 @@ def test_what_a_tube_says_of_its_ends_its_verdicts_and_tables_say(case):
     )
 
 
-@each()
+@each(basic=FEW)
 def test_without_time_sets_hold_and_none_says_that_more_was_done(case):
     tube = case.reach(time_limit=0.0)
     for k in range(1, HORIZON + 1):

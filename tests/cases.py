@@ -41,6 +41,7 @@ class Loop:
         make: the loop.
         initial: the set that it starts from, where a row names none.
         start: the time of that set.
+        n: the number of states.
         plain: the same loop in plain numpy, if there is one.
         kept: whether a file keeps it; a function of a user's is given again.
         smooth: whether a unit of it is no piecewise linear one.
@@ -50,6 +51,7 @@ class Loop:
     make: Callable[[], rj.ClosedLoop]
     initial: Callable[[], rj.AbstractSet]
     start: int = 0
+    n: int = 2
     plain: Callable[[], Controlled] | None = None
     kept: bool = True
     smooth: bool = False
@@ -173,7 +175,7 @@ def of_arrays(n_x: int = 2, seed: int = 3, activation: Any = rj.ReLU(), **option
             return controlled(activation, n_x, (4, 3), seed, **options)
         return Controlled(random_loop(n_x, (4, 3), seed, **options), activation)
 
-    return Loop(lambda: plain().loop, lambda: initial_set("box", n_x, n_x), start, plain)
+    return Loop(lambda: plain().loop, lambda: initial_set("box", n_x, n_x), start, n_x, plain)
 
 
 def disturbed(W: str, V: str, n: int = 2) -> Loop:
@@ -181,6 +183,7 @@ def disturbed(W: str, V: str, n: int = 2) -> Loop:
     return Loop(
         lambda: disturbed_loop(n, disturbance_set(W, n), disturbance_set(V, n, seed=3), seed=1),
         lambda: rj.Box(np.full(n, -0.1), np.full(n, 0.4)),
+        n=n,
         options={"gap": 0.1},  # no products
     )
 
@@ -191,10 +194,11 @@ def of_functions(make: Callable[[], rj.ClosedLoop], **more: Any) -> Loop:
     return Loop(make, **({"initial": small, "kept": False, "smooth": True} | more))
 
 
-def jumping(make: Callable, size: float = 0.5, smooth: bool = False) -> Loop:
+def jumping(make: Callable, size: float = 0.5, smooth: bool = False, kept: bool = False) -> Loop:
     """A loop that jumps, from around where it does."""
     around = lambda: rj.Box([-size, -0.8 * size], [0.8 * size, size])  # noqa: E731
-    return of_functions(make, initial=around, smooth=smooth, options={"gap": 1e-2})
+    given = {"smooth": smooth, "kept": kept, "options": {"gap": 1e-2}}
+    return of_functions(make, initial=around, **given)
 
 
 FILE = "tests/data/networks/torch_tanh.onnx"
@@ -242,9 +246,11 @@ LOOPS = {
     "oscillator, hard": of_functions(lambda: nonlinear(oscillator, rj.HardTanh())),
     "tank": of_functions(lambda: nonlinear(tank)),
     "car": of_functions(
-        lambda: nonlinear(car, rj.ReLU(), 3), initial=lambda: rj.Box([0, 0, 0.2], [0.1, 0.2, 0.5])
+        lambda: nonlinear(car, rj.ReLU(), 3),
+        initial=lambda: rj.Box([0, 0, 0.2], [0.1, 0.2, 0.5]),
+        n=3,
     ),
-    "bell": of_functions(lambda: nonlinear(bell, n=1), initial=lambda: rj.Box([-1.0], [0.5])),
+    "bell": of_functions(lambda: nonlinear(bell, n=1), initial=lambda: rj.Box([-1.0], [0.5]), n=1),
     "quotient": of_functions(lambda: nonlinear(quotient, rj.ReLU())),
     "pushed": of_functions(
         lambda: rj.ClosedLoop(
@@ -256,7 +262,7 @@ LOOPS = {
     "relay": jumping(lambda: nonlinear(relay), smooth=True),
     "friction": jumping(lambda: nonlinear(friction), smooth=True),
     "argmax": jumping(lambda: rj.ClosedLoop(LINE, rj.Network(best, 2, 1))),
-    "bang-bang": jumping(lambda: rj.ClosedLoop(LINE, net(rj.Step()))),
+    "bang-bang": jumping(lambda: rj.ClosedLoop(LINE, net(rj.Step())), kept=True),
     "switched": jumping(
         lambda: rj.ClosedLoop(LINE, rj.Switched([net(rj.ReLU()), net(rj.ReLU(), 1)], by=side)),
         size=0.15,
@@ -369,6 +375,11 @@ class Case:
         return METHODS[self.method]
 
     @property
+    def continuous(self) -> bool:
+        """Whether its plant is a differential equation."""
+        return self.loop.startswith("sampled")
+
+    @property
     def round(self) -> bool:
         """Whether its sets are ellipsoids, or in them."""
         return self.template in ROUND
@@ -429,7 +440,7 @@ def _loop(name: str) -> rj.ClosedLoop:
 
 @functools.cache
 def _initial(loop: str, kind: str) -> rj.AbstractSet:
-    return LOOPS[loop].initial() if kind == "own" else SETS[kind](_loop(loop).states)
+    return LOOPS[loop].initial() if kind == "own" else SETS[kind](LOOPS[loop].n)
 
 
 @functools.cache

@@ -78,8 +78,9 @@ def wider(X):
 
 
 def another(loop):
-    """The loop with other numbers of its controller."""
-    return loop.replace(controller=jax.tree.map(lambda leaf: 1.7 * leaf, loop.controller))
+    """The loop with other numbers of its plant and its controller."""
+    plant, controller = jax.tree.map(lambda leaf: 1.7 * leaf, (loop.plant, loop.controller))
+    return loop.replace(plant=plant, controller=controller)
 
 
 CHANGES = {

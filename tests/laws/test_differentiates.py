@@ -94,7 +94,7 @@ SOME = (
 )
 """Rows that are quick to compile."""
 
-LOOPS = "relu", "hard", "tanh", "sine", "sine, tanh", "oscillator, hard", "disturbed", "sampled"
+LOOPS = "relu", "hard", "tanh", "sine", "sine, tanh", "oscillator, hard", "disturbed"
 METHODS = "default", "one cell", "no programs", "few programs", "forms"
 REST = [
     row

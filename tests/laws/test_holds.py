@@ -20,7 +20,7 @@ def test_no_state_is_outside(case):
     assert len(case.tube.sets) == HORIZON + 1
 
 
-@each(lambda case: case.closed_loop.plant.continuous)
+@each(lambda case: case.continuous)
 def test_no_state_is_outside_in_between_samples(case):
     """States of shorter periods, under the disturbances in their middle."""
     loop, start = case.closed_loop, case.of.start
@@ -64,7 +64,7 @@ BY_PROGRAMS = [
 
 @pytest.mark.costly
 @pytest.mark.parametrize("fault", FAULTS)
-@each(rows=BY_PROGRAMS)
+@each(rows=BY_PROGRAMS, basic=())
 def test_no_state_is_outside_whatever_a_solver_answers(case, fault):
     tube = case.reach(steps=2, solver=Faulty(rj.Clarabel(), fault))
     assert outside(case, tube) <= ROUNDING

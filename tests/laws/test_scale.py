@@ -64,7 +64,9 @@ def set_in(X, D):
 
 def loop_in(loop, D, e):
     """A loop in other units; disturbances and noise stay as they are, but for noise's units."""
-    inputs = None if loop.input_box is None else set_in(loop.input_box, np.full(loop.inputs, e))
+    inputs = (
+        None if loop.input_box is None else set_in(loop.input_box, np.full(loop.plant.inputs, e))
+    )
     noise = None if loop.noise is None else set_in(loop.noise, D)
     plant, net = plant_in(loop.plant, D, e), net_in(loop.controller, D, e)
     return rj.ClosedLoop(plant, net, inputs, disturbance=loop.disturbance, noise=noise)

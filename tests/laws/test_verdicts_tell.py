@@ -78,7 +78,7 @@ def test_what_trajectories_leave_is_refuted_and_nothing_proves_it(case):
 @each(lambda case: case.method in ("default", "forms", "programs"), basic=FEW)
 def test_what_sets_stay_in_is_proved_and_nothing_refutes_it(case):
     boxes = [X.bounding_box() for X in case.tube.sets]
-    if case.closed_loop.plant.continuous:
+    if case.continuous:
         boxes += [X.bounding_box() for X in case.tube.spans]
     lower = np.min([box.lower for box in boxes], axis=0) - 1e-6
     upper = np.max([box.upper for box in boxes], axis=0) + 1e-6

@@ -5,9 +5,6 @@ import numpy as np
 import reachjax as rj
 from tests.cases import HORIZON, ROUNDING, each
 
-CLOSED = "relu", "leaky", "hard", "residual", "unlimited", "varying", "one state", "three states"
-"""Loops whose gaps phases close."""
-
 
 @each()
 def test_a_proof_repeats_the_bounds_of_its_set(case):
@@ -47,11 +44,3 @@ def test_witnesses_are_scenarios_of_the_loop_that_attain_their_values(case):
         runs = loop.simulate(states, steps, case.of.start, **given)
         values = np.diag(tube.sets[k].bounded_values(runs[:, k]))
         np.testing.assert_allclose(values, proof.witnesses, rtol=1e-9, atol=1e-12)
-
-
-@each(lambda case: case.by.closes and case.loop in CLOSED)
-def test_gaps_are_closed(case):
-    for k in range(1, HORIZON + 1):
-        values = np.asarray(case.tube.sets[k].bounded_values(case.runs[:, k]))
-        room = 1.1 * case.options.get("gap", 1e-4) * np.ptp(values, axis=0) / 2
-        assert np.all(np.asarray(case.tube.proof(k).gaps) <= room + 1e-9)

@@ -4,7 +4,7 @@ import numpy as np
 
 import reachjax as rj
 from reachjax.proofs.proposal import AS_ASKED
-from tests.cases import FEW, HORIZON, ROUNDING, each
+from tests.cases import FEW, HORIZON, ROUNDING, Case, each
 
 
 def ranges(case, k):
@@ -23,6 +23,24 @@ def test_a_gap_that_is_open_is_said(case):
         for status, gap, most in zip(proof.statuses, proof.gaps, room, strict=True):
             assert status is not rj.SolverStatus.SOLVED or gap <= most
             assert status is rj.SolverStatus.AFFINE_FORM or case.method != "forms"
+
+
+SOLVED = (
+    *("relu", "leaky", "hard", "residual", "unlimited", "varying", "one state", "three states"),
+    *("six states", "inputs in a pentagon", "inputs in a cube", "tanh", "sigmoid", "traced"),
+    *("sine", "sine, tanh", "oscillator", "oscillator, hard", "tank", "quotient"),
+)
+"""Loops whose gaps phases and cells close."""
+
+
+@each(rows=map(Case, SOLVED))
+def test_gaps_are_closed_by_default(case):
+    """So bounds are as tight as is asked for: witnesses attain all but a ten-thousandth."""
+    for k in range(1, HORIZON + 1):
+        proof = case.tube.proof(k)
+        assert set(proof.statuses) == {rj.SolverStatus.SOLVED}
+        room = 2 * case.options.get("gap", 1e-4) * ranges(case, k) + 1e-9
+        assert np.all(np.asarray(proof.gaps) <= room)
 
 
 @each()

@@ -121,34 +121,6 @@ def test_units_that_are_affine_leave_the_basis_and_the_set_is_then_exact(options
     np.testing.assert_allclose(following.b, ends.max(axis=0), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "options", some(CONTROLLERS, lambda options: options is not CONTROLLERS[0]), ids=NAMES
-)
-@pytest.mark.costly
-def test_the_gradient_in_all_weights_is_the_central_difference(options):
-    case, X = controlled(n_x=2, seed=3, **options), initial_box(2)
-    loop, weights = case.loop, jnp.linspace(0.5, 2.0, 4)
-
-    @jax.jit
-    @jax.value_and_grad
-    def size(net):
-        moved, template = loop.replace(controller=net), rj.Template.box(2)
-        return weights @ rj.reach_step(moved, X, template, relaxation=rj.LocalBounds())[0].b
-
-    leaves, structure = jax.tree.flatten(loop.controller)
-    rng, h = np.random.default_rng(1), 1e-5
-    direction = [rng.normal(size=leaf.shape) for leaf in leaves]
-
-    def moved(by):
-        pairs = zip(leaves, direction, strict=True)
-        return size(jax.tree.unflatten(structure, [leaf + by * d for leaf, d in pairs]))
-
-    difference = (moved(h)[0] - moved(-h)[0]) / (2 * h)
-    slopes = jax.tree.leaves(moved(0.0)[1])
-    along = sum(float(np.sum(g * d)) for g, d in zip(slopes, direction, strict=True))
-    assert along == pytest.approx(float(difference), rel=1e-3)
-
-
 def test_a_residual_network_adds_its_input_and_may_be_nested():
     net = rj.MLP.from_layers([(np.eye(2), [0.0, 0.0]), (np.eye(2), [0.0, 0.0])])  # max(x, 0)
     x = jnp.array([-1.0, 2.0])

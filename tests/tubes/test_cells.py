@@ -75,30 +75,6 @@ def test_what_is_interrupted_keeps_what_is_proved(monkeypatch):
     assert caught.value.tube.horizon == 2
 
 
-@pytest.mark.long  # what gradients of many kinds of loops claim too
-def test_derivatives_are_those_of_what_is_proved():
-    def size(lower, gravity):
-        def f(gravity, x, u):
-            return jnp.array(
-                [x[0] + PERIOD * x[1], x[1] + PERIOD * (gravity * jnp.sin(x[0]) + u[0])]
-            )
-
-        plant = rj.NonlinearPlant(jax.tree_util.Partial(f, gravity), 2, 1)
-        loop = rj.ClosedLoop(plant, loop_of(2).controller, rj.Box([-1.0], [1.0]))
-        relaxation = rj.BranchAndCut(cells=16)
-        tube = rj.reach(loop, rj.Box(lower, [0.5, 0.3]), 3, rj.Template.box(2), relaxation)
-        return jnp.sum(tube.sets[3].b)
-
-    at = jnp.array([0.1, -0.2]), jnp.array(5.0)
-    slopes, h = jax.grad(size, argnums=(0, 1))(*at), 1e-5
-    for i in range(2):
-        step = h * jnp.eye(2)[i]
-        along = (size(at[0] + step, at[1]) - size(at[0] - step, at[1])) / (2 * h)
-        np.testing.assert_allclose(slopes[0][i], along, rtol=1e-5, atol=1e-8)
-    along = (size(at[0], at[1] + h) - size(at[0], at[1] - h)) / (2 * h)
-    np.testing.assert_allclose(slopes[1], along, rtol=1e-5)
-
-
 @pytest.mark.costly
 def test_what_disturbances_leave_open_is_not_halved_for_ever():
     net = rj.MLP.from_layers([([[1.0, 0.5]], [0.0]), ([[-0.5]], [0.0])], activation=rj.Tanh())

@@ -1,7 +1,5 @@
 """Loops with disturbances and noise: nothing that may enter them leaves a tube, and it is tight."""
 
-from itertools import product
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 
 import reachjax as rj
 from experiments.tightness.exact import exact_tube
-from tests.differences import central_difference, dot
 from tests.disturbed_loops import (
     STEPS,
     attacked,
@@ -17,7 +14,6 @@ from tests.disturbed_loops import (
     disturbed_loop,
     double_integrator,
 )
-from tests.quick_cases import some
 
 KINDS = ["box", "varying box", "polytope", "ellipsoid", "intersection"]
 ROUNDING = 1e-9
@@ -99,44 +95,6 @@ def test_noise_alone_and_disturbances_without_width():
         rj.reach(each, initial(2), 2, rj.Template.box(2)) for each in (still, _quiet(flat, None)[0])
     )
     np.testing.assert_allclose(tube.sets[2].b, other.sets[2].b, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("kind", "relaxation"),
-    some(
-        product(["box", "polytope", "ellipsoid"], [rj.LinearBounds(), rj.BranchAndCut()]),
-        lambda *case: case in (("box", rj.BranchAndCut()), ("ellipsoid", rj.LinearBounds())),
-    ),
-    ids=lambda each: each if isinstance(each, str) else type(each).__name__,
-)
-@pytest.mark.costly
-def test_gradients_are_those_of_differences(kind, relaxation):
-    loop = disturbed_loop(2, disturbance_set(kind, 2), disturbance_set("box", 2, 3), seed=1)
-    X0, template = initial(2), rj.Template.octagonal(2)
-    weights = jnp.asarray(np.random.default_rng(0).uniform(size=8))
-
-    def value(loop, X0):
-        tube = rj.reach(loop, X0, 2, template, relaxation, samples=20)
-        return sum(weights @ region.b for region in tube.sets[1:])
-
-    gradient = jax.grad(value, argnums=(0, 1))(loop, X0)
-    rng = np.random.default_rng(1)
-    # normals of a polytope have kinks where the box around it touches along an edge
-    normals = loop.disturbance.A if kind == "polytope" else None
-    for chosen in (loop.disturbance, (loop, X0)):
-        ids = {id(leaf) for leaf in jax.tree.leaves(chosen)} - {id(normals)}
-        direction = jax.tree.map(
-            lambda leaf, ids=ids: (
-                0.1 * jnp.asarray(rng.normal(size=leaf.shape)) * (id(leaf) in ids)
-            ),
-            (loop, X0),
-        )
-        if kind == "ellipsoid":
-            Q = direction[0].disturbance.shape
-            direction[0].disturbance._set(shape=(Q + Q.T) / 20)
-        exact = dot(gradient, direction)
-        difference = central_difference(value, (loop, X0), direction, 1e-5)
-        assert abs(exact - difference) <= 1e-4 * max(abs(difference), 1e-2)
 
 
 @pytest.mark.costly

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.activations import CONTROLLERS, NAMES, controlled
 from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
-from tests.differences import error_in_all_parts
 from tests.networks import directions
-from tests.quick_cases import some
 
 HORIZON = 5
 ROUNDING = 1e-13
@@ -67,27 +64,6 @@ def penalty(loop, X0):
     return jnp.sum(jnp.log(widths))
 
 
-@pytest.mark.parametrize(
-    ("options", "kind"),
-    some(
-        [(options, "box") for options in CONTROLLERS]
-        + [(CONTROLLERS[0], kind) for kind in ("ellipsoid", "far intersection")],
-        lambda options, kind: options is not CONTROLLERS[0] or kind == "ellipsoid",
-    ),
-    ids=[*NAMES, "ellipsoid", "intersection"],
-)
-def test_a_gradient_is_that_of_the_bounds(options, kind):
-    """In all parts at once, away from where a unit becomes affine; differences of the compiled."""
-    X0 = initial_set(kind, 2, 2)
-    if kind == "far intersection":  # whose box touches the ellipsoid, which is a kink
-        box, by = X0.polytope, 0.1 * X0.polytope.widths
-        X0 = X0.replace(polytope=rj.Box(box.lower + by, box.upper - by))
-    args = controlled(**options, hidden=(4, 3), seed=2).loop, X0
-    value, gradient = jax.jit(jax.value_and_grad(penalty, argnums=(0, 1)))(*args)
-    np.testing.assert_allclose(value, penalty(*args), rtol=1e-9)  # compiled, and in numpy
-    assert error_in_all_parts(penalty, args, gradient, 1e-5) < 1e-5
-
-
 @pytest.mark.costly
 def test_a_training_step_compiles_once_whatever_switches():
     traced = []
@@ -104,15 +80,6 @@ def test_a_training_step_compiles_once_whatever_switches():
         assert np.isfinite(value)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
     assert len(traced) == 1
-
-
-@pytest.mark.costly
-def test_loops_and_sets_are_mapped_over():
-    loops = [closed_loop(random_loop(2, seed=seed)) for seed in range(3)]
-    X0 = initial_set("box", 2)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loops)
-    values = jax.vmap(penalty, in_axes=(0, None))(stacked, X0)
-    np.testing.assert_allclose(values, [float(penalty(loop, X0)) for loop in loops], rtol=1e-9)
 
 
 @pytest.mark.costly

@@ -1,16 +1,12 @@
 """Loops of smooth units: no state is outside, sets are tight, and their sizes have derivatives."""
 
-from itertools import product
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 
 import reachjax as rj
 from tests.networks import he_network
-from tests.quick_cases import some
 
 HORIZON = 3
 
@@ -109,53 +105,6 @@ def test_sets_are_tight(name, most):
         offsets = np.asarray(tube.sets[t].b)
         widths = offsets[::2] + offsets[1::2]
         assert np.all(widths <= most * np.ptp(runs[:, t], axis=0))
-
-
-@pytest.mark.parametrize(
-    ("name", "relaxation"),
-    some(
-        product(["pendulum", "boxed", "ball", "tank", "oscillator"], RELAXATIONS[:2]),
-        lambda *case: (
-            case
-            in (
-                ("boxed", rj.BranchAndCut()),
-                ("tank", rj.LinearBounds()),
-                ("oscillator", rj.LinearBounds()),
-            )
-        ),
-    ),
-    ids=lambda each: each if isinstance(each, str) else type(each).__name__,
-)
-@pytest.mark.costly
-def test_derivatives_are_central_differences(name, relaxation):
-    loop, X0 = LOOPS[name]
-    template = rj.Template.box(loop.states)
-
-    def size(given):
-        loop, X0 = given
-        tube = rj.reach(loop, X0, HORIZON, template, relaxation, samples=20, gap=1e-7)
-        return sum(rj.log_widths(X).sum() for X in tube.sets[1:])
-
-    def size_of_the_same_cells(given):  # a step may turn the choice of the next cell to halve
-        sets = (X.replace(b=p.replace(loop=given[0], X0=given[1]).recheck()) for X, p in reached)
-        return sum(rj.log_widths(X).sum() for X in sets)
-
-    tube = rj.reach(loop, X0, HORIZON, template, relaxation, samples=20, gap=1e-7)
-    reached = list(zip(tube.sets[1:], tube.certificates[1:], strict=True))
-    celled = all(hasattr(proof, "axes") for _, proof in reached)
-    size_near = size_of_the_same_cells if celled else size
-    if isinstance(X0, rj.Ellipsoid):  # whose shape stays symmetric
-        fixed, X0 = X0, X0.center
-        sized = size
-        size = size_near = lambda given: sized((given[0], fixed.replace(center=given[1])))
-    flat, restore = ravel_pytree((loop, X0))
-    slopes = ravel_pytree(jax.grad(size)((loop, X0)))[0]
-    rng = np.random.default_rng(0)
-    for _ in range(3):
-        direction, step = rng.normal(size=flat.shape), 1e-6
-        ends = [size_near(restore(flat + sign * step * direction)) for sign in (1, -1)]
-        difference = (ends[0] - ends[1]) / (2 * step)
-        assert slopes @ direction == pytest.approx(float(difference), rel=1e-4)
 
 
 def test_a_remainder_that_is_infinite_says_where_and_what_to_do():

@@ -40,7 +40,7 @@ def spans_by_forms(
         horizon: the number of periods.
         start: the time of the initial set.
     """
-    facets = template if isinstance(template, Template) else Template.box(loop.states)
+    facets = template.alone or Template.box(loop.states)
     shapes, box = [facets.at(k) for k in range(1, horizon + 1)], boxed(X0, "X0")
     directions = jnp.stack([each.directions for each in shapes])
     given = loop, X0, box, directions

@@ -19,7 +19,7 @@ from reachjax.methods.problem import Problem
 from reachjax.programs.held import Facets, held_bounds, sources
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.moving import HeldBounds, Moving, moving
-from reachjax.sets import AbstractSet, Box, Polytope
+from reachjax.sets import AbstractSet, Box, PolyhedralSet
 
 LOOSE = 1e-6
 """By which part of its longest side a cell is larger for the programs of its multipliers."""
@@ -32,7 +32,14 @@ def moving_cell(problem: Problem, node: Node) -> tuple[AbstractSet, Box]:
     sides = np.where(upper > lower, upper - lower, 1.0)
     shares = ((end - lower) / sides for end in node.ends)
     around = Box(*(box.lower + share * (box.upper - box.lower) for share in shares))
-    return X0.cut(around) if isinstance(X0, Polytope) else around, around
+    flat = _programmed(X0)
+    return around if flat is None else flat.cut(around), around
+
+
+def _programmed(X0: AbstractSet) -> PolyhedralSet | None:
+    """The set, if forms over it are bounded by linear programs; None of a box."""
+    flat, ball = X0.parts
+    return flat if flat is not None and ball is None and flat.needs_programs else None
 
 
 def moving_offsets(
@@ -99,9 +106,9 @@ def _held(
     horizon, facets = Horizon(loop, part, box, start), None
     for _ in range(k + 1):
         horizon.advance()
-    if isinstance(X0, Polytope):
+    if (flat := _programmed(X0)) is not None:
         room = LOOSE * np.max(box.upper - box.lower)
-        facets = X0.cut(Box(box.lower - room, box.upper + room)).facets
+        facets = flat.cut(Box(box.lower - room, box.upper + room)).facets
     return _held_forms(horizon, directions, facets)
 
 

@@ -59,6 +59,12 @@ class AbstractTemplate(Replaceable, abc.ABC):
         """The templates of the two parts that the sets have; None of what they have not."""
 
     @property
+    def alone(self) -> Template | None:
+        """The template, if its sets are bounded by facets and nothing else; None of others."""
+        facets, ellipsoid = self.parts
+        return facets if ellipsoid is None else None
+
+    @property
     def steps(self) -> int | None:
         """The number of steps it is given for; None if all sets look alike."""
         return None

@@ -21,7 +21,7 @@ from reachjax.numerics.checks import described, is_concrete, whole_number
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import unlogged
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds, LocalBounds
-from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
+from reachjax.sets import AbstractSet, AbstractTemplate, Box
 from reachjax.sets.cells import grid_ends
 from reachjax.tubes.reach import ReachTube, reach
 from reachjax.tubes.sizes import log_volume
@@ -175,9 +175,9 @@ def _penalised(
 
     if cells is None:
         return of(X0)
-    if not isinstance(X0, Box):
+    if X0.intervals is None:
         raise TypeError(f"cells are of an X0 of type Box, but {described(X0)} arrived")
-    lower, upper = grid_ends(X0, cells)
+    lower, upper = grid_ends(X0.bounding_box(), cells)
     if options["window"] is None:  # on the host, one by one
         each = [of(Box(*ends)) for ends in zip(lower, upper, strict=True)]
         return sum(each, start=jnp.zeros(())) / len(each)
@@ -188,7 +188,7 @@ def _completed(
     loop: ClosedLoop, X0: AbstractSet, template: AbstractTemplate, options: dict[str, Any]
 ) -> dict[str, Any]:
     """The options that are given, and what they leave open."""
-    by_programs = not isinstance(template, Template) or "solver" in options or "window" in options
+    by_programs = template.alone is None or "solver" in options or "window" in options
     relaxation = options.get("relaxation", LocalBounds() if by_programs else LinearBounds())
     of_numbers = is_concrete(jax.lax.stop_gradient((loop, X0, template)))
     relaxation, window = _in_penalties(relaxation, of_numbers)

@@ -21,7 +21,7 @@ from reachjax.methods.ladder import WORK, Ladder
 from reachjax.methods.steps import boxed
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.flags import lenient
-from reachjax.sets import AbstractSet, Box
+from reachjax.sets import AbstractSet
 from reachjax.sets.balance import balanced
 from reachjax.verdicts.sieve import Margins, Outcome, Unbounded, no_margins
 from reachjax.verdicts.specification import Requirement
@@ -97,7 +97,7 @@ def _climbed(
     limits = task.nodes, budget.with_work(WORK)
     between = any(item.throughout for item in task.required)
     ladder = Ladder(task.loop, part, around, scenarios, task.start, *limits, between=between)
-    if by_forms and isinstance(part, Box) and not task.by_programs:
+    if by_forms and part.intervals is not None and not task.by_programs:
         ladder.advance(tighten=False)  # nothing but forms could be tried again
         axis = _axis(ladder, _first_open(task.required, margins))
         return Outcome(False, margins, axis=axis)

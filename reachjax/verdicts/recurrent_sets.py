@@ -114,8 +114,9 @@ def _safe_part(region: PolyhedralSet, safe: PolyhedralSet | None) -> PolyhedralS
     """A set without what is not safe; None if nothing of it is, or too little to draw states."""
     if safe is None or within([region], safe)[0]:
         return region
-    if isinstance(region, Box) and isinstance(safe, Box):
-        return None if region.misses(safe) else region.cut(safe)
+    if region.intervals is not None and safe.intervals is not None:
+        around = Box(*safe.intervals)
+        return None if region.misses(around) else region.cut(around)
     (A, b), (C, d) = region.facets, safe.facets
     part = Polytope(jnp.concatenate([A, C]), jnp.concatenate([b, d]))
     try:
@@ -138,9 +139,8 @@ def _directions(
         modes = np.concatenate([real, pairs.reshape(-1, len(jacobian))])
         if np.linalg.matrix_rank(modes, 1e-6) == len(jacobian):
             yield np.concatenate([modes, -modes])
-    own = tube.template.at(tube.horizon)
-    box = Template.box(loop.states)
-    yield np.asarray((own if isinstance(own, Template) else box).directions)
+    own = tube.template.at(tube.horizon).alone or Template.box(loop.states)
+    yield np.asarray(own.directions)
 
 
 def _jacobian(loop: ClosedLoop, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:

@@ -22,7 +22,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.methods.problem import Span, at
 from reachjax.numerics.checks import described, is_concrete, real_number, require_kind
 from reachjax.numerics.flags import lenient
-from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet, Polytope
+from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
 from reachjax.sets.linear_programs import is_empty
 from reachjax.tubes.reach import ReachTube
@@ -357,18 +357,19 @@ def _checked(item: Requirement, states: int) -> Requirement:
         raise ValueError(
             f"{item.name} has dimension {region.dimension}, but the loop has {states} states"
         )
-    if isinstance(region, Polytope) and is_concrete(region):
+    flat, ball = region.parts
+    if flat is not None and flat.needs_programs and is_concrete(flat):
         A, b = (np.asarray(part, float) for part in region.facets)
         if _empty(A.tobytes(), b.tobytes()):
             raise ValueError(f"{item.name} is empty: no point satisfies all facets of its polytope")
-    if not isinstance(region, Ellipsoid):
+    if ball is None:
         return item
     if not is_concrete(region):
         raise ValueError(
             f"{item.name} must be a polytope inside jax.jit, but a traced ellipsoid arrived"
         )
-    polytope = (inner_polytope if item.inside else outer_polytope)(region, item.name)
-    return dataclasses.replace(item, region=polytope, ball=region)
+    polytope = (inner_polytope if item.inside else outer_polytope)(ball, item.name)
+    return dataclasses.replace(item, region=polytope, ball=ball)
 
 
 @lru_cache(maxsize=256)

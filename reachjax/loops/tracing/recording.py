@@ -7,7 +7,6 @@ step is affine (a choice of entries, a matrix, a factor, a sum) or a layer of un
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Container, Sequence
 from typing import Any
 
@@ -32,7 +31,6 @@ from reachjax.loops.units import (
     AtUnit,
     Bilinear,
     ReLU,
-    SmoothUnit,
     Square,
     UnboundedError,
 )
@@ -322,10 +320,12 @@ class Recorder:
 
     def unit(self, unit: AbstractUnit, value: Value) -> Value:
         """A layer of units, of which smooth ones are told between what numbers their inputs are."""
-        if isinstance(unit, SmoothUnit) and value.size:
+
+        def ends() -> tuple[float, float]:
             limits = self.limits(value)
-            ends = {"least": float(limits.least.min()), "most": float(limits.most.max())}
-            unit = dataclasses.replace(unit, **ends)
+            return float(limits.least.min()), float(limits.most.max())
+
+        unit = unit.knowing(ends) if value.size else unit
         again = lambda y: self.unit(unit, y)  # noqa: E731
         step = Step(self._applied(unit), (value.place,), unit=unit, again=again)
         return self.layer(value.shape, step, ("unit", unit, value.place))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, ClassVar, NamedTuple
 
@@ -162,10 +162,13 @@ class SmoothUnit(AbstractUnit):
             lower, upper = smaller(lower, self.most), smaller(upper, self.most)
         return lower, upper
 
+    def knowing(self, ends: Callable[[], tuple[float, float]]) -> SmoothUnit:
+        """The unit with what its inputs are known never to be below, or above."""
+        least, most = ends()
+        return dataclasses.replace(self, least=least, most=most)
+
     def limits(self, least: Any, most: Any) -> tuple[Any, Any]:
-        """Bounds of the value for inputs in `[least, most]`, one end or both of which may be
-        infinite.
-        """
+        """Bounds of the value for inputs of which an end, or both, may be infinite."""
         ends: Any = [np.where(np.isfinite(end), end, 1.0) for end in (least, most)]
         low, high = ends
         if self.rises:

@@ -113,10 +113,11 @@ from reachjax.verdicts.verdict import (
     Recurrence,
     Verdict,
     VerdictStatus,
+    WinningSet,
+    plot_cells,
 )
 from reachjax.verdicts.verify import verify
 from reachjax.verdicts.winning import winning_set
-from reachjax.verdicts.winning_sets import WinningSet, plot_cells
 
 __version__ = "0.1.0"
 

@@ -231,7 +231,11 @@ def _is_smooth(recorder: Recorder, operand: Operand, y: Value) -> bool:
     places = recorder.between(operand, y)
     steps = [recorder.steps[place] for place in places if place != y.place]
     known = y.place in places and all(step is not None and step.entrywise for step in steps)
-    return known and any(step.unit is not None and step.unit.curved for step in steps if step)
+    return known and any(
+        step.unit is not None and step.unit.curved and len(step.parents) == 1
+        for step in steps
+        if step
+    )
 
 
 def _meeting(

@@ -247,7 +247,7 @@ def test_threads_leave_the_filters_of_warnings_alone(loop):
 @pytest.mark.costly
 def test_an_error_in_a_cell_ends_the_run(loop):
     class Broken(rj.Clarabel):
-        def solve(self, program):
+        def solve(self, program, goal):
             raise KeyboardInterrupt("stopped")  # what else a solver raises is a failed proposal
 
     with pytest.raises(KeyboardInterrupt, match="stopped"):

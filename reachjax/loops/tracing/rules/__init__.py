@@ -106,7 +106,7 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
             found = jumps.of_decisions(recorder, equation, operands, recorded)
         return found
     if equation.name == "convert_element_type" and not _is_float(equation):
-        return jumps.whole_numbers(recorder, equation, first)
+        return jumps.whole_numbers(recorder, equation, operands[0])
     if jnp.issubdtype(equation.kind, jnp.integer) and equation.name not in jumps.OF_WHOLE:
         raise UnsupportedError(jumps.WHOLE)
     rule = RULES.get(equation.name)

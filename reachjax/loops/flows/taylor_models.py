@@ -9,7 +9,7 @@ that there is to a state, an input or a disturbance. Each number is
 and a product of two leaves out all that is of degree three in `w`, or of degree two with an `r`.
 
 Since symbols are few, what is computed with them does not grow with the columns of a horizon; the
-`l` are the derivatives by which these are carried on (`programs.flowed`).
+`l` are the derivatives by which these are carried on (`programs.flows`).
 """
 
 from __future__ import annotations

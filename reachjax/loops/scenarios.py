@@ -190,6 +190,8 @@ class Scenarios(Replaceable):
 
     def split(self, scenarios: Rows) -> Scenario:
         """The parts of scenarios, of as many steps as they have."""
+        if not self._draws:  # all of them is the initial state
+            return Scenario(scenarios, None, None)
         return split(scenarios, self.X0.dimension, *self._sizes)
 
     def joined(self, states: Any, *drawn: Any) -> Any:

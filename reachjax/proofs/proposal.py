@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from reachjax.programs.lmi import Program
-from reachjax.programs.pencils import AbstractInequality
+from reachjax.programs.presolve import AbstractInequality
 
 
 class SolverStatus(enum.IntEnum):

@@ -22,8 +22,7 @@ from reachjax.numerics.budget import clock
 from reachjax.numerics.host import all_finite
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.lmi import Program, Slopes, form_rows, inequality_slopes, with_successor
-from reachjax.programs.pencils import Pencil, Shape
-from reachjax.programs.presolve import Generators, NormalProgram, presolved
+from reachjax.programs.presolve import Generators, NormalProgram, Pencil, Shape, presolved
 from reachjax.proofs.by_products import EllipsoidCertificate
 from reachjax.proofs.gradients import held_level
 from reachjax.proofs.proposal import ANSWERS, Proposal, SolverStatus

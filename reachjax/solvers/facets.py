@@ -13,8 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.lmi import Program, Slopes, inequality_slopes
-from reachjax.programs.pencils import Pencil, Shape
-from reachjax.programs.presolve import Generators, NormalProgram, presolved
+from reachjax.programs.presolve import Generators, NormalProgram, Pencil, Shape, presolved
 from reachjax.programs.relaxations import Products
 from reachjax.proofs.by_products import Certificate
 from reachjax.proofs.gradients import held_offsets

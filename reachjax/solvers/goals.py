@@ -43,7 +43,7 @@ from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.host import all_finite, on_host, shapes_of
 from reachjax.programs.lmi import Program, Slopes
-from reachjax.programs.pencils import AbstractInequality
+from reachjax.programs.presolve import AbstractInequality
 from reachjax.programs.relaxations import LocalBounds, Products
 from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.proposal import Proposal
@@ -56,7 +56,7 @@ from reachjax.solvers.cutting_planes import NONE, CutPool, Rounds, Shown, idle, 
 class AbstractGoal(AbstractInequality):
     """What is sought of a program. A pytree; what gets a program gets numpy arrays, on the host.
 
-    It says what a solver sees (`programs.pencils`), what is proved with what that proposes, and how
+    It says what a solver sees (`programs.presolve`), what is proved with what that proposes, and how
     that moves with the program's rows.
     """
 

@@ -21,11 +21,11 @@ from reachjax.methods.ladder import Ladder
 from reachjax.methods.recursion import goals_of
 from reachjax.methods.steps import Setting, Step, boxed
 from reachjax.numerics.budget import ENDLESS
-from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Origin, Program
 from reachjax.programs.relaxations import (
     AbstractRelaxation,
     AllProducts,
+    FactLayout,
     LinearBounds,
     LocalBounds,
     Products,

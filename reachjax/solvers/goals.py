@@ -56,7 +56,7 @@ from reachjax.solvers.cutting_planes import NONE, CutPool, Rounds, Shown, idle, 
 class AbstractGoal(AbstractInequality):
     """What is sought of a program. A pytree; what gets a program gets numpy arrays, on the host.
 
-    It says what a solver sees (`programs.presolve`), what is proved with what that proposes, and how
+    It says what solvers see (`programs.presolve`), what is proved with what they propose, and how
     that moves with the program's rows.
     """
 

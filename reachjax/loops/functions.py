@@ -26,6 +26,7 @@ from reachjax.loops.units import AtUnit, evaluate
 from reachjax.loops.values import Choice, Operand, Parameter, UnsupportedError, Value
 from reachjax.numerics.checks import described, is_concrete
 from reachjax.numerics.pytrees import pytree, static, unchecked
+from reachjax.numerics.rounding import counting
 
 
 class Structure(NamedTuple):
@@ -217,6 +218,7 @@ class Function:
             object.__setattr__(self, "_kept", kept)
         return kept
 
+    @counting
     def _recorded(self) -> tuple[Any, tuple[Recorder, Operand]]:
         """The parameters, so that this can be traced, and the steps with what they end in."""
         closed, sizes = self.structure.trace.closed, self.structure.inputs
@@ -259,7 +261,7 @@ class Compiled:
     """
 
     def __init__(self, function: Callable[..., Any], **options: Any):
-        self._jitted = jax.jit(function, **options)
+        self._jitted = jax.jit(counting(function), **options)
         functools.update_wrapper(self, function)
 
     def __call__(self, *given: Any, **static: Any) -> Any:

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.functions import Compiled
 from reachjax.numerics.host import in_numpy
+from reachjax.numerics.rounding import rounding
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
 from reachjax.programs.flows import Between
@@ -93,7 +94,7 @@ def unrolled(
         yield found._replace(drawn=tuple(np.sign(forms.columns[:, each]) for each in free))
 
 
-@partial(Compiled, static_argnames=("t", "between"))
+@partial(Compiled, static_argnames=("t", "between", "counted"))
 def unrolled_at_once(
     loop: ClosedLoop,
     X0: AbstractSet,
@@ -101,11 +102,27 @@ def unrolled_at_once(
     directions: Float[Array, "N m n_x"],
     t: int = 0,
     between: bool = False,
+    counted: bool = True,
 ) -> ByForms:
     """Bounds for all steps at once, compiled and differentiable, without a call to the host.
 
-    A polytope counts as the box around it. Arguments are those of `unrolled`.
+    A polytope counts as the box around it. Arguments are those of `unrolled`, but for `counted`,
+    whether rounding is: what is found without it is no bound, and takes a fraction of the time. Of
+    differential equations it always is.
     """
+    with rounding(counted or loop.plant.continuous):
+        return _at_once(loop, X0, box, directions, t, between)
+
+
+def _at_once(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[Array, "N m n_x"],
+    t: int,
+    between: bool,
+) -> ByForms:
+    """Bounds for all steps, as one scan."""
     start = InitialColumns.of(X0, box, loop.curved)
     (more, between), steps = step_columns(loop), len(directions)
     first, end = start.count, start.count + steps * more

@@ -8,6 +8,7 @@ certified by the tube's sets; it can be differentiated as the sets can.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
 from reachjax.sets.polyhedra import is_empty
 from reachjax.tubes.methods import Span, at
 from reachjax.tubes.reach import ReachTube
+from reachjax.tubes.sketches import Sketch
 from reachjax.tubes.times import AvoidSets, Region, Timed, timed_goals, timed_sets_to_avoid
 
 
@@ -85,7 +87,7 @@ class Requirement:
         """What every state surely does not exceed, and should not: of each facet, or of the set."""
         return self.compared_with(self.holding(tube))
 
-    def holding(self, tube: ReachTube) -> AbstractSet:
+    def holding(self, tube: ReachTube | Sketch) -> AbstractSet:
         """The set of a tube that holds all states which the requirement is about."""
         return tube.spans[self.time - 1] if self.throughout else tube.sets[self.time]
 
@@ -284,11 +286,18 @@ def shortfall(
         0.1
     """
     check_margin(margin)
-    missing = jnp.zeros(())
-    for item in of_tube(tube, goal, avoid, safe):
+    return missing(of_tube(tube, goal, avoid, safe), tube, margin)
+
+
+def missing(
+    required: Sequence[Requirement], tube: ReachTube | Sketch, margin: float
+) -> Float[Array, ""]:
+    """By how much sets miss requirements, in all: see `shortfall`."""
+    total = jnp.zeros(())
+    for item in required:
         margins = item.compared_with(item.holding(tube), by_offsets=True).margins
-        missing += jnp.sum(jnp.maximum(0.0, margin - margins))
-    return missing
+        total += jnp.sum(jnp.maximum(0.0, margin - margins))
+    return total
 
 
 def check_margin(margin: Any) -> None:

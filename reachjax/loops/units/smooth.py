@@ -14,7 +14,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -22,12 +22,16 @@ from jaxtyping import Array, Bool, Float
 
 from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark, Product
 from reachjax.numerics.rounding import (
+    NOTHING,
     TINY,
     UNIT,
     constant,
+    errors,
     gamma,
+    is_counted,
     larger,
     namespace,
+    select,
     settled,
     smaller,
 )
@@ -201,6 +205,8 @@ class SmoothUnit(AbstractUnit):
         """What remains of the value if nothing is taken from it; NaN where an end is."""
         xp, (least, most) = namespace(lower, upper), self.image
         low, high = self.remainder(xp.zeros_like(lower), lower, upper)
+        if not is_counted():
+            return larger(low, least), smaller(high, most)
         unknown = xp.isnan(lower) | xp.isnan(upper)
         low, high = larger(low, least), smaller(high, most)
         return xp.where(unknown, math.nan, low), xp.where(unknown, math.nan, high)
@@ -214,20 +220,23 @@ class SmoothUnit(AbstractUnit):
         xp = namespace(slope, lower, upper)
         slope, lower, upper = settled((slope, *self.met(lower, upper)))
         fine = self.defined(lower, upper) & (abs(slope) < math.inf)
-        slope = xp.where(fine, slope, 0.0)
-        lower, upper = (xp.where(fine, end, 1.0) for end in (lower, upper))
+        slope = select(fine, slope, 0.0)
+        lower, upper = (select(fine, end, 1.0) for end in (lower, upper))
         # by the envelope theorem a derivative needs no derivatives of the stationary points
         inner = self.stationary(*map(constant, (slope, lower, upper)))
         y = xp.stack([lower, upper, *(_within(point, lower, upper) for point in inner)])
         value, product = self(y), slope * y
+        rest = value - product
+        if not is_counted():
+            low, high = (select(fine, extreme(rest), end) for extreme, end in EXTREMES)
+            return low, high
         rounding = constant(
             SLACK * (abs(value) + abs(product))
             + (self.flushed + TINY * (abs(slope) + abs(y)))  # of what underflows
         )
-        rest = value - product
         known = fine & (abs(rest) < math.inf) & (rounding < math.inf)
-        low = xp.where(known, rest - rounding, -math.inf)
-        high = xp.where(known, rest + rounding, math.inf)
+        low = select(known, rest - rounding, -math.inf)
+        high = select(known, rest + rounding, math.inf)
         return reduce(smaller, low), reduce(larger, high)
 
     def lines(self, lower: Array, upper: Array) -> Lines:
@@ -243,15 +252,15 @@ class SmoothUnit(AbstractUnit):
     @np.errstate(all="ignore")
     def _chord(self, lower: Array, upper: Array) -> Float[Array, " k"]:
         """The slope of the chord; of the tangent in the middle where differences lose digits."""
-        xp, fine = namespace(lower, upper), self.defined(lower, upper)
-        lower, upper = (xp.where(fine, end, 1.0) for end in (lower, upper))
+        fine = self.defined(lower, upper)
+        lower, upper = (select(fine, end, 1.0) for end in (lower, upper))
         first, last = self(lower), self(upper)
         width, rise = upper - lower, last - first
         lost = abs(rise) <= THIN * (abs(first) + abs(last))
         thin = (width <= THIN * (abs(lower) + abs(upper))) | ((width <= THIN) & lost)
         tangent = self.derivative(lower / 2 + upper / 2)
-        slope = xp.where(thin, tangent, rise / xp.where(thin, 1.0, width))
-        return xp.where(fine & (abs(slope) < math.inf), slope, 0.0)
+        slope = select(thin, tangent, rise / select(thin, 1.0, width))
+        return select(fine & (abs(slope) < math.inf), slope, 0.0)
 
     @np.errstate(all="ignore")
     def quadratic(self, lower: Array, upper: Array, linear: Quadratic | None = None) -> Quadratic:
@@ -270,30 +279,38 @@ class SmoothUnit(AbstractUnit):
         lower, upper = settled(self.met(lower, upper))
         center = settled(lower / 2 + upper / 2)
         fine = self.defined(lower, upper)
-        lower, upper, middle = (xp.where(fine, y, 1.0) for y in (lower, upper, center))
+        lower, upper, middle = (select(fine, y, 1.0) for y in (lower, upper, center))
         radius = larger(upper - middle, middle - lower) * (1 + gamma(2)) + TINY
         wide = fine & (radius > THIN * abs(middle))
         wide = wide & (radius > SQUARES) & (radius < 1 / SQUARES)
-        radius = xp.where(wide, radius, 1.0)
+        radius = select(wide, radius, 1.0)
         step = math.sqrt(0.75) * radius
-        nodes = xp.stack([middle + xp.where(wide, k * step, 0.0) for k in (-1, 0, 1)])
+        away = select(wide, step, 0.0)
+        nodes = xp.stack([middle - away, middle, middle + away])
         values = self(nodes)
         before, at, after = values
         slope = (after - before) / (2 * step)
         curvature = ((after - at) - (at - before)) / (2 * step * step)
         offset, slope, curvature = settled((at, slope, curvature))
-        y = nodes - middle
-        terms = offset, slope * y, curvature * y * y
-        rounding = SLACK * abs(values) + gamma(8) * sum(map(abs, terms)) + self.flushed
-        errors = abs(values - sum(terms)) + constant(rounding)
         third = self.third(lower, upper)
-        wide, third = wide & (third < math.inf), xp.where(third < math.inf, third, 0.0)
+        wide, third = wide & (third < math.inf), select(third < math.inf, third, 0.0)
         # nodes may be off by some `UNIT |c|`, that is `1e-8 r`
         between = radius * radius * radius / 24 * third * (1 + THIN)
-        gap = (between + 2 * reduce(larger, errors)) * (1 + gamma(4))
+
+        def off() -> Any:
+            y = nodes - middle
+            terms = offset, slope * y, curvature * y * y
+            rounding = SLACK * abs(values) + gamma(8) * sum(map(abs, terms)) + self.flushed
+            return reduce(larger, abs(values - sum(terms)) + constant(rounding))
+
+        # its derivative counts where there is one: the nodes' values are what is measured
+        error = 2 * off() if is_counted() else NOTHING
+        gap = (between + error) * (1 + gamma(4))
         better = wide & (gap < linear.gap)
         curved = Quadratic(middle, offset, slope, curvature, gap)
-        chosen = [xp.where(better, *pair) for pair in zip(curved, linear, strict=True)]
+        chosen = [select(better, *pair) for pair in zip(curved, linear, strict=True)]
+        if not is_counted():
+            return Quadratic(*chosen)
         known = reduce(lambda a, b: a & b, (abs(each) < math.inf for each in chosen))
         *chosen, gap = (xp.where(known, each, 0.0) for each in chosen)
         return Quadratic(*settled((*chosen, xp.where(known, gap, math.inf))))
@@ -304,8 +321,16 @@ class SmoothUnit(AbstractUnit):
         lower, upper = self.met(lower, upper)
         center = settled(lower / 2 + upper / 2)
         start, half = slope * center, low / 2 + high / 2
-        gap = high / 2 - low / 2 + gamma(4) * constant(abs(start) + abs(low) + abs(high))
-        gap = gap + TINY * constant(abs(slope) + abs(center) + 2)
+        gap = (
+            high / 2
+            - low / 2
+            + errors(
+                lambda: (
+                    gamma(4) * (abs(start) + abs(low) + abs(high))
+                    + TINY * (abs(slope) + abs(center) + 2)
+                )
+            )
+        )
         return Quadratic(center, start + half, slope, namespace(slope).zeros_like(slope), gap)
 
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:
@@ -316,6 +341,10 @@ class SmoothUnit(AbstractUnit):
             Block(z - (below.slope * y + below.offset), "over", Mark.BOUND),
         )
         return Facts(blocks, (), (Product("under", "over", Mark.BOUND),))
+
+
+EXTREMES = (partial(reduce, smaller), -math.inf), (partial(reduce, larger), math.inf)
+"""The least and the largest of some numbers, and what is below and above all."""
 
 
 def _within(point: Array, lower: Array, upper: Array) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.loops.units.smooth import SLACK, SmoothUnit, farthest, nearest
-from reachjax.numerics.rounding import TINY, gamma, larger, namespace, smaller
+from reachjax.numerics.rounding import TINY, errors, gamma, larger, namespace, select, smaller
 
 FAR = 1e5
 """Up to this size of arguments sines and cosines of numpy and of XLA were compared with exact ones,
@@ -43,13 +43,14 @@ class WaveUnit(SmoothUnit):
         far = far & (abs(slope) < math.inf)
         if xp is np and not far.any():
             return low, high
-        slope, lower, upper = (xp.where(far, each, 0.0) for each in (slope, lower, upper))
+        slope, lower, upper = (select(far, each, 0.0) for each in (slope, lower, upper))
         ends, (least, most) = (slope * lower, slope * upper), self.extent(lower, upper)
         least, most = least - larger(*ends), most - smaller(*ends)
-        flushed = TINY * (1 + farthest(lower, upper))  # of slopes too small for floats
+        # slopes may be too small for floats
+        flushed = errors(lambda: TINY * (1 + farthest(lower, upper)))
         least, most = least - gamma(4) * abs(least), most + gamma(4) * abs(most)
         least, most = least - flushed, most + flushed
-        return xp.where(far, least, low), xp.where(far, most, high)
+        return select(far, least, low), select(far, most, high)
 
 
 def _met(angle: Array, lower: Array, upper: Array) -> tuple[Array, Array]:

@@ -71,6 +71,14 @@ class Whole:
 
     __rmul__ = __mul__
 
+    def __add__(self, other: Any) -> Any:
+        return 1.0 + other
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> Any:
+        return 1.0 - other
+
 
 NOTHING, WHOLE = Nothing(), Whole()
 

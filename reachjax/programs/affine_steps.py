@@ -32,6 +32,7 @@ from reachjax.numerics.rounding import (
     gamma,
     is_counted,
     namespace,
+    rounding,
     select,
 )
 from reachjax.programs.affine import AffineForms, Place, joined, radii_of
@@ -181,6 +182,8 @@ def step_forms(
         ends = _cut(unit, y, start)
         if ranges is not None:
             ends = ranges(unit, y, ends, found)
+        if not is_counted():  # or compilers compute them again for each of their uses
+            ends = settled(ends)
         if isinstance(unit, Bilinear):
             z, forms = _bilinear(unit, y, ends, free, start)
         elif isinstance(unit, SmoothUnit):
@@ -192,6 +195,8 @@ def step_forms(
         else:
             here = slice(done, done + len(y))
             z, forms = _unit(unit, y, ends, free, None if slopes is None else slopes[here])
+        if not is_counted():
+            z = settled(z)
         if place is None and unit.curved:
             _require_bounds(forms, int(t))
         done = done + len(z)
@@ -307,6 +312,8 @@ def _smooth(
     better = model.gap + lost <= line.gap
     model = Quadratic(*(select(better, *pair) for pair in zip(model, line, strict=True)))
     lost = select(better, lost, 0.0)
+    if not is_counted():
+        model, lost, own, rest, values = settled((model, lost, own, rest, values))
     off = center - model.center
     middle = model.offset + (model.slope + model.curvature * off) * off
     slope = model.slope + 2 * model.curvature * off
@@ -393,12 +400,13 @@ def _unit(
 ) -> tuple[AffineForms, UnitForms]:
     """What a layer of units makes of its inputs, whose bounds are known."""
     xp, (lower, upper) = namespace(y.rows), ends
-    if slope is None:
-        slope = unit.lines(lower, upper).above.slope
-    rest, values = (
-        Ball.between(*ends)
-        for ends in (unit.remainder(slope, lower, upper), unit.interval(lower, upper))
-    )
+    with rounding(True):  # it is little that these count, and said in many ways
+        if slope is None:
+            slope = unit.lines(lower, upper).above.slope
+        rest, values = (
+            Ball.between(*ends)
+            for ends in (unit.remainder(slope, lower, upper), unit.interval(lower, upper))
+        )
     slope, offset, gap = settled((slope, rest.mid, rest.rad))
     left = NOTHING if not is_counted() else xp.zeros_like(gap)
     rows = slope[:, None] * y.rows

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.functions import Compiled
+from reachjax.loops.units.smooth import EXTREMES
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import rounding
 from reachjax.programs.affine import AffineForms
@@ -95,8 +96,12 @@ def unrolled(
         yield found._replace(drawn=tuple(np.sign(forms.columns[:, each]) for each in free))
 
 
-COLUMNS = 96
-"""Columns that old ones are merged into where many cells are bounded."""
+FOUND = jax.checkpoint_policies.save_only_these_names(EXTREMES)
+"""What is kept for derivatives, as it has none itself."""
+
+COLUMNS, MEMORY = 96, 12
+"""Where many cells are bounded so many columns are kept, or those of so many steps, where these are
+more: old ones are merged."""
 
 
 @partial(Compiled, static_argnames=("t", "between", "counted", "columns"))
@@ -147,7 +152,7 @@ def _at_once(
     end = first + (kept + more if merges else steps * more)
 
     # a derivative computes a step again: storing what it needs of it is most of what is compiled
-    @partial(jax.checkpoint, prevent_cse=False)
+    @partial(jax.checkpoint, prevent_cse=False, policy=FOUND)
     def advance(state: AffineForms, step: tuple[Array, Array]) -> tuple[AffineForms, ByForms]:
         k, rows = step
         place = first + (kept if merges else k * more)
@@ -170,7 +175,7 @@ def unrolled_from_boxes(
     directions: Float[Array, "N m n_x"],
     whole: Bool[Array, "N m"] | None = None,
     t: int = 0,
-    columns: int | None = COLUMNS,
+    columns: int | None = None,
 ) -> Float[Array, "c N m"]:
     """Upper bounds of directions after 1, ..., N steps from each of many boxes, in one call.
 
@@ -181,13 +186,14 @@ def unrolled_from_boxes(
         directions: one row a facet, for each step.
         whole: which of them are bounded at all times since the sample before; None for none.
         t: the time of the boxes.
-        columns: as of `unrolled_at_once`.
+        columns: as of `unrolled_at_once`; None for as many as a dozen steps add.
     """
+    most = columns or max(COLUMNS, MEMORY * step_columns(loop)[0])
 
     def one(lower: Float[Array, " n_x"], upper: Float[Array, " n_x"]) -> Float[Array, "N m"]:
         box = Box(lower, upper)
         found = unrolled_at_once(
-            loop, box, box, directions, t, between=whole is not None, columns=columns
+            loop, box, box, directions, t, between=whole is not None, columns=most
         )
         return found.offsets if whole is None else jnp.where(whole, found.between, found.offsets)
 

@@ -14,15 +14,16 @@ import abc
 import dataclasses
 import math
 from collections.abc import Sequence
-from functools import partial, reduce
+from functools import reduce
 from typing import Any, ClassVar, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark, Product
 from reachjax.numerics.rounding import (
-    NOTHING,
     TINY,
     UNIT,
     constant,
@@ -64,6 +65,9 @@ class Quadratic(NamedTuple):
     curvature: Array
     gap: Array
 
+
+EXTREMES = "extremes"
+"""The name of what need not be found again for a derivative (`jax.checkpoint`)."""
 
 ENDLESS = 1e100
 """Inputs of this size are no matter of a domain."""
@@ -204,9 +208,9 @@ class SmoothUnit(AbstractUnit):
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """What remains of the value if nothing is taken from it; NaN where an end is."""
         xp, (least, most) = namespace(lower, upper), self.image
-        low, high = self.remainder(xp.zeros_like(lower), lower, upper)
         if not is_counted():
-            return larger(low, least), smaller(high, most)
+            return self._plain_interval(lower, upper)
+        low, high = self.remainder(xp.zeros_like(lower), lower, upper)
         unknown = xp.isnan(lower) | xp.isnan(upper)
         low, high = larger(low, least), smaller(high, most)
         return xp.where(unknown, math.nan, low), xp.where(unknown, math.nan, high)
@@ -225,11 +229,12 @@ class SmoothUnit(AbstractUnit):
         # by the envelope theorem a derivative needs no derivatives of the stationary points
         inner = self.stationary(*map(constant, (slope, lower, upper)))
         y = xp.stack([lower, upper, *(_within(point, lower, upper) for point in inner)])
+        if not is_counted():
+            y = self._extremes(slope, lower, upper, constant(y))
+            low, high = self(y) - slope * y
+            return select(fine, low, -math.inf), select(fine, high, math.inf)
         value, product = self(y), slope * y
         rest = value - product
-        if not is_counted():
-            low, high = (select(fine, extreme(rest), end) for extreme, end in EXTREMES)
-            return low, high
         rounding = constant(
             SLACK * (abs(value) + abs(product))
             + (self.flushed + TINY * (abs(slope) + abs(y)))  # of what underflows
@@ -238,6 +243,27 @@ class SmoothUnit(AbstractUnit):
         low = select(known, rest - rounding, -math.inf)
         high = select(known, rest + rounding, math.inf)
         return reduce(smaller, low), reduce(larger, high)
+
+    def _plain_interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """What remains of the value, where rounding is not counted."""
+        if not self.rises:
+            low, high = self.remainder(jnp.zeros_like(lower), lower, upper)
+            return larger(low, self.image[0]), smaller(high, self.image[1])
+        lower, upper = self.met(lower, upper)
+        fine, (least, most) = self.defined(lower, upper), self.image
+        low, high = self(select(fine, jnp.stack([lower, upper]), 1.0))
+        return select(fine, low, least), select(fine, high, most)
+
+    def _extremes(self, slope: Array, lower: Array, upper: Array, points: Array) -> Array:
+        """Where `f(y) - slope y` is least and largest of some points, the first two of which are
+        ends, that alone have derivatives; in JAX.
+        """
+        rest = self(points) - constant(slope) * points
+        which = jnp.argmin(jnp.stack([rest, -rest]), axis=1)
+        found = which[:, None] == np.arange(len(points))[:, None]
+        inner = select(found, points, 0.0).sum(axis=1)
+        which, inner = checkpoint_name((which, inner), EXTREMES)
+        return select(which == 0, lower, select(which == 1, upper, inner))
 
     def lines(self, lower: Array, upper: Array) -> Lines:
         """Two lines of the slope of the chord, that touch: never the same.
@@ -259,12 +285,15 @@ class SmoothUnit(AbstractUnit):
         lost = abs(rise) <= THIN * (abs(first) + abs(last))
         thin = (width <= THIN * (abs(lower) + abs(upper))) | ((width <= THIN) & lost)
         tangent = self.derivative(lower / 2 + upper / 2)
+        tangent = tangent if is_counted() else constant(tangent)  # so thin that it does not matter
         slope = select(thin, tangent, rise / select(thin, 1.0, width))
         return select(fine & (abs(slope) < math.inf), slope, 0.0)
 
     @np.errstate(all="ignore")
     def quadratic(self, lower: Array, upper: Array, linear: Quadratic | None = None) -> Quadratic:
         """The interpolant at Chebyshev nodes, or the lines where those leave less out.
+
+        Where rounding is not counted, nobody looks at the lines.
 
         The error at the nodes is measured. Between them it is at most 5/3 of that (the nodes'
         Lebesgue constant), here 2, beside the error of an exact interpolant.
@@ -303,14 +332,12 @@ class SmoothUnit(AbstractUnit):
             rounding = SLACK * abs(values) + gamma(8) * sum(map(abs, terms)) + self.flushed
             return reduce(larger, abs(values - sum(terms)) + constant(rounding))
 
-        # its derivative counts where there is one: the nodes' values are what is measured
-        error = 2 * off() if is_counted() else NOTHING
-        gap = (between + error) * (1 + gamma(4))
+        if not is_counted():
+            return Quadratic(middle, offset, slope, curvature, select(wide, between, math.inf))
+        gap = (between + 2 * off()) * (1 + gamma(4))
         better = wide & (gap < linear.gap)
         curved = Quadratic(middle, offset, slope, curvature, gap)
         chosen = [select(better, *pair) for pair in zip(curved, linear, strict=True)]
-        if not is_counted():
-            return Quadratic(*chosen)
         known = reduce(lambda a, b: a & b, (abs(each) < math.inf for each in chosen))
         *chosen, gap = (xp.where(known, each, 0.0) for each in chosen)
         return Quadratic(*settled((*chosen, xp.where(known, gap, math.inf))))
@@ -341,10 +368,6 @@ class SmoothUnit(AbstractUnit):
             Block(z - (below.slope * y + below.offset), "over", Mark.BOUND),
         )
         return Facts(blocks, (), (Product("under", "over", Mark.BOUND),))
-
-
-EXTREMES = (partial(reduce, smaller), -math.inf), (partial(reduce, larger), math.inf)
-"""The least and the largest of some numbers, and what is below and above all."""
 
 
 def _within(point: Array, lower: Array, upper: Array) -> Array:

@@ -28,15 +28,18 @@ RIDGE = 1e-6
 in which none is divided by what rounding makes of zero."""
 
 
-def merged_columns(state: AffineForms, first: int, count: int) -> AffineForms:
+def merged_columns(
+    state: AffineForms, first: int, count: int, last: int | None = None
+) -> AffineForms:
     """The state with the columns from some on as fewer, the rest empty; compiled.
 
     Args:
         state: of all columns.
         first: where those begin that may be merged.
         count: how many are left of them, more than twice as many as there are states.
+        last: where they end, and only empty ones come; None for all columns.
     """
-    n, given = len(state), state.columns[:, first:]
+    n, given = len(state), state.columns[:, first:last]
     counted = state.off is not NOTHING
     held = count - (2 * n if counted else n)
     frame, back = _frame(jax.lax.stop_gradient(state.columns))
@@ -52,7 +55,7 @@ def merged_columns(state: AffineForms, first: int, count: int) -> AffineForms:
     if counted:  # they contract as columns, not as radii
         off = jax.lax.stop_gradient(state.off + _lost(frame, parts, merged, block))
         rows.append(select(jnp.eye(n, dtype=bool), off[:, None] * (1 + gamma(2)), 0.0))
-    rows.append(jnp.zeros((n, given.shape[1] - count)))
+    rows.append(jnp.zeros((n, state.columns.shape[1] - first - count)))
     radii = radii_of(state.off * 0.0, state.radii[:, -1])
     return AffineForms(jnp.concatenate(rows, axis=1), radii)
 

@@ -161,7 +161,7 @@ def _at_once(
             loop, state, t + k, start, place=place, scratch=end, spans=spans
         )
         found = _bounds(rows, state, units, start, spans)
-        return merged_columns(state, first, kept) if merges else state, found
+        return merged_columns(state, first, kept, end) if merges else state, found
 
     state = AffineForms.beginning(start, end + scratch)
     return jax.lax.scan(advance, state, (jnp.arange(steps), directions))[1]

@@ -43,7 +43,7 @@ from reachjax.numerics.rounding import (
     smaller,
 )
 from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
-from reachjax.sets.polyhedra import support
+from reachjax.sets.linear_programs import support
 
 Rows = Float[Array | np.ndarray, "k n"]
 

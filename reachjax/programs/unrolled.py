@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.functions import Compiled
+from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units.smooth import EXTREMES
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import rounding

@@ -15,16 +15,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.methods.problem import AbstractMethod, Problem
+from reachjax.methods.propagation import Options, check_problem, require_kinds
 from reachjax.numerics.checks import described, is_concrete, whole_number
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import unlogged
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds, LocalBounds
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
 from reachjax.sets.cells import grid_ends
-from reachjax.tubes.methods import AbstractMethod, Problem
-from reachjax.tubes.propagation import Options, check_problem, require_kinds
 from reachjax.tubes.reach import ReachTube, reach
-from reachjax.tubes.requirements import (
+from reachjax.tubes.sizes import log_volume
+from reachjax.tubes.sketches import Sketch, sketched
+from reachjax.verdicts.specification import (
     AvoidSets,
     Region,
     Requirement,
@@ -34,8 +36,6 @@ from reachjax.tubes.requirements import (
     period_of,
     requirements,
 )
-from reachjax.tubes.sizes import log_volume
-from reachjax.tubes.sketches import Sketch, sketched
 
 
 @unlogged

@@ -11,10 +11,10 @@ import dataclasses
 import jax.numpy as jnp
 
 from reachjax.loops import ClosedLoop
+from reachjax.methods.problem import Problem
 from reachjax.numerics.derivatives import first_order
 from reachjax.programs.unrolled import unrolled_at_once
 from reachjax.sets import AbstractSet, Polytope
-from reachjax.tubes.methods import Problem
 
 
 @dataclasses.dataclass(frozen=True)

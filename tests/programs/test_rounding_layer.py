@@ -46,17 +46,17 @@ def test_sets_without_rounding_are_the_certified_ones_but_for_rounding(kind):
     loop, X0 = loop_of(kind)
     rows = np.broadcast_to(directions(loop.states), (5, *directions(loop.states).shape))
 
-    def total(loop, counted):
-        found = unrolled_at_once(loop, X0, X0.bounding_box(), rows, counted=counted).offsets
+    def total(net, counted):
+        given = loop.replace(controller=net), X0, X0.bounding_box(), rows
+        found = unrolled_at_once(*given, counted=counted).offsets
         return found[-1].sum(), found
 
-    (one, proved), (other, plain) = (
-        jax.value_and_grad(total, has_aux=True)(loop, counted)[::-1] for counted in (True, False)
-    )
-    proved, plain = proved[1], plain[1]
+    values = jax.value_and_grad(total, has_aux=True)
+    (_, proved), slopes = values(loop.controller, True)
+    (_, plain), other = values(loop.controller, False)
     np.testing.assert_allclose(plain, proved, rtol=1e-9, atol=1e-9)
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(b, a, rtol=1e-6, atol=1e-8)
+    for one, another in zip(jax.tree.leaves(slopes), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(another, one, rtol=1e-6, atol=1e-8)
 
 
 def test_what_is_proved_within_a_scope_without_rounding_counts_it():

@@ -26,6 +26,7 @@ from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
 from reachjax.sets.linear_programs import is_empty
 from reachjax.tubes.reach import ReachTube
+from reachjax.tubes.sketches import Sketch
 
 Region = PolyhedralSet | Ellipsoid
 
@@ -226,7 +227,7 @@ class Requirement:
         """What every state surely does not exceed, and should not: of each facet, or of the set."""
         return self.compared_with(self.holding(tube))
 
-    def holding(self, tube: ReachTube) -> AbstractSet:
+    def holding(self, tube: ReachTube | Sketch) -> AbstractSet:
         """The set of a tube that holds all states which the requirement is about."""
         return tube.spans[self.time - 1] if self.throughout else tube.sets[self.time]
 
@@ -426,11 +427,18 @@ def shortfall(
         0.1
     """
     check_margin(margin)
-    missing = jnp.zeros(())
-    for item in of_tube(tube, goal, avoid, safe):
+    return missing(of_tube(tube, goal, avoid, safe), tube, margin)
+
+
+def missing(
+    required: Sequence[Requirement], tube: ReachTube | Sketch, margin: float
+) -> Float[Array, ""]:
+    """By how much sets miss requirements, in all: see `shortfall`."""
+    total = jnp.zeros(())
+    for item in required:
         margins = item.compared_with(item.holding(tube), by_offsets=True).margins
-        missing += jnp.sum(jnp.maximum(0.0, margin - margins))
-    return missing
+        total += jnp.sum(jnp.maximum(0.0, margin - margins))
+    return total
 
 
 def check_margin(margin: Any) -> None:

@@ -92,6 +92,13 @@ def products(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
     return m.stack([x[0] + x[1] / 8, x[1] + bent + a[2] * u[0]])
 
 
+def coupled(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
+    """Products of factors of unlike sizes, of the state and of the input, pushed."""
+    a, push = p["a"], 0 if w is None else w[0]
+    bent = a[0] * (4096 * x[0]) * (m.sin(x[1]) / 4096) - a[1] * x[1] * u[0]
+    return m.stack([x[0] + x[1] / 8, x[1] + bent + a[2] * u[0] + push])
+
+
 def quotients(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
     """Every other function: quotients, roots, logarithms, exponentials."""
     a = p["a"]
@@ -124,6 +131,7 @@ class Kind:
         facets: of a polytope of inputs; 0 for a box.
         skips: whether the network is traced, with a connection that skips it.
         horizon: the number of steps.
+        columns: what old columns of forms are merged into, from a box; 0 where that is not tried.
     """
 
     name: str
@@ -139,6 +147,7 @@ class Kind:
     facets: int = 0
     skips: bool = False
     horizon: int = 2
+    columns: int = 0
 
     @property
     def loop(self) -> tuple:
@@ -158,6 +167,10 @@ KINDS = (
     Kind("sine", sine, "tanh", hidden=(3, 3), horizon=3, initial=("box", "ellipsoid", "polytope")),
     Kind("products", products, "relu", template=OCTAGONAL),
     Kind("quotients", quotients, "sigmoid"),
+    Kind(
+        "products, disturbed", coupled, "tanh", disturbed=("box",), noisy=True, horizon=4, columns=8
+    ),
+    Kind("long", sine, "tanh", disturbed=("box",), noisy=True, horizon=24, columns=16),
     Kind("unicycle", unicycle, "relu", states=3, hidden=(4,)),
     Kind("leaky, traced", affine, "leaky", skips=True, hidden=(4,), horizon=3),
     Kind("hard, products", products, "hard", skips=True),

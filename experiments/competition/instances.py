@@ -34,12 +34,22 @@ class Shape:
         activation: of these: `relu` or `tanh`, which stands for `sigmoid` too.
         law: inputs `(c, n_u)` at states `(c, n)`, to be imitated.
         spread: `(n,)`, how far around the initial set it is learned.
+        sees: what it is given of states `(c, n)`; None for the states.
     """
 
     hidden: tuple[int, ...]
     activation: str
     law: Callable[[np.ndarray], np.ndarray]
     spread: tuple[float, ...]
+    sees: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def samples(self, X0: rj.Box, count: int = 5000) -> tuple[np.ndarray, np.ndarray]:
+        """What the network sees, and what the law does there."""
+        rng = np.random.default_rng(0)
+        lower, upper = (np.asarray(end) for end in (X0.lower, X0.upper))
+        states = rng.uniform(lower - self.spread, upper + self.spread, (count, len(lower)))
+        seen = states if self.sees is None else self.sees(states)
+        return seen, self.law(seen)
 
 
 @dataclass(frozen=True)
@@ -151,7 +161,13 @@ def _cruise_control() -> Instance:
         50,
         {"safe": rj.Polytope(-room[None], [-10.0])},
         ((0, 1), (0, 4)),
-        Shape((20,) * 5, "relu", law, (0.5, 0.2, 8.0, 60.0, 8.0)),
+        Shape(
+            (20,) * 5,
+            "relu",
+            law,
+            (60.0, 12.0, 2.0, 60.0, 12.0, 2.0),
+            lambda x: np.asarray(jax.vmap(sees)(jnp.asarray(x))),
+        ),
     )
 
 
@@ -460,21 +476,19 @@ def _balancing() -> Instance:
 
 
 def _avoidances() -> list[Instance]:
+    def sees(x):
+        return (x[:3] - jnp.array([0.0, 0, 20])) / jnp.array([16000.0, 5000, 40])
+
     def loop(worst: bool) -> Callable[[Networks], rj.ClosedLoop]:
         def made(nets: Networks) -> rj.ClosedLoop:
             step = fields.avoidance(worst)
             count = 3 if worst else 0
             plant = rj.NonlinearPlant(step, 12, 9, **({"disturbances": count} if worst else {}))
-            advised = [
-                scaled(
-                    net,
-                    12,
-                    lambda x: (x[:3] - jnp.array([0.0, 0, 20])) / jnp.array([16000.0, 5000, 40]),
-                    lambda y: jax.nn.one_hot(jnp.argmax(y), 9),
-                )
-                for net in nets
-            ]
-            policy = rj.Switched(advised, by=lambda x: jnp.argmax(x[3:]))
+            scores = rj.Switched(
+                [scaled(net, 12, sees, unchanged) for net in nets],
+                by=lambda x: jnp.argmax(x[3:]),
+            )
+            policy = scaled(scores, 12, unchanged, lambda y: jax.nn.one_hot(jnp.argmax(y), 9))
             drawn = rj.Box(np.zeros(count), np.ones(count)) if worst else None
             return rj.ClosedLoop(plant, policy, disturbance=drawn)
 

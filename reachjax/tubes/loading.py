@@ -1,4 +1,4 @@
-"""Tubes from files, sealed again, and rechecked where what they rest on may have changed."""
+"""Tubes and verdicts from files, sealed again, and rechecked where what they rest on may have changed."""
 
 from __future__ import annotations
 
@@ -20,13 +20,17 @@ from reachjax.numerics.files import existing_file
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.numerics.storage import read
+from reachjax.sets import AbstractSet
 from reachjax.tubes.kept import Kept
 from reachjax.tubes.methods import Problem
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.propagation import Options, check_problem
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.rechecks import Recheck, require_partition
+from reachjax.tubes.requirements import asked_again, period_of
 from reachjax.tubes.searches import Bar
+from reachjax.tubes.verdict_rechecks import rechecked
+from reachjax.tubes.verdicts import KeptVerdict, Verdict
 
 MISSING = (
     "was written without its loop, whose functions cannot be stored: give the loop again, "
@@ -42,8 +46,8 @@ def load(
     *,
     recheck: bool = False,
     progress: Bar | None = None,
-) -> ReachTube | PartitionedTube:
-    """A tube from the file that `tube.save(path)` wrote.
+) -> ReachTube | PartitionedTube | Verdict:
+    """A tube, or a verdict, from the file that `tube.save(path)` or `verdict.save(path)` wrote.
 
     Args:
         path: of the file.
@@ -51,7 +55,9 @@ def load(
             the one that was left out, in every equation that JAX traces of it and in every number.
         recheck: whether everything that the tube says of its loop is proved anew, which takes about
             as long as it took to compute, or less. The file is believed in nothing: of the loop,
-            the initial set, template and start that it has, all else follows.
+            the initial set, template and start that it has, all else follows; how searches ended
+            and what they took is not said any more. Of a verdict all is proved anew, from what it
+            is about, without a search; without `recheck` its status is what the file says.
         progress: wraps the iteration over steps that are rechecked, such as `tqdm.tqdm`.
 
     Raises:
@@ -79,16 +85,39 @@ def load(
     found = existing_file("path", path)
     kept = read(found, owned(loop), MISSING)
     try:
-        tube = _sealed(kept)
+        tube = _verdict(kept.tube) if _is_verdict(kept) else _sealed(kept)
     except Exception as error:  # whoever wrote it may have written anything
-        message = f"{path} must hold a tube, but something else arrived: {error}"
+        message = f"{path} must hold a tube or a verdict, but something else arrived: {error}"
         raise UnreadableError(message) from error
     if loop is not None and not kept.is_of(loop):
         raise ValueError(
             f"loop must be that of the tube in {path}, with the same equations and numbers, but "
             "another one arrived (or another version of JAX, which writes its equations otherwise)"
         )
+    if isinstance(tube, Verdict):
+        return rechecked(tube, progress) if recheck else tube
     return _rechecked(tube, progress) if recheck else tube
+
+
+def _is_verdict(kept: Any) -> bool:
+    return isinstance(kept, Kept) and isinstance(kept.tube, KeptVerdict)
+
+
+def _verdict(kept: KeptVerdict) -> Verdict:
+    """The verdict that was read, what it is about being a question that there can be.
+
+    Raises:
+        Exception: of any kind: it is something else.
+    """
+    asked = kept.asked
+    require_kind("it", asked.loop, ClosedLoop, "a verdict of a loop")
+    require_kind("it", asked.X0, AbstractSet, "a verdict of an initial set")
+    if asked.X0.dimension != asked.loop.states:
+        raise ValueError("the initial set is not of the loop's states")
+    asked.loop.check_horizon(asked.horizon, asked.start)
+    period = period_of(asked.loop)
+    required = asked_again(asked.required, asked.loop.states, asked.horizon, period)
+    return kept._replace(asked=asked._replace(required=required)).verdict
 
 
 def _rechecked(tube: ReachTube | PartitionedTube, progress: Bar | None) -> Any:

@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     recheck = commands.add_parser("recheck", help="prove a tube or a verdict anew")
     recheck.add_argument("file", help="that save(...) wrote")
-    recheck.add_argument("--loop", metavar="MODULE:NAME", help="a loop, or a function that makes it")
+    recheck.add_argument("--loop", metavar="MODULE:NAME", help="a loop, or what makes it")
     given = parser.parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     from reachjax.tubes.loading import load

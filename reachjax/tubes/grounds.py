@@ -19,7 +19,6 @@ from reachjax.proofs.branches import Branches
 from reachjax.sets import AbstractSet
 from reachjax.tubes.requirements import Requirement
 
-
 LARGEST = 2**27
 """A matrix of more entries than a gigabyte holds is none of a step's."""
 

@@ -1,4 +1,4 @@
-"""Tubes and verdicts from files, sealed again, and rechecked where what they rest on may have changed."""
+"""Tubes and verdicts from files, rechecked where what they rest on may have changed."""
 
 from __future__ import annotations
 

@@ -8,7 +8,6 @@ its trajectory is enclosed again. Nothing is searched.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -41,8 +40,6 @@ from reachjax.tubes.verdicts import Verdict, VerdictStatus
 Key = tuple[str, int]
 """The name and the time of a requirement."""
 
-Margins = dict[Key, float]
-
 
 def rechecked(verdict: Verdict, progress: Bar | None = None) -> Verdict:
     """The verdict as it is proved anew; of one that is unknown nothing is claimed.
@@ -59,21 +56,22 @@ def rechecked(verdict: Verdict, progress: Bar | None = None) -> Verdict:
     assert asked is not None
     findings = Findings(asked.loop, asked.X0, asked.horizon, asked.start, asked.required)
     more: dict[str, Any] = {"asked": asked}
+    left_out = 0
     try:
         if verdict.status is VerdictStatus.REFUTED:
             _refute(verdict, asked, findings)
         elif verdict.status is VerdictStatus.PROVED:
             grounds = verdict.grounds or Grounds()
-            margins = _proved(asked, grounds, progress)
+            margins, left_out = _proved(asked, grounds, progress)
             for item in asked.required:
                 findings.prove(item, *margins[item.name, item.time])
             more["grounds"] = grounds
     except DisagreementError:
         raise
     except Exception as error:  # what is read may be of any shape and size
-        if progress is not None and isinstance(error, ValueError) and "progress" in str(error):
-            raise
         raise DisagreementError(f"the recheck of the verdict proves nothing: {error}") from error
+    if left_out:
+        raise ValueError(f"progress must pass on each cell, but {left_out} did not arrive")
     found = findings.verdict(**more)
     if found.status is not verdict.status:
         left = ", ".join(f"{name} at t = {time}" for name, time in list(findings.open)[:3])
@@ -106,8 +104,13 @@ def _refute(verdict: Verdict, asked: Asked, findings: Findings) -> None:
     findings.simulate(runs, broken)
 
 
-def _proved(asked: Asked, grounds: Grounds, progress: Bar | None) -> dict[Key, tuple[float, bool]]:
+def _proved(
+    asked: Asked, grounds: Grounds, progress: Bar | None
+) -> tuple[dict[Key, tuple[float, bool]], int]:
     """The least margin of each requirement over all cells, and whether it holds over each.
+
+    Returns:
+        These, and how many cells the progress bar left out.
 
     Raises:
         ValueError: the tree is none of the initial set's, or there are not as many climbs as cells.
@@ -117,24 +120,17 @@ def _proved(asked: Asked, grounds: Grounds, progress: Bar | None) -> dict[Key, t
     if len(cells) != len(grounds.climbs):
         raise ValueError(f"it has {len(cells)} cells, but {len(grounds.climbs)} proofs")
     found = {(item.name, item.time): (np.inf, True) for item in asked.required}
-    steps = list(range(len(cells)))
-    count = 0
-    outcomes = _by_forms(loop, asked, cells, grounds)
-    for number in wrapped(progress, steps):
-        count += 1
-        margins = next(outcomes)
+    given = zip(_by_forms(loop, asked, cells, grounds), cells, grounds.climbs, strict=True)
+    left = len(cells)
+    for _ in wrapped(progress, list(range(len(cells)))):  # whatever a bar passes on, in order
+        margins, cell, climbs = next(given)
+        left -= 1
         if margins is None:
-            part, climbs = cells[number].part, grounds.climbs[number] or (Climb(),)
-            margins = _over(loop, asked, part, climbs)
+            margins = _over(loop, asked, cell.part, climbs or (Climb(),))
         for key, (least, holds) in found.items():
             margin, right = margins.get(key, (-np.inf, False))
             found[key] = min(least, margin), holds and right
-    if count != len(steps):
-        raise ValueError(
-            f"progress must pass on each cell, but {len(steps) - count} of {len(steps)} did not "
-            "arrive"
-        )
-    return found
+    return found, left
 
 
 def _cells(X0: AbstractSet, grounds: Grounds) -> list[Node]:

@@ -64,13 +64,12 @@ def unclaimed(tree):
         return node.replace(**nested, codes=0 * node.codes, seconds=0 * node.bounds)
 
     parts = tree.tubes if isinstance(tree, rj.PartitionedTube) else (tree,)
-    found = [
+    return [
         (t.loop, t.template, t.sets, jax.tree.map(without, t.certificates, is_leaf=is_proof))
         if isinstance(t, rj.ReachTube)
         else t
         for t in parts
     ]
-    return found
 
 
 def equal(one, other):

@@ -248,6 +248,20 @@ def _shown(name: str, value: Any) -> str:
     return f"{value:.3g}" if name == "margin" else f"{value:.2f}"
 
 
+def write_markdown(rows: list[dict], path: Path) -> None:
+    """The table for the docs, with the machine, the date and the commit."""
+    names = ("first", "warm", "recheck", "margin", "cells", "width", "peak")
+    head = ("benchmark", "instance", "verdict", *names[:-1], "GB")
+    lines = [" | ".join(head), " | ".join(["---"] * 3 + ["---:"] * len(names))]
+    for row in rows:
+        numbers = (_shown(name, row.get(name)) for name in names)
+        lines.append(" | ".join((row["benchmark"], row["name"], row["verdict"], *numbers)))
+    on = machine()
+    commits = ", ".join(dict.fromkeys(row["commit"] for row in rows))
+    told = f"{on['date']}, commit {commits}, {on['cores']} cores ({on['machine']}), no GPU."
+    path.write_text("\n".join(f"| {line} |" for line in lines) + f"\n\n{told}\n")
+
+
 def write_csv(rows: list[dict], path: Path) -> None:
     """An instance a line, as the evaluation platform takes them: result, and its seconds."""
     with path.open("w", newline="") as file:
@@ -284,6 +298,7 @@ def main(settings: Settings) -> None:
         rich.print(table(rows))
         rich.print(NOTE)
         write_csv(rows, settings.output / "results.csv")
+        write_markdown(rows, settings.output / "results.md")
     if missing:
         rich.print(f"without networks in {settings.path}: {', '.join(missing)}")
     rich.print(f"written: results.csv, results.json, figures, verdicts under {settings.output}")

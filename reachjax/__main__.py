@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     recheck.add_argument("--loop", metavar="MODULE:NAME", help="a loop, or what makes it")
     given = parser.parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
-    from reachjax.tubes.loading import load
+    from reachjax.verdicts.loading import load
 
     try:
         loop = _loop(given.loop) if given.loop else None

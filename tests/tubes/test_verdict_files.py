@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes import verdict_rechecks
-from reachjax.tubes.grounds import Asked, Climb, Grounds, Leaves, Multipliers
-from reachjax.tubes.kept import keep
 from reachjax.tubes.rechecks import ROUNDING
-from reachjax.tubes.verdicts import KeptVerdict, VerdictStatus
+from reachjax.tubes.saving import keep
+from reachjax.verdicts import rechecks
+from reachjax.verdicts.grounds import Asked, Climb, Grounds, Leaves, Multipliers
+from reachjax.verdicts.verdict import KeptVerdict, VerdictStatus
 from tests.closed_loops import closed_loop, random_loop
 from tests.tubes.test_hostile_files import CHANGES, REFUSED, opened, written
 
@@ -93,7 +93,7 @@ def test_a_recheck_solves_and_searches_nothing(tmp_path, monkeypatch):
         raise AssertionError("something was searched")
 
     monkeypatch.setattr("reachjax.solvers.linear_programs.LinearPrograms.largest", refuse)
-    monkeypatch.setattr("reachjax.tubes.ladder.Ladder.bounds", refuse)
+    monkeypatch.setattr("reachjax.methods.ladder.Ladder.bounds", refuse)
     assert rj.load(tmp_path / "a.verdict", recheck=True).proved
 
 
@@ -176,7 +176,7 @@ def test_multipliers_of_any_kind_prove_nothing_that_is_false():
             VerdictStatus.PROVED, {}, {}, asked=asked, grounds=Grounds(climbs=(climbs,))
         )
         with pytest.raises(rj.DisagreementError):
-            verdict_rechecks.rechecked(verdict)
+            rechecks.rechecked(verdict)
 
 
 def _distorted(rng, climb):

@@ -80,6 +80,8 @@ from reachjax.sets import (
     PolyhedralSet,
     Polytope,
     Template,
+    VnnLib,
+    read_vnnlib,
 )
 from reachjax.sets.pictures import plot_set
 from reachjax.solvers import (
@@ -213,6 +215,7 @@ __all__ = [
     "UnsoundError",
     "Verdict",
     "VerdictStatus",
+    "VnnLib",
     "WinningSet",
     "XLogX",
     "change_of_basis",
@@ -230,6 +233,7 @@ __all__ = [
     "reach",
     "reach_partitioned",
     "reach_step",
+    "read_vnnlib",
     "runge_kutta",
     "shortfall",
     "skip_failures",

@@ -18,7 +18,6 @@ import jax
 def _loop(name: str) -> Any:
     """What a module calls so, or what its function of that name gives."""
     module, _, path = name.partition(":")
-    sys.path.insert(0, "")
     found: Any = importlib.import_module(module)
     for part in path.split(".") if path else ():
         found = getattr(found, part)

@@ -27,6 +27,10 @@ MISSING = (
 )
 
 
+LONGEST = 10**6
+"""Steps of any verdict: a file that names more would fill memory with margins."""
+
+
 @logged
 @lenient
 def load(
@@ -104,6 +108,8 @@ def _verdict(file: Kept) -> Verdict:
     if asked.X0.dimension != asked.loop.states:
         raise ValueError("the initial set is not of the loop's states")
     asked.loop.check_horizon(asked.horizon, asked.start)
+    if asked.horizon > LONGEST:
+        raise ValueError(f"its horizon is {asked.horizon}, more than {LONGEST} steps")
     period = period_of(asked.loop)
     required = asked_again(asked.required, asked.loop.states, asked.horizon, period)
     return kept._replace(asked=asked._replace(required=required)).verdict

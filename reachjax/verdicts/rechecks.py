@@ -114,8 +114,7 @@ def _proved(
     Raises:
         ValueError: the tree is none of the initial set's, or there are not as many climbs as cells.
     """
-    loop, X0 = jax.device_get((asked.loop, asked.X0))
-    cells = _cells(X0, grounds)
+    loop, cells = jax.device_get(asked.loop), _cells(asked.X0, grounds)
     if len(cells) != len(grounds.climbs):
         raise ValueError(f"it has {len(cells)} cells, but {len(grounds.climbs)} proofs")
     found = {(item.name, item.time): (np.inf, True) for item in asked.required}
@@ -180,7 +179,7 @@ def _over(
 ) -> dict[Key, tuple[float, bool]]:
     """The margins over a part of the initial set, by all of the climbs."""
     found: dict[Key, tuple[float, bool]] = {}
-    around = jax.device_get(boxed(jax.device_put(part), "X0"))
+    part, around = jax.device_get((part, boxed(jax.device_put(part), "X0")))
     scenarios = Scenarios.of(loop, part, asked.horizon, asked.start)
     between = any(item.throughout for item in asked.required)
     for item in asked.required:

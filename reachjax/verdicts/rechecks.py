@@ -115,7 +115,7 @@ def _proved(
         ValueError: the tree is none of the initial set's, or there are not as many climbs as cells.
     """
     loop, cells = jax.device_get(asked.loop), _cells(asked.X0, grounds)
-    if len(cells) != len(grounds.climbs):
+    if not cells or len(cells) != len(grounds.climbs):
         raise ValueError(f"it has {len(cells)} cells, but {len(grounds.climbs)} proofs")
     found = {(item.name, item.time): (np.inf, True) for item in asked.required}
     given = zip(_by_forms(loop, asked, cells, grounds), cells, grounds.climbs, strict=True)

@@ -80,6 +80,8 @@ from reachjax.sets import (
     PolyhedralSet,
     Polytope,
     Template,
+    VnnLib,
+    read_vnnlib,
 )
 from reachjax.sets.pictures import plot_set
 from reachjax.solvers import (
@@ -98,13 +100,13 @@ from reachjax.training import (
     unsolved,
     volume_penalty,
 )
-from reachjax.tubes.loading import load
 from reachjax.tubes.partitions import PartitionedTube, plot_tube, reach_partitioned
 from reachjax.tubes.reach import ReachTube, reach, reach_step
 from reachjax.tubes.repeats import DisagreementError
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.verdicts.decide import decide
 from reachjax.verdicts.largest import LargestSet, largest_set
+from reachjax.verdicts.loading import load
 from reachjax.verdicts.soundness import UnsoundError
 from reachjax.verdicts.specification import shortfall
 from reachjax.verdicts.verdict import (
@@ -214,6 +216,7 @@ __all__ = [
     "UnsoundError",
     "Verdict",
     "VerdictStatus",
+    "VnnLib",
     "WinningSet",
     "XLogX",
     "change_of_basis",
@@ -231,6 +234,7 @@ __all__ = [
     "reach",
     "reach_partitioned",
     "reach_step",
+    "read_vnnlib",
     "runge_kutta",
     "shortfall",
     "skip_failures",

@@ -64,8 +64,15 @@ def counterexample(
         drawn = loop.split(scenario)
         if not scenarios.surely_contains(scenario):
             continue
-        part = broken_at(on_host, item, drawn, start)
-        if part is not None:
+        reached = enclosures(on_host, drawn, item.time, start)
+        found_at = broken_at(on_host, item, drawn, start, reached)
+        if found_at is not None:
+            part, last = found_at
+            boxes = [*reached[:-1], last]
+            lower, upper = (
+                np.stack([np.asarray(getattr(box, end)) for box in boxes])
+                for end in ("lower", "upper")
+            )
             _, w, v = drawn
             noises = [None] * (len(states) - 1) if v is None else v
             inputs = [
@@ -75,19 +82,29 @@ def counterexample(
             parts = item.name, item.time, -room, states, np.stack(inputs)
             plant: Any = on_host.plant
             instant = (item.time - 1 + part) * float(plant.period) if plant.continuous else None
-            return Counterexample(*parts, disturbances=w, noises=v, instant=instant)
+            enclosed = {"lower": lower, "upper": upper, "region": item.ball or item.region}
+            return Counterexample(*parts, disturbances=w, noises=v, instant=instant, **enclosed)
     return None
 
 
-def broken_at(loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int) -> float | None:
+def broken_at(
+    loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int, reached: list[Box]
+) -> tuple[float, Box] | None:
     """Where the exact trajectory of a scenario surely breaks a requirement, rounding accounted for.
 
+    Args:
+        loop: of numpy arrays.
+        item: the requirement.
+        scenario: of the trajectory.
+        start: the time of its initial state.
+        reached: boxes around its states, up to the time of the requirement.
+
     Returns:
-        The part of the period before, 1 at the sample; None where that is not known.
+        The part of the period before, 1 at the sample, and a box around the state there; None where
+        that is not known.
     """
-    reached = enclosures(loop, scenario, item.time, start)
     if most_room(item, reached[-1]) < 0:
-        return 1.0
+        return 1.0, reached[-1]
     if not item.throughout:
         return None
     plant: Any = loop.plant
@@ -95,9 +112,9 @@ def broken_at(loop: ClosedLoop, item: Requirement, scenario: Scenario, start: in
     drawn = [None if each is None else each[t] for each in scenario[1:]]
     for part in PARTS:
         shorter = in_numpy(loop.replace(plant=plant.replace(period=part * plant.period)))
-        held = start + t, *drawn
-        if most_room(item, successor_box(shorter, before, *held)) < 0:
-            return part
+        there = successor_box(shorter, before, start + t, *drawn)
+        if most_room(item, there) < 0:
+            return part, there
     return None
 
 

@@ -13,6 +13,7 @@ import contextlib
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -41,6 +42,7 @@ from reachjax.tubes.by_cells import affordable
 from reachjax.tubes.cell_decisions import decided_by_cells
 from reachjax.tubes.cell_tasks import CellTask
 from reachjax.tubes.cell_tree import CellTree
+from reachjax.tubes.closing import closed
 from reachjax.tubes.findings import Findings
 from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.ladder import WORK, Ladder, StepBounds
@@ -156,21 +158,82 @@ def decide(
     whole_number("seed", seed, 0)
     budget, (loop, X0) = Budget.of(time_limit), known_numbers("decide", loop, X0, "X0")
     required = requirements(loop.states, horizon, goal, avoid, safe, period_of(loop))
-    simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     if cells is not None:
-        parts = CellTree.over(X0, cells)
+        CellTree.over(X0, cells)  # its errors come first
         require_executor(executor)
         require_bar(progress)
-        task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
-        return decided_by_cells(task, X0, parts, simulations, budget, executor, progress)
-    decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
-    try:
-        return _by_remedies(decision, loop, X0, horizon, start, required, relaxation, budget)
-    except Interrupted:
-        raise
-    except KeyboardInterrupt:
-        message = "interrupted: this exception's `found` is the verdict so far"
-        raise Interrupted(message, decision.verdict()) from None
+    asked = _Asked(loop, start, relaxation, samples, seed)
+    return asked.decided(X0, horizon, required, budget, cells, executor, progress)
+
+
+class _Asked(NamedTuple):
+    """What is the same for all sets from which requirements are decided.
+
+    Attributes:
+        loop: the closed loop.
+        start: the time of the sets, in a loop that varies in time.
+        relaxation: how many linear programs a bound may take.
+        samples: how many trajectories are simulated.
+        seed: of these.
+    """
+
+    loop: ClosedLoop
+    start: int
+    relaxation: BranchAndCut
+    samples: int
+    seed: int
+
+    def decided(
+        self,
+        X0: AbstractSet,
+        horizon: int,
+        required: list[Requirement],
+        budget: Budget,
+        cells: int | Sequence[int] | None = None,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+    ) -> Verdict:
+        """The verdict, by a set that later states come into where that is proved."""
+        drawn = X0, horizon, self.start, self.samples, self.seed
+        simulations = simulations_from(self.loop, *drawn)
+        by = {"cells": cells, "executor": executor, "progress": progress}
+
+        def first(X: AbstractSet, steps: int, some: list[Requirement], share: Budget) -> Verdict:
+            begun = simulations_from(self.loop, X, steps, *drawn[2:])
+            return self._to_the_end(X, steps, some, share, begun, **by)
+
+        if simulations is not None:
+            given = self.loop, X0, horizon, self.start, required, simulations
+            found = closed(*given, first, self.decided, cells is not None, budget)
+            if found is not None:
+                return found
+        return self._to_the_end(X0, horizon, required, budget, simulations, **by)
+
+    def _to_the_end(
+        self,
+        X0: AbstractSet,
+        horizon: int,
+        required: list[Requirement],
+        budget: Budget,
+        simulations: Simulations | None,
+        cells: int | Sequence[int] | None = None,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+    ) -> Verdict:
+        """The verdict step by step until the horizon."""
+        loop, start, relaxation = self.loop, self.start, self.relaxation
+        if cells is not None:
+            parts = CellTree.over(X0, cells)
+            task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
+            return decided_by_cells(task, X0, parts, simulations, budget, executor, progress)
+        decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
+        try:
+            return _by_remedies(decision, loop, X0, horizon, start, required, relaxation, budget)
+        except Interrupted:
+            raise
+        except KeyboardInterrupt:
+            message = "interrupted: this exception's `found` is the verdict so far"
+            raise Interrupted(message, decision.verdict()) from None
 
 
 def _by_remedies(

@@ -20,16 +20,18 @@ from jaxtyping import Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.numerics.budget import Budget
+from reachjax.numerics.host import in_numpy
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.witnesses import initial_states
 from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope
 from reachjax.tubes.decisions import decide
+from reachjax.tubes.findings import rooms_of
 from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.recurrent_sets import TRAJECTORIES, Candidate, candidate_sets, periods, within
 from reachjax.tubes.refutations import SUSPECTS, counterexample, suspects
-from reachjax.tubes.requirements import AvoidSets, Region, requirements
+from reachjax.tubes.requirements import AvoidSets, Region, Requirement, period_of, requirements
 from reachjax.tubes.soundness import Claim, compiled_runs, require_unbroken, worst_of
 from reachjax.tubes.verdicts import Counterexample, Recurrence, Verdict, VerdictStatus
 
@@ -140,14 +142,16 @@ def _broken_later(
     """
     tried = 0
     size = (runs.scenarios.shape[1] - loop.states) // LONG
-    for item in requirements(loop.states, LONG, None, wanted.avoid or None, wanted.safe):
+    on_host = in_numpy(loop)
+    for item in _for_long(loop, wanted):
         if budget.late:
             return None
         until = runs.states[:, : item.time + 1]
         some = Runs(runs.scenarios, until).some(np.isfinite(until).all(axis=(1, 2)))
         if len(some.states):
             begun = some.scenarios[:, : loop.states + item.time * size]
-            found = suspects(item, item.simulated(some.states), Runs(begun, some.states))
+            cut = Runs(begun, some.states)
+            found = suspects(item, rooms_of(on_host, item, cut, start), cut)
             example = counterexample(loop, X0, found, start)
             tried += len(found)
             if example is not None or tried > SUSPECTS:
@@ -155,11 +159,17 @@ def _broken_later(
     return None
 
 
+def _for_long(loop: ClosedLoop, wanted: Wanted) -> list[Requirement]:
+    """What is wanted at all times of long simulations."""
+    given = None, wanted.avoid or None, wanted.safe
+    return requirements(loop.states, LONG, *given, period_of(loop))
+
+
 def _require_unbroken(
     loop: ClosedLoop, X0: AbstractSet, wanted: Wanted, runs: Runs, start: int
 ) -> None:
     """Raise an error if a trajectory, as JAX runs it, breaks what is proved for all time."""
-    items = requirements(loop.states, LONG, None, wanted.avoid or None, wanted.safe)
+    items = _for_long(loop, wanted)
     scenarios = Scenarios.of(loop, X0, LONG, start)
     rows = worst_of(runs.some(np.isfinite(runs.states).all(axis=(1, 2))), items)
     long_runs = compiled_runs(loop, scenarios, rows, start)

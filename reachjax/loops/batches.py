@@ -73,8 +73,8 @@ def in_between(
     u = loop.input(Batch(states), t, _evaluated, v)
     others, period = [u] if w is None else [u, w], float(plant.period)
     first, last = (
-        period * plant.flow.rate((Batch(x), *others), _evaluated).values
-        for x in (states, following)
+        period * plant.flow_at(time).rate((Batch(x), *others), _evaluated).values
+        for time, x in ((t, states), (t + 1, following))
     )
     found = []
     for s in PARTS:

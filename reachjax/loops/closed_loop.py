@@ -218,6 +218,11 @@ class ClosedLoop(Replaceable):
         return next((part.steps for _, part in self._parts() if part.steps is not None), None)
 
     @property
+    def varies(self) -> bool:
+        """Whether a step depends on its time."""
+        return self.steps is not None or self.plant.clock
+
+    @property
     def is_disturbed(self) -> bool:
         """Whether an initial state leaves open what follows."""
         return self.disturbance is not None or self.noise is not None

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from reachjax.loops.flows.clock import successor_at, timed
 from reachjax.loops.functions import Function
 from reachjax.loops.units import AtUnit, evaluate
-from reachjax.numerics.checks import Numbers, whole_number, within_time_axis
-from reachjax.numerics.pytrees import Replaceable, converted, pytree
+from reachjax.numerics.checks import Numbers, require_kind, whole_number, within_time_axis
+from reachjax.numerics.pytrees import Replaceable, converted, pytree, static
 
 
 class AbstractPlant(Replaceable, abc.ABC):
@@ -46,6 +47,11 @@ class AbstractPlant(Replaceable, abc.ABC):
     @property
     def bends(self) -> bool:
         """Whether its successors bend smoothly by more than the units it has; not here."""
+        return False
+
+    @property
+    def clock(self) -> bool:
+        """Whether it is a function of the time, whatever that is; not here."""
         return False
 
     @property
@@ -216,6 +222,7 @@ class NonlinearPlant(AbstractPlant):
         inputs: how many there are.
         disturbances: how many there are; of none `f` takes two arguments. What they may be the
             `disturbance` of a `ClosedLoop` says.
+        clock: whether `f` has a last argument more, the time: the number of the step.
 
     Raises:
         TypeError: `f` is no function, or contains a primitive that has no bounds, whose line the
@@ -231,17 +238,27 @@ class NonlinearPlant(AbstractPlant):
     """
 
     f: Function
+    clock: bool = static(default=False)
 
     def __init__(
-        self, f: Any, states: int | None = None, inputs: int | None = None, disturbances: int = 0
+        self,
+        f: Any,
+        states: int | None = None,
+        inputs: int | None = None,
+        disturbances: int = 0,
+        clock: bool = False,
     ):
+        require_kind("NonlinearPlant.clock", clock, bool, "True or False")
         if not isinstance(f, Function):
             name = "NonlinearPlant"
             n = whole_number(f"{name}.states", states, 1)
             m = whole_number(f"{name}.inputs", inputs, 1)
             d = whole_number(f"{name}.disturbances", disturbances, 0)
-            f = Function.of(f, (n, m, d) if d else (n, m), n, f"{name}.f")
-        self._set(f=f)
+            sizes = (n, m, *([d] if d else []), *([1] if clock else []))
+            if clock and callable(f):
+                f = timed(f, successor_at)
+            f = Function.of(f, sizes, n, f"{name}.f")
+        self._set(f=f, clock=clock)
 
     def __repr__(self) -> str:
         more = f", disturbances={self.disturbances}" if self.disturbances else ""
@@ -260,19 +277,21 @@ class NonlinearPlant(AbstractPlant):
     @property
     def disturbances(self) -> int:
         """The number `n_w` of disturbances."""
-        return sum(self.f.structure.inputs[2:])
+        return sum(self.f.structure.inputs[2:]) - self.clock
 
     @property
     def steps(self) -> int | None:
-        """No number of steps: the function does not know the time."""
+        """No number of steps: the function is one of any time, if it knows it."""
         return None
 
     def propagate(
         self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
     ) -> Any:
         """The successor of `x` under input `u` and disturbances `w`, for any kind of number."""
-        if not self.disturbances:
-            return self.f.propagate((x, u), unit)
-        if w is None:
-            w = np.zeros((self.disturbances, self.states)) @ x
-        return self.f.propagate((x, u, w), unit)
+        given = [x, u]
+        if self.disturbances:
+            given.append(np.zeros((self.disturbances, self.states)) @ x if w is None else w)
+        if self.clock:
+            xp = jnp if isinstance(t, jax.Array) else np
+            given.append(np.zeros((1, self.states)) @ x + xp.asarray([t], float))
+        return self.f.propagate(tuple(given), unit)

@@ -34,8 +34,8 @@ from reachjax.tubes.verdicts import Recurrence, Verdict
 LONG = 100
 """Shorter horizons are done step by step: what comes back does so after tens of steps."""
 
-PARTS = 1 / 8, 1 / 4, 1 / 2
-"""At these parts of a horizon a set is looked for that holds all later states."""
+EARLIEST = 25
+"""From this step on, and after twice as many each time, a set that holds later states is tried."""
 
 WIDER = 1.5
 """By how much it is larger than what is simulated: bounds of its states are."""
@@ -119,7 +119,7 @@ def closed(
         Interrupted: Ctrl-C.
         UnsoundError: a trajectory breaks what is proved.
     """
-    if loop.steps is not None or horizon < LONG:
+    if loop.varies or horizon < LONG:
         return None
     findings = Findings(loop, X0, horizon, start, required)
     findings.simulate(simulations.runs)
@@ -164,9 +164,11 @@ def _candidates(
 ) -> Iterator[Candidate]:
     """Sets that hold what is simulated from a step on."""
     states = states[np.isfinite(states).all(axis=(1, 2))]
-    if len(states):
-        for part in PARTS:
-            yield from sets_around(loop, states, int(part * horizon), WIDER)
+    step = EARLIEST
+    while len(states) and step <= horizon // 2:
+        # of a polytope forms know the box around it alone
+        yield from reversed([*sets_around(loop, states, step, WIDER)])
+        step *= 2
 
 
 def _for_ever(

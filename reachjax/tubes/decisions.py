@@ -10,6 +10,7 @@ until it is decided. Between its forms and its programs a smooth loop is halved 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -71,6 +72,15 @@ FIRST_PROGRAMS = 50
 FOR_CELLS = 0.5
 """The part of its time that a smooth loop's cells get, by forms; the rest is for programs over the
 whole set, which close what cells do not where much is switched and little is smooth."""
+
+TO_CLOSE = 50
+"""Linear programs that a bound may take from a set that shall be come back to: there are others."""
+
+HALVES = 16
+"""So many cells such a set may be halved into."""
+
+FEW = 200
+"""So many trajectories are simulated from such a set."""
 
 PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
 """How far an initial state is brought towards the middle of the set, so that it surely is in it."""
@@ -204,7 +214,12 @@ class _Asked(NamedTuple):
 
         if simulations is not None:
             given = self.loop, X0, horizon, self.start, required, simulations
-            found = closed(*given, first, self.decided, cells is not None, budget)
+            few = self.relaxation
+            few = dataclasses.replace(
+                few, nodes=min(few.nodes, TO_CLOSE), cells=min(few.cells, HALVES)
+            )
+            later = self._replace(relaxation=few, samples=min(self.samples, FEW)).decided
+            found = closed(*given, first, later, cells is not None, budget)
             if found is not None:
                 return found
         return self._to_the_end(X0, horizon, required, budget, simulations, **by)

@@ -44,8 +44,8 @@ def rooms_of(
     ends = runs.states[:, t], runs.states[:, t + 1]
     with np.errstate(all="ignore"):
         dense = in_between(loop, *ends, start + t, *at)
-    here = dataclasses.replace(item, time=0)
-    return np.fmin.reduce([rooms, *(here.simulated(states[:, None]) for states in dense)])
+    inner = dataclasses.replace(item, time=0).simulated(dense.reshape(-1, 1, dense.shape[-1]))
+    return np.fmin.reduce([rooms, *inner.reshape(len(dense), -1)])
 
 
 class Findings:

@@ -87,11 +87,9 @@ def for_ever(
         UnsoundError: a trajectory breaks what is proved.
     """
     loop, start = tubes[0].loop, tubes[0].start
-    if loop.steps is not None:
-        raise ValueError(
-            f"forever=True is of loops that do not vary in time, but this one is given for "
-            f"{loop.steps} time steps"
-        )
+    if loop.varies:
+        this = f"is given for {loop.steps} time steps" if loop.steps else "has a clock"
+        raise ValueError(f"forever=True is of loops that do not vary in time, but this one {this}")
     if isinstance(avoid, Mapping):
         raise ValueError("with forever=True avoid must be a sequence of sets, for all times")
     if safe is None and not avoid:

@@ -82,13 +82,13 @@ def test_what_leaves_after_the_horizon_is_proved_until_then_and_not_for_ever():
 
 def test_what_is_required_at_one_late_time_is_not_missed():
     loop = turning(0.97)
-    end = np.asarray(loop.simulate(jnp.array([0.35, 0.0]), 150))[-1]
+    end = np.asarray(loop.simulate(jnp.array([0.35, 0.0]), 110))[-1]
     there = rj.Box(end - 1e-3, end + 1e-3)
-    verdict = rj.decide(loop, X0, 150, avoid={150: [there]})
+    verdict = rj.decide(loop, X0, 110, avoid={110: [there]})
     assert verdict.refuted
-    assert verdict.counterexample.time == 150
+    assert verdict.counterexample.time == 110
     beside = rj.Box(end + 0.2, end + 0.3)
-    assert rj.decide(loop, X0, 150, avoid={150: [beside]}).proved
+    assert rj.decide(loop, X0, 110, avoid={110: [beside]}).proved
 
 
 def test_disturbances_that_never_end_are_in_the_set():

@@ -28,6 +28,14 @@ CELL_COLORS = {
 ABOVE = {"loc": "lower center", "bbox_to_anchor": (0.5, 1), "ncols": 3, "frameon": False}
 """A legend that covers nothing."""
 
+SPAN = {"facecolor": "tab:red", "edgecolor": "none", "alpha": 0.15}
+"""Sets that hold all states of a period."""
+
+LINE = {"color": "tab:blue", "linewidth": 0.4, "alpha": 0.6}
+
+LINES, LINE_PARTS = 40, 4
+"""So many trajectories are lines, with so many points a period."""
+
 SAMPLE_STYLE = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
 
 
@@ -97,6 +105,9 @@ def plot_tube(
     coordinates: tuple[int, int] = (0, 1),
 ) -> Axes:
     """Draw the sets of a tube over simulated states: shadows, where there are more than two.
+
+    Of a differential equation what holds the states in between is filled below, and trajectories
+    are lines.
 
     Args:
         tube: of a loop with two or more states.
@@ -179,9 +190,18 @@ def _plot_cell(
     """The sets of one tube over its simulated states, with an entry each in the legend."""
     simulated, initial, certified = labels
     try:
-        trajectories = np.asarray(tube.simulate(samples))[:, :, [i, j]]
+        states = np.asarray(tube.simulate(samples))
+        trajectories = states[:, :, [i, j]]
     except ThinSetError:  # the initial set is too thin to be sampled: the sets alone
-        trajectories = np.zeros((0, tube.horizon + 1, 2))
+        states, trajectories = np.zeros((0, 0, 0)), np.zeros((0, tube.horizon + 1, 2))
+    if tube.loop.plant.continuous:
+        for t, region in enumerate(tube.spans):
+            named = None if t or certified is None else "at all times"
+            plot_set(region, ax, (i, j), **SPAN, label=named)
+        if len(states) and not tube.loop.is_disturbed:
+            first = states[:LINES, 0]
+            dense = tube.loop.simulate(first, tube.horizon, tube.start, parts=LINE_PARTS)
+            ax.plot(*np.asarray(dense)[:, :, [i, j]].T, **LINE)
     for t, region in enumerate(tube.sets):
         ax.scatter(*trajectories[:, t].T, **SAMPLE_STYLE, label=None if t else simulated)
         first = {"edgecolor": "black", "label": initial}

@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.units import UnboundedError
 from reachjax.numerics.budget import Budget
 from reachjax.proofs.witnesses import Simulations
 from reachjax.sets import AbstractSet, PolyhedralSet
+from reachjax.sets.unusable import ThinSetError
 from reachjax.tubes.findings import Findings
 from reachjax.tubes.interruptions import Interrupted
 from reachjax.tubes.recurrent_sets import Candidate, periods, sets_around
@@ -142,7 +142,7 @@ def closed(
             arrives = Requirement(ARRIVES, step, region, True)
             before = [*(item for item in required if item.time <= step), arrives]
             begun = first(X0, step, before, budget)
-        except UnboundedError:
+        except (ThinSetError, ValueError):  # a unit has no bounds from it, or it is no set
             continue
         except Interrupted as error:
             cells = getattr(error.found, "cells", ())

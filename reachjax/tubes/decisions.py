@@ -135,7 +135,9 @@ def decide(
 
     Returns:
         The verdict, with a certificate of each requirement that is proved after the first time, or
-        with what is known of each cell.
+        with what is known of each cell. Of a long horizon whose states come into a set that they
+        come back to, its `recurrence` says where; later times have no certificates of their own,
+        and what is required at the last of them holds for ever.
 
     Raises:
         Interrupted: Ctrl-C; its `found` is the verdict so far.

@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 from reachjax.loops.flows.clock import successor_at, timed
 from reachjax.loops.functions import Function
 from reachjax.loops.units import AtUnit, evaluate
-from reachjax.numerics.checks import Numbers, require_kind, whole_number, within_time_axis
-from reachjax.numerics.pytrees import Replaceable, converted, pytree, static
+from reachjax.numerics.checks import Numbers, whole_number, within_time_axis
+from reachjax.numerics.pytrees import Replaceable, converted, pytree
 
 
 class AbstractPlant(Replaceable, abc.ABC):
@@ -222,7 +222,6 @@ class NonlinearPlant(AbstractPlant):
         inputs: how many there are.
         disturbances: how many there are; of none `f` takes two arguments. What they may be the
             `disturbance` of a `ClosedLoop` says.
-        clock: whether `f` has a last argument more, the time: the number of the step.
 
     Raises:
         TypeError: `f` is no function, or contains a primitive that has no bounds, whose line the
@@ -238,27 +237,42 @@ class NonlinearPlant(AbstractPlant):
     """
 
     f: Function
-    clock: bool = static(default=False)
 
     def __init__(
-        self,
-        f: Any,
-        states: int | None = None,
-        inputs: int | None = None,
-        disturbances: int = 0,
-        clock: bool = False,
+        self, f: Any, states: int | None = None, inputs: int | None = None, disturbances: int = 0
     ):
-        require_kind("NonlinearPlant.clock", clock, bool, "True or False")
         if not isinstance(f, Function):
             name = "NonlinearPlant"
             n = whole_number(f"{name}.states", states, 1)
             m = whole_number(f"{name}.inputs", inputs, 1)
             d = whole_number(f"{name}.disturbances", disturbances, 0)
-            sizes = (n, m, *([d] if d else []), *([1] if clock else []))
-            if clock and callable(f):
-                f = timed(f, successor_at)
-            f = Function.of(f, sizes, n, f"{name}.f")
-        self._set(f=f, clock=clock)
+            f = Function.of(*self._traced(f, (n, m, d) if d else (n, m)), n, f"{name}.f")
+        self._set(f=f)
+
+    def _traced(self, f: Any, sizes: tuple[int, ...]) -> tuple[Any, tuple[int, ...]]:
+        """What is traced, and with vectors of which sizes."""
+        return f, sizes
+
+    @staticmethod
+    def timed(f: Any, states: int, inputs: int, disturbances: int = 0) -> TimedPlant:
+        """The plant `x[t+1] = f(x[t], u[t], t)`, or `f(x[t], u[t], w[t], t)`, that knows the time.
+
+        Args:
+            f: of a state, an input, disturbances if there are any, and the number of the step.
+            states: how many there are.
+            inputs: how many there are.
+            disturbances: how many there are.
+
+        Raises:
+            TypeError: `f` is no function, or contains a primitive that has no bounds.
+            ValueError: `f` cannot be called so, or its result has another shape.
+
+        Example:
+            >>> plant = NonlinearPlant.timed(lambda x, u, t: x + t * u, states=1, inputs=1)
+            >>> plant.propagate(jnp.array([1.0]), jnp.array([0.5]), 3).tolist()
+            [2.5]
+        """
+        return TimedPlant(f, states, inputs, disturbances)
 
     def __repr__(self) -> str:
         more = f", disturbances={self.disturbances}" if self.disturbances else ""
@@ -295,3 +309,22 @@ class NonlinearPlant(AbstractPlant):
             xp = jnp if isinstance(t, jax.Array) else np
             given.append(np.zeros((1, self.states)) @ x + xp.asarray([t], float))
         return self.f.propagate(tuple(given), unit)
+
+
+@pytree
+class TimedPlant(NonlinearPlant):
+    """A plant that knows the number of the step, as `NonlinearPlant.timed` makes it."""
+
+    __init__ = NonlinearPlant.__init__
+
+    def __repr__(self) -> str:
+        return super().__repr__().replace("NonlinearPlant(", "NonlinearPlant.timed(")
+
+    @property
+    def clock(self) -> bool:
+        """Whether it is a function of the time: it is."""
+        return True
+
+    def _traced(self, f: Any, sizes: tuple[int, ...]) -> tuple[Any, tuple[int, ...]]:
+        """The function of a vector of one in place of the time."""
+        return (timed(f, successor_at) if callable(f) else f), (*sizes, 1)

@@ -27,7 +27,7 @@ def loops():
     plants = [
         rj.SampledPlant(forced, 1, 1, H, clock=True),
         rj.SampledPlant(law, 1, 1, H, clock=True),
-        rj.NonlinearPlant(step, 1, 1, clock=True),
+        rj.NonlinearPlant.timed(step, 1, 1),
     ]
     return [rj.ClosedLoop(plant, STILL) for plant in plants]
 
@@ -88,4 +88,4 @@ def test_errors_of_clocks_name_the_argument():
     with pytest.raises(ValueError, match=r"shape \(1,\)"):
         rj.SampledPlant(lambda x, u, t: jnp.array([x[0], t]), 1, 1, H, clock=True)
     with pytest.raises(ValueError, match="cannot be called"):
-        rj.NonlinearPlant(lambda x, u: x, 1, 1, clock=True)
+        rj.NonlinearPlant.timed(lambda x, u: x, 1, 1)

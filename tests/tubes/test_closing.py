@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes import closing
+from reachjax.verdicts import closing
 
 LATER = 1000
 """Steps of simulation, beyond what any proof looks at."""

@@ -33,7 +33,8 @@ from reachjax.loops.flows.taylor_models import (
     straight,
     zeros,
 )
-from reachjax.loops.recording import Recorder
+from reachjax.loops.tracing.recording import Recorder
+from reachjax.loops.tracing.values import UnsupportedError, Value
 from reachjax.loops.units import (
     ISRU,
     AbstractUnit,
@@ -56,7 +57,6 @@ from reachjax.loops.units import (
     XLogX,
     evaluate,
 )
-from reachjax.loops.values import UnsupportedError, Value
 from reachjax.numerics.numbers import AbstractNumber, size, widened
 from reachjax.numerics.rounding import UNIT, Ball, namespace
 

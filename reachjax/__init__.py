@@ -45,6 +45,8 @@ from reachjax.loops import (
     one_of,
     runge_kutta,
     zero_order_hold,
+    delayed,
+    with_inputs,
 )
 from reachjax.methods.affine_forms import AffineForms
 from reachjax.methods.branch_and_cut import Branching
@@ -123,7 +125,9 @@ __version__ = "0.1.0"
 
 def __dir__() -> list[str]:
     """The public names, and no others."""
-    return [*__all__]
+    return [*__all__    "delayed",
+    "with_inputs",
+]
 
 
 __all__ = [

@@ -56,6 +56,10 @@ class AbstractSampledPlant(AbstractPlant):
         """Its flow over the period that begins at a sample; of an equation without clock any."""
         return self.flow
 
+    def beginning(self, x: Any, u: Any) -> tuple[Any, Any]:
+        """What a period begins with, the state and the input that acts: these, if none is late."""
+        return x, u
+
     def shortened(self, part: float) -> AbstractSampledPlant:
         """The plant of a part of each period: what follows a sample after so much of it."""
         return self.replace(period=part * self.period)

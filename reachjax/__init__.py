@@ -42,11 +42,11 @@ from reachjax.loops import (
     Switched,
     Tanh,
     XLogX,
+    delayed,
     one_of,
     runge_kutta,
-    zero_order_hold,
-    delayed,
     with_inputs,
+    zero_order_hold,
 )
 from reachjax.methods.affine_forms import AffineForms
 from reachjax.methods.branch_and_cut import Branching
@@ -125,9 +125,7 @@ __version__ = "0.1.0"
 
 def __dir__() -> list[str]:
     """The public names, and no others."""
-    return [*__all__    "delayed",
-    "with_inputs",
-]
+    return [*__all__]
 
 
 __all__ = [
@@ -221,6 +219,7 @@ __all__ = [
     "XLogX",
     "change_of_basis",
     "decide",
+    "delayed",
     "failures",
     "keep_compilations",
     "largest_set",
@@ -243,5 +242,6 @@ __all__ = [
     "volume",
     "volume_penalty",
     "winning_set",
+    "with_inputs",
     "zero_order_hold",
 ]

@@ -36,8 +36,9 @@ LONG = 100
 EARLIEST = 25
 """From this step on, and after twice as many each time, a set that holds later states is tried."""
 
-WIDER = 1.5
-"""By how much it is larger than what is simulated: bounds of its states are."""
+WIDER, PUSHED = (1.5,), (1.5, 6.0)
+"""By how much it is larger than what is simulated: bounds of its states are. Of a loop with
+disturbances these are several times as large, as none that is drawn is in tune with it."""
 
 ATTEMPTS = 2
 """With so many sets the way of the initial set into them is tried: it is most of the work."""
@@ -165,8 +166,9 @@ def _candidates(
     states = states[np.isfinite(states).all(axis=(1, 2))]
     step = EARLIEST
     while len(states) and step <= horizon // 2:
-        # of a polytope forms know the box around it alone
-        yield from reversed([*sets_around(loop, states, step, WIDER)])
+        for wider in PUSHED if loop.is_disturbed else WIDER:
+            # of a polytope forms know the box around it alone
+            yield from reversed([*sets_around(loop, states, step, wider)])
         step *= 2
 
 

@@ -111,7 +111,7 @@ def broken_at(
     t, before = item.time - 1, reached[-2]
     drawn = [None if each is None else each[t] for each in scenario[1:]]
     for part in PARTS:
-        shorter = in_numpy(loop.replace(plant=plant.replace(period=part * plant.period)))
+        shorter = in_numpy(loop.replace(plant=plant.shortened(part)))
         there = successor_box(shorter, before, start + t, *drawn)
         if most_room(item, there) < 0:
             return part, there
@@ -134,16 +134,24 @@ def deviates(
     """Whether a simulated trajectory leaves the enclosure of a step by more than rounding.
 
     Each step is enclosed from the state that was simulated, so that nothing adds up. Then what was
-    simulated is another loop than what is bounded.
+    simulated is another loop than what is bounded. What is integrated is beside the flow by more
+    than rounding: by about as much as it is beside what twice as many steps say.
     """
     loop, (_, w, v) = in_numpy(loop), scenario
+    plant: Any = loop.plant
+    finer = in_numpy(loop.replace(plant=plant.finer)) if plant.continuous else None
     for t, (x, following) in enumerate(itertools.pairwise(states)):
-        drawn = (None if part is None else part[t] for part in (w, v))
+        drawn = [None if part is None else part[t] for part in (w, v)]
         reached = successor_box(loop, Box(x, x), start + t, *drawn)
         lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
         with np.errstate(over="ignore", invalid="ignore"):
             beyond = np.maximum(lower - following, following - upper)
             slack = TOLERATED * (upper - lower + np.spacing(abs(following)))
+            if finer is not None:
+                one, other = (
+                    each.step(x, start + t, w=drawn[0], v=drawn[1]) for each in (loop, finer)
+                )
+                slack = slack + TOLERATED * np.nan_to_num(abs(other - one), nan=np.inf)
         if np.any(beyond > slack):
             return True
     return False

@@ -5,9 +5,10 @@ On the host step by step in numpy, where nothing is compiled; for traced numbers
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from reachjax.numerics.host import in_numpy
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
 from reachjax.programs.flows import Between
+from reachjax.programs.followed import NoStatesError, Way, ways
 from reachjax.programs.initial import InitialColumns, constant
 from reachjax.sets import AbstractSet, Box
 
@@ -53,6 +55,8 @@ def unrolled(
     slopes: Float[np.ndarray, "N units"] | None = None,
     known: Sequence[Box] | None = None,
     between: bool = False,
+    most: int = 1,
+    wanted: Float[np.ndarray, "N m"] | None = None,
 ) -> Iterator[ByForms]:
     """Bounds of directions of the states after 1, ..., N steps, one step after the other in numpy.
 
@@ -65,6 +69,9 @@ def unrolled(
         slopes: of lines for the units of each step, of which any are sound; None for good ones.
         known: boxes that surely hold the states after each step, where they are known.
         between: whether bounds at all times are asked for, of a differential equation.
+        most: along how many ways of its decisions a loop that jumps is followed.
+        wanted: for each step, bounds of the directions below which nothing is gained; None for
+            bounds that are as good as they can be.
 
     Example:
         >>> from reachjax import MLP, AffinePlant
@@ -76,21 +83,66 @@ def unrolled(
     loop, X0, box, known = map(in_numpy, (loop, X0, box, known))
     with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
         start = InitialColumns.of(X0, box, loop.curved)
-        state = AffineForms.beginning(start)
-    free: list[np.ndarray] = []
-    for k, rows in enumerate(np.asarray(directions)):
-        with np.errstate(all="ignore"):
-            given = None if slopes is None else np.asarray(slopes[k])
-            held = None if known is None else known[k]
-            spans = [] if between else None
-            state, units, _ = step_forms(
-                loop, state, t + k, start, slopes=given, known=held, before=k, spans=spans
-            )
-            found = _bounds(rows, state, units, start, spans)
-            forms = rows @ state
-        here = [layer.places for layer in units if layer.unit.free]
-        free.append(np.concatenate([np.zeros(0, int), *here]))
-        yield found._replace(drawn=tuple(np.sign(forms.columns[:, each]) for each in free))
+    given = loop, start, len(directions), t, most, between, slopes, known
+    for k, found in enumerate(ways(*given)):
+        rows = np.asarray(directions[k])
+        enough = np.full(len(rows), -np.inf) if wanted is None else wanted[k]
+        yield _of_ways(found, rows, start, enough, loop.units)
+
+
+def _of_way(
+    way: Way,
+    rows: Float[np.ndarray, "m n_x"],
+    start: InitialColumns,
+    wanted: Float[np.ndarray, " m"],
+) -> ByForms:
+    """What one way says of the states after a step.
+
+    Raises:
+        NoStatesError: there are none on it.
+    """
+    found, forms = _bounds(rows, way.state, way.units, start, way.spans), rows @ way.state
+    drawn = [np.sign(forms.columns[:, each]) for each in way.free]
+    if len(way.facts):
+        upper, at = way.bounds(forms, start, wanted)
+        known, first = np.isfinite(at).all(axis=1), start.spread.shape[1]
+        corners = found.corners.copy()
+        corners[known] = start.center + at[known, :first] @ start.spread.T
+        drawn = [np.where(known[:, None], at[:, each], one) for each, one in zip(way.free, drawn, strict=True)]
+        found = found._replace(offsets=upper, corners=corners)
+    return found._replace(drawn=tuple(drawn))
+
+
+def _of_ways(
+    found: Sequence[Way],
+    rows: Float[np.ndarray, "m n_x"],
+    start: InitialColumns,
+    wanted: Float[np.ndarray, " m"],
+    units: int,
+) -> ByForms:
+    """What all ways together say of the states after a step: of each direction the largest."""
+    each = list[ByForms]()
+    for way in found:
+        with np.errstate(all="ignore"), contextlib.suppress(NoStatesError):
+            each.append(_of_way(way, rows, start, wanted))
+    if not each:
+        nowhere = np.tile(start.center, (len(rows), 1))
+        return ByForms(np.full(len(rows), -np.inf), np.zeros(units), nowhere)
+    if len(each) == 1:
+        return each[0]
+    uppers = np.array([found.offsets for found in each])
+    deciding = np.where(np.isnan(uppers), np.inf, uppers).argmax(axis=0)
+
+    def of_deciding(values: Callable[[ByForms], Any]) -> Any:
+        both = zip((values(each[number]) for number in deciding), range(len(rows)), strict=True)
+        return np.array([rows_of_one[row] for rows_of_one, row in both])
+
+    drawn = tuple(of_deciding(lambda one, k=k: one.drawn[k]) for k in range(len(each[0].drawn)))
+    between = None
+    if each[0].between is not None:
+        between = np.max([one.between for one in each], axis=0)
+    corners = of_deciding(lambda one: one.corners)
+    return ByForms(uppers.max(axis=0), each[0].slopes, corners, drawn, between)
 
 
 @partial(Compiled, static_argnames=("t", "between"))
@@ -158,7 +210,7 @@ def _bounds(
     state: AffineForms,
     units: tuple[UnitForms, ...],
     start: InitialColumns,
-    spans: list[Between] | None,
+    spans: Sequence[Between] | None,
 ) -> ByForms:
     rows = directions @ state
     xp = jnp if isinstance(rows.rows, jax.Array) else np

@@ -141,6 +141,7 @@ class AbstractUnit(AbstractActivation):
             the input is: then all that there is to know of it is that.
         stated: whether its facts are known of its inputs, so that they count where it is affine.
         closed: whether these bound the free units before it by themselves.
+        jumps: whether its value changes at once where an input changes its sign, and nowhere else.
     """
 
     separable: ClassVar[bool] = True
@@ -149,6 +150,7 @@ class AbstractUnit(AbstractActivation):
     nonexpansive: ClassVar[bool] = True
     free: ClassVar[bool] = False
     stated: ClassVar[bool] = False
+    jumps: ClassVar[bool] = False
     closed: bool = False
 
     @property

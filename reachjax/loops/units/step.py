@@ -54,6 +54,7 @@ class Step(AbstractUnit):
     at_zero: float = 0.0
 
     nonexpansive: ClassVar[bool] = False
+    jumps: ClassVar[bool] = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`1` above zero, `0` below; derivatives are zero."""

@@ -326,8 +326,10 @@ class Recorder:
             limits = self.limits(value)
             ends = {"least": float(limits.least.min()), "most": float(limits.most.max())}
             unit = dataclasses.replace(unit, **ends)
+        elif unit.jumps and not unit.line:
+            unit = dataclasses.replace(unit, line=self.line)
         again = lambda y: self.unit(unit, y)  # noqa: E731
-        step = Step(self._applied(unit), (value.place,), unit=unit, again=again)
+        step = Step(self._applied(unit), (value.place,), unit=unit, again=again, line=self.line)
         return self.layer(value.shape, step, ("unit", unit, value.place))
 
     def _applied(self, unit: AbstractUnit) -> Any:

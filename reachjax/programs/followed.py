@@ -1,9 +1,9 @@
 """Affine forms of a loop that jumps, along every way in which its decisions may go.
 
 Over a set on which a decision is open, forms hold its outcome for any number between its cases, and
-what follows from that is worth little. So forms are made of both: where the input `y` of a unit that
-jumps may have either sign, a **way** forks into one on which `y >= 0` is a fact, and one on which
-`-y >= 0` is. Both hold the tie, so together they leave out no trajectory of the closed law. On
+what follows from that is worth little. So forms are made of both: where the input `y` of a unit
+that jumps may have either sign, a **way** forks into one on which `y >= 0` is a fact, and one on
+which `-y >= 0` is. Both hold the tie, so together they leave out no trajectory of the closed law. On
 either way the unit has one value. Facts are forms too, so with multipliers `lambda >= 0`
 
     r . eta  <=  (r + sum_i lambda_i p_i) . eta
@@ -37,6 +37,24 @@ Signs = dict[tuple[int, int], bool]
 """Which inputs of a step's units are not negative, by layer and number; of others not positive."""
 
 
+class OpenDecision(NamedTuple):
+    """A decision that may go either way.
+
+    Attributes:
+        time: when.
+        line: where a user wrote it, if that is known.
+        room: what is compared is between minus so much and so much, or more.
+    """
+
+    time: int
+    line: str
+    room: float
+
+    def __str__(self) -> str:
+        ends = f"{-self.room:.3g} and {self.room:.3g}"
+        return f"at t = {self.time}{self.line}, of numbers between {ends}"
+
+
 class Way(NamedTuple):
     """One way in which decisions go, so far.
 
@@ -46,7 +64,7 @@ class Way(NamedTuple):
         units: of the last step.
         free: columns of disturbances, of each step.
         spans: what is in between the last two samples, if that is wanted.
-        open: how far each decision of the last step that stayed open is from being known.
+        open: decisions of the last step that stayed so.
     """
 
     state: AffineForms
@@ -54,7 +72,7 @@ class Way(NamedTuple):
     units: tuple[UnitForms, ...] = ()
     free: tuple[np.ndarray, ...] = ()
     spans: tuple[Between, ...] = ()
-    open: tuple[float, ...] = ()
+    open: tuple[OpenDecision, ...] = ()
 
     def bounds(
         self, rows: AffineForms, start: InitialColumns, wanted: Float[np.ndarray, " k"]
@@ -75,6 +93,15 @@ class Way(NamedTuple):
             upper[high] = np.fmin(upper[high], better)
             at[high] = there[:, : at.shape[1]]
         return upper, at
+
+    def on_a_side(self, y: AffineForms, above: bool) -> Way:
+        """The way on which a number is not negative, or not positive.
+
+        What comes next adds columns after those of the number.
+        """
+        width, more = y.columns.shape[1], (y if above else -y) + TINY
+        facts = joined([self.facts.padded(width), more.padded(self.facts.columns.shape[1])])
+        return self._replace(facts=facts, state=self.state.padded(facts.columns.shape[1]))
 
     def _by_facts(
         self, rows: AffineForms, start: InitialColumns
@@ -99,11 +126,12 @@ class _ForkError(Exception):
 
     Args:
         place: of its input, by layer and number.
+        input: the form of that.
     """
 
-    def __init__(self, place: tuple[int, int]):
+    def __init__(self, place: tuple[int, int], input: AffineForms):
         super().__init__(place)
-        self.place = place
+        self.place, self.input = place, input
 
 
 def ways(
@@ -154,13 +182,15 @@ def _followed(
     given: dict[str, Any],
 ) -> list[Way]:
     """The ways that one way forks into in a step, so many more than one at most."""
-    found, waiting = list[Way](), list[Signs]([{}])
+    found, waiting = list[Way](), list[tuple[Way, Signs]]([(way, {})])
     while waiting:
-        signs = waiting.pop()
+        way, signs = waiting.pop()
         try:
             found.append(_advanced(loop, start, way, signs, left > 0, spans, given))
         except _ForkError as fork:
-            waiting += [signs | {fork.place: above} for above in (False, True)]
+            for above in (False, True):
+                known = signs | {fork.place: above}
+                waiting.append((way.on_a_side(fork.input, above), known))
             left -= 1
         except NoStatesError:
             left += 1
@@ -182,31 +212,30 @@ def _advanced(
         NoStatesError: no states have.
         _ForkError: another decision is open.
     """
-    facts, still_open = way.facts, list[float]()
+    here, still_open = way, list[OpenDecision]()
 
     def ranges(
         unit: AbstractUnit | None, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
     ) -> Ends:
-        nonlocal facts
-        if unit is None or not unit.jumps:
+        nonlocal here
+        if unit is None or unit.curved or unit.free or not (unit.jumps or len(here.facts)):
             return ends
-        layer, here = len(found), way._replace(facts=facts)
         lower, upper = np.array(ends[0]), np.array(ends[1])
-        undecided = np.flatnonzero(unit.open(lower, upper))
-        if len(undecided):
-            inputs = y[undecided]
-            most, _ = here.bounds(inputs, start, np.zeros(len(inputs)))
-            least, _ = here.bounds(-inputs, start, np.zeros(len(inputs)))
-            known = lower[undecided], upper[undecided]
-            lower[undecided], upper[undecided] = met(known, (-least, most))
+        inexact = np.flatnonzero(np.tile(unit.open(lower, upper), unit.inputs))
+        if len(inexact) and len(here.facts):
+            inputs, known = y[inexact], (lower[inexact], upper[inexact])
+            both = joined([inputs, -inputs])
+            most, least = np.split(here.bounds(both, start, np.full(len(both), -np.inf))[0], 2)
+            lower[inexact], upper[inexact] = met(known, (-least, most))
+        if not unit.jumps:
+            return lower, upper
+        layer = len(found)
         for (at, entry), above in signs.items():
             if at != layer:
                 continue
             if (upper[entry] <= -TINY) if above else (lower[entry] >= TINY):
                 raise NoStatesError
-            own = y[entry : entry + 1] if above else -y[entry : entry + 1]
-            width = max(own.columns.shape[1], facts.columns.shape[1])
-            facts = joined([facts.padded(width), (own + TINY).padded(width)])
+            here = here.on_a_side(y[entry : entry + 1], above)
             if above:
                 lower[entry] = max(lower[entry], TINY)
                 upper[entry] = max(lower[entry], upper[entry])
@@ -216,8 +245,9 @@ def _advanced(
         undecided = np.flatnonzero(unit.open(lower, upper))
         room = np.fmin(-lower, upper)[undecided]
         if len(undecided) and forks and np.isfinite(room).all():
-            raise _ForkError((layer, int(undecided[room.argmax()])))
-        still_open.extend(room.tolist())
+            entry = int(undecided[room.argmax()])
+            raise _ForkError((layer, entry), y[entry : entry + 1])
+        still_open.extend(OpenDecision(given["t"], unit.line, each) for each in room.tolist())
         return lower, upper
 
     found: list[Between] | None = [] if spans else None
@@ -228,9 +258,8 @@ def _advanced(
     drawn = [layer.places for layer in units if layer.unit.free]
     free = (*way.free, np.concatenate([np.zeros(0, int), *drawn]))
     width = state.columns.shape[1]
-    return Way(
-        state, facts.padded(width), units, free, tuple(found or ()), tuple(still_open)
-    )
+    facts = here.facts.padded(width)
+    return Way(state, facts, units, free, tuple(found or ()), tuple(still_open))
 
 
 def _weighed(
@@ -284,3 +313,13 @@ def _largest(
     at = np.sign(objective)
     at[:, used] = result.x[: count * len(used)].reshape(count, len(used))
     return duals * scale[:, None] / size, at
+
+
+def open_decisions(layers: Sequence[UnitForms], t: int) -> tuple[OpenDecision, ...]:
+    """The decisions of a step that may go either way."""
+    found = list[OpenDecision]()
+    for layer in layers:
+        if layer.unit.jumps:
+            room = np.fmin(-layer.lower, layer.upper)[layer.unit.open(layer.lower, layer.upper)]
+            found += [OpenDecision(t, layer.unit.line, each) for each in room.tolist()]
+    return tuple(found)

@@ -21,7 +21,7 @@ from reachjax.numerics.host import in_numpy
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
 from reachjax.programs.flows import Between
-from reachjax.programs.followed import NoStatesError, Way, ways
+from reachjax.programs.followed import NoStatesError, OpenDecision, Way, ways
 from reachjax.programs.initial import InitialColumns, constant
 from reachjax.sets import AbstractSet, Box
 
@@ -37,6 +37,8 @@ class ByForms(NamedTuple):
         drawn: for each step so far the values `(m, d)` of disturbances there; nothing of compiled
             code.
         between: `(m,)`, upper bounds at all times since the sample before, if they are asked for.
+        open: decisions of the step that may go either way, none of compiled code.
+        ways: along how many ways of decisions that is so.
     """
 
     offsets: Float[Array | np.ndarray, "*N m"]
@@ -44,6 +46,8 @@ class ByForms(NamedTuple):
     corners: Float[Array | np.ndarray, "*N m n_x"]
     drawn: tuple[Float[np.ndarray, "m d"], ...] = ()
     between: Float[Array | np.ndarray, "*N m"] | None = None
+    open: tuple[OpenDecision, ...] = ()
+    ways: int = 1
 
 
 def unrolled(
@@ -80,6 +84,27 @@ def unrolled(
         >>> [step.offsets.round(6).tolist() for step in unrolled(loop, X0, X0, np.ones((2, 1, 1)))]
         [[1.2], [0.72]]
     """
+    given = loop, X0, box, directions, t, slopes, known, between, most, wanted
+    for found in along_ways(*given):
+        yield _together(found)
+
+
+def along_ways(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[np.ndarray, "N m n_x"],
+    t: int = 0,
+    slopes: Float[np.ndarray, "N units"] | None = None,
+    known: Sequence[Box] | None = None,
+    between: bool = False,
+    most: int = 1,
+    wanted: Float[np.ndarray, "N m"] | None = None,
+) -> Iterator[list[ByForms]]:
+    """What `unrolled` says, of each way in which decisions go; arguments are the same.
+
+    At least one way is given, which says minus infinity should there be no states at all.
+    """
     loop, X0, box, known = map(in_numpy, (loop, X0, box, known))
     with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
         start = InitialColumns.of(X0, box, loop.curved)
@@ -87,7 +112,12 @@ def unrolled(
     for k, found in enumerate(ways(*given)):
         rows = np.asarray(directions[k])
         enough = np.full(len(rows), -np.inf) if wanted is None else wanted[k]
-        yield _of_ways(found, rows, start, enough, loop.units)
+        each = list[ByForms]()
+        for way in found:
+            with np.errstate(all="ignore"), contextlib.suppress(NoStatesError):
+                each.append(_of_way(way, rows, start, enough))
+        nowhere = np.tile(start.center, (len(rows), 1))
+        yield each or [ByForms(np.full(len(rows), -np.inf), np.zeros(loop.units), nowhere)]
 
 
 def _of_way(
@@ -108,41 +138,32 @@ def _of_way(
         known, first = np.isfinite(at).all(axis=1), start.spread.shape[1]
         corners = found.corners.copy()
         corners[known] = start.center + at[known, :first] @ start.spread.T
-        drawn = [np.where(known[:, None], at[:, each], one) for each, one in zip(way.free, drawn, strict=True)]
+        drawn = [
+            np.where(known[:, None], at[:, each], one)
+            for each, one in zip(way.free, drawn, strict=True)
+        ]
         found = found._replace(offsets=upper, corners=corners)
-    return found._replace(drawn=tuple(drawn))
+    return found._replace(drawn=tuple(drawn), open=way.open)
 
 
-def _of_ways(
-    found: Sequence[Way],
-    rows: Float[np.ndarray, "m n_x"],
-    start: InitialColumns,
-    wanted: Float[np.ndarray, " m"],
-    units: int,
-) -> ByForms:
-    """What all ways together say of the states after a step: of each direction the largest."""
-    each = list[ByForms]()
-    for way in found:
-        with np.errstate(all="ignore"), contextlib.suppress(NoStatesError):
-            each.append(_of_way(way, rows, start, wanted))
-    if not each:
-        nowhere = np.tile(start.center, (len(rows), 1))
-        return ByForms(np.full(len(rows), -np.inf), np.zeros(units), nowhere)
+def _together(each: Sequence[ByForms]) -> ByForms:
+    """What all ways together say: of each direction the largest."""
     if len(each) == 1:
         return each[0]
     uppers = np.array([found.offsets for found in each])
     deciding = np.where(np.isnan(uppers), np.inf, uppers).argmax(axis=0)
 
     def of_deciding(values: Callable[[ByForms], Any]) -> Any:
-        both = zip((values(each[number]) for number in deciding), range(len(rows)), strict=True)
-        return np.array([rows_of_one[row] for rows_of_one, row in both])
+        return np.array([values(each[number])[row] for row, number in enumerate(deciding)])
 
     drawn = tuple(of_deciding(lambda one, k=k: one.drawn[k]) for k in range(len(each[0].drawn)))
     between = None
     if each[0].between is not None:
         between = np.max([one.between for one in each], axis=0)
     corners = of_deciding(lambda one: one.corners)
-    return ByForms(uppers.max(axis=0), each[0].slopes, corners, drawn, between)
+    decisions = tuple(decision for one in each for decision in one.open)
+    uppers = uppers.max(axis=0)
+    return ByForms(uppers, each[0].slopes, corners, drawn, between, decisions, len(each))
 
 
 @partial(Compiled, static_argnames=("t", "between"))

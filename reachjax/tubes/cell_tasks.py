@@ -21,9 +21,10 @@ from reachjax.numerics.budget import Budget
 from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet, Box
 from reachjax.sets.balance import balanced
+from reachjax.tubes.by_cells import WAYS
 from reachjax.tubes.ladder import WORK, Ladder
 from reachjax.tubes.requirements import Requirement
-from reachjax.tubes.sieve import Margins, Outcome, Unbounded, no_margins
+from reachjax.tubes.sieve import Margins, Outcome, Sieve, Unbounded, no_margins
 from reachjax.tubes.steps import boxed
 from reachjax.tubes.targets import target_of, values_of
 
@@ -51,6 +52,11 @@ class CellTask(NamedTuple):
         layers = self.loop.unit_layers
         return self.nodes > 0 and not all(each.unit.curved for each in layers)
 
+    @property
+    def follows(self) -> bool:
+        """Whether forms along the ways of decisions may prove what forms do not."""
+        return self.loop.curved and self.loop.jumps and not self.by_programs
+
 
 @lenient
 def outcome_of(
@@ -74,6 +80,10 @@ def outcome_of(
     margins = {name: row.copy() for name, row in begun.items()}
     with jax.enable_x64(True):
         try:
+            if task.follows and not any(broken):
+                sieve = Sieve(task.loop, task.horizon, task.start, task.required)
+                around = jax.device_get(boxed(jax.device_put(part), "X0"))
+                return sieve.followed(part, around, WAYS, budget)
             return _climbed(task, part, budget, margins, known is not None, broken)
         except UnboundedError as error:
             return Outcome(False, margins, unbounded=Unbounded.of(error))

@@ -32,6 +32,7 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
+from reachjax.programs.followed import OpenDecision, open_decisions
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate
 from reachjax.proofs.proposal import SolverStatus
@@ -256,6 +257,7 @@ class _Decision:
         self._findings = Findings(loop, X0, horizon, start, required)
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
         self._ends: dict[tuple[str, int], np.ndarray] = {}
+        self._decisions: tuple[OpenDecision, ...] = ()
         self.simulations = simulations
         if simulations is not None:
             self._findings.simulate(simulations.runs)
@@ -273,7 +275,8 @@ class _Decision:
         """
         self._require_unbroken()
         ends = Counter(SolverStatus(int(code)) for codes in self._ends.values() for code in codes)
-        return self._findings.verdict(dict(ends), certificates=self._certificates)
+        more = {"certificates": self._certificates, "decisions": self._decisions}
+        return self._findings.verdict(dict(ends), **more)
 
     def _require_unbroken(self) -> None:
         """Raise an error if a trajectory, as JAX runs it, breaks what is proved."""
@@ -300,8 +303,10 @@ class _Decision:
             tighten: whether the ranges of units are bounded by linear programs.
         """
         last = max(time for _, time in self._findings.open)
+        self._decisions = ()
         for k in range(1, last + 1):
             ladder.advance(tighten)
+            self._decisions += open_decisions(ladder.horizon.steps[-1], self._start + k - 1)
             if self._budget.overdue:
                 return
             for key, item in list(self._findings.open.items()):

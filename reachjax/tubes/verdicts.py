@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from reachjax.programs.followed import OpenDecision
 from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.proofs.proposal import AS_ASKED, SolverStatus
 from reachjax.sets import PolyhedralSet
@@ -49,6 +50,8 @@ class Counterexample:
         noises: `(horizon, n_x)`; None of a loop without.
         instant: when, in the plant's units of time, of a differential equation: it may be in
             between the sample at `time` and the one before.
+        decision: of a loop that jumps, by how much the closest of the decisions on the trajectory
+            wins up to `time`: the size of what is compared with zero, more than its rounding.
     """
 
     requirement: str
@@ -59,6 +62,7 @@ class Counterexample:
     disturbances: Float[np.ndarray, "h n_w"] | None = None
     noises: Float[np.ndarray, "h n_x"] | None = None
     instant: float | None = None
+    decision: float | None = None
 
 
 class DecidedCell(NamedTuple):
@@ -115,6 +119,8 @@ class Verdict:
             by its name and its time.
         cells: of a decision by cells, what is known of each, see `plot_cells`.
         recurrence: of a statement for all time, what it rests on, or what came nearest to that.
+        decisions: of a loop that jumps, those that may go either way over the initial set, or over
+            cells of it that are not proved.
     """
 
     status: VerdictStatus
@@ -125,6 +131,7 @@ class Verdict:
     certificates: Mapping[tuple[str, int], AbstractProof] = dataclasses.field(default_factory=dict)
     cells: tuple[DecidedCell, ...] = ()
     recurrence: Recurrence | None = None
+    decisions: tuple[OpenDecision, ...] = ()
 
     @property
     def proved(self) -> bool:
@@ -194,6 +201,11 @@ class Verdict:
                 f"  counterexample: from {np.round(e.states[0], 4).tolist()} it breaks "
                 f"{e.requirement} at t = {e.time} by {e.violation:.4g}{_drawn(e)}"
             )
+            if e.decision is not None:
+                lines.append(f"    its closest decision wins by {e.decision:.3g}")
+        if self.decisions and self.unknown:
+            closest = max(self.decisions, key=lambda decision: decision.room)
+            lines.append(f"  {len(self.decisions)} decisions stay open; widest {closest}")
         if self.cells:
             counts = [sum(each.status is status for each in self.cells) for status in VerdictStatus]
             proved, refuted, unknown = counts

@@ -17,7 +17,7 @@ import mpmath
 import numpy as np
 
 import reachjax as rj
-from tests.campaign.functions import by_cases, masses
+from tests.campaign.functions import by_cases, masses, switched, switched_waves
 from tests.campaign.oracle import WIDE, Region, exact
 from tests.input_polytopes import exact_multipliers
 
@@ -124,6 +124,7 @@ class Kind:
         facets: of a polytope of inputs; 0 for a box.
         skips: whether the network is traced, with a connection that skips it.
         horizon: the number of steps.
+        jumps: whether decisions of the plant are tied in the middle of the initial box.
     """
 
     name: str
@@ -139,6 +140,7 @@ class Kind:
     facets: int = 0
     skips: bool = False
     horizon: int = 2
+    jumps: bool = False
 
     @property
     def loop(self) -> tuple:
@@ -147,6 +149,7 @@ class Kind:
 
 
 BOXES, ROUND = ("box", "varying", "polytope"), ("ellipsoid", "box")
+EDGED = ("box", "flat", "point")
 OCTAGONAL, PAIRS = rj.Template.octagonal, rj.Template.regular
 
 KINDS = (
@@ -166,6 +169,8 @@ KINDS = (
     Kind("relu, round", affine, "relu", disturbed=ROUND, initial=("ellipsoid", "box"), horizon=3),
     Kind("by cases", by_cases, "tanh"),
     Kind("masses", masses, "relu", hidden=(4,)),
+    Kind("switched", switched, "relu", initial=EDGED, template=OCTAGONAL, jumps=True),
+    Kind("switched waves", switched_waves, "tanh", initial=EDGED, jumps=True),
     Kind("tanh, to balls", affine, "tanh", template=lambda n: rj.EllipsoidTemplate(), horizon=1),
 )
 
@@ -341,6 +346,10 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
         p["A"] = np.eye(n) + rng.normal(size=(n, n)) * 10 ** rng.uniform(-2, 0)
         p["B"] = rng.normal(size=(n, n_u))
         p["E"] = rng.normal(size=(n, n_w))
+    region = str(rng.choice(kind.initial))
+    X0 = _initial(region, n, rng)
+    if kind.jumps:
+        p["at"] = np.array(X0.center[:1])
     W = _disturbances(kind, n_w, rng) if kind.disturbed else None
     noise = rj.Box(*_ends(rng, n, 0.02)) if kind.noisy else None
     inputs, allowed = _inputs(kind, rng)
@@ -356,8 +365,6 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
         f = jax.tree_util.Partial(step, p)
         plant = rj.NonlinearPlant(f, n, n_u, disturbances=n_w if W is not None else 0)
     loop = rj.ClosedLoop(plant, net, allowed, disturbance=W, noise=noise)
-    region = str(rng.choice(kind.initial))
-    X0 = _initial(region, n, rng)
     gap = float(rng.choice([1e-4, 1e-2, 0.1]))
     relaxation: Any = rj.BranchAndCut(nodes=int(rng.choice([0, 3, 40])))
     if rng.random() < 0.25:

@@ -3,8 +3,8 @@
 Over a set on which a decision is open, forms hold its outcome for any number between its cases, and
 what follows from that is worth little. So forms are made of both: where the input `y` of a unit
 that jumps may have either sign, a **way** forks into one on which `y >= 0` is a fact, and one on
-which `-y >= 0` is. Both hold the tie, so together they leave out no trajectory of the closed law. On
-either way the unit has one value. Facts are forms too, so with multipliers `lambda >= 0`
+which `-y >= 0` is. Both hold the tie, so together they leave out no trajectory of the closed law.
+On either way the unit has one value. Facts are forms too, so with multipliers `lambda >= 0`
 
     r . eta  <=  (r + sum_i lambda_i p_i) . eta
 

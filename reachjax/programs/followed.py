@@ -33,8 +33,9 @@ from reachjax.programs.flows import Between
 from reachjax.programs.initial import Ends, InitialColumns, met
 from reachjax.sets import Box
 
-Signs = dict[tuple[int, int], bool]
-"""Which inputs of a step's units are not negative, by layer and number; of others not positive."""
+Signs = dict[tuple[int, int], tuple[bool, float]]
+"""By layer and number, whether an input of a step's units is not negative, or is not positive, and
+how far it might be on both sides."""
 
 
 class OpenDecision(NamedTuple):
@@ -64,7 +65,7 @@ class Way(NamedTuple):
         units: of the last step.
         free: columns of disturbances, of each step.
         spans: what is in between the last two samples, if that is wanted.
-        open: decisions of the last step that stayed so.
+        open: decisions of the last step that may go either way, or did until it forked.
     """
 
     state: AffineForms
@@ -127,11 +128,12 @@ class _ForkError(Exception):
     Args:
         place: of its input, by layer and number.
         input: the form of that.
+        room: how far it may be on both sides.
     """
 
-    def __init__(self, place: tuple[int, int], input: AffineForms):
+    def __init__(self, place: tuple[int, int], input: AffineForms, room: float):
         super().__init__(place)
-        self.place, self.input = place, input
+        self.place, self.input, self.room = place, input, room
 
 
 def ways(
@@ -189,7 +191,7 @@ def _followed(
             found.append(_advanced(loop, start, way, signs, left > 0, spans, given))
         except _ForkError as fork:
             for above in (False, True):
-                known = signs | {fork.place: above}
+                known = signs | {fork.place: (above, fork.room)}
                 waiting.append((way.on_a_side(fork.input, above), known))
             left -= 1
         except NoStatesError:
@@ -230,9 +232,10 @@ def _advanced(
         if not unit.jumps:
             return lower, upper
         layer = len(found)
-        for (at, entry), above in signs.items():
+        for (at, entry), (above, size) in signs.items():
             if at != layer:
                 continue
+            still_open.append(OpenDecision(given["t"], unit.line, size))
             if (upper[entry] <= -TINY) if above else (lower[entry] >= TINY):
                 raise NoStatesError
             here = here.on_a_side(y[entry : entry + 1], above)
@@ -246,7 +249,7 @@ def _advanced(
         room = np.fmin(-lower, upper)[undecided]
         if len(undecided) and forks and np.isfinite(room).all():
             entry = int(undecided[room.argmax()])
-            raise _ForkError((layer, entry), y[entry : entry + 1])
+            raise _ForkError((layer, entry), y[entry : entry + 1], float(room.max()))
         still_open.extend(OpenDecision(given["t"], unit.line, each) for each in room.tolist())
         return lower, upper
 

@@ -161,7 +161,7 @@ def _together(each: Sequence[ByForms]) -> ByForms:
     if each[0].between is not None:
         between = np.max([one.between for one in each], axis=0)
     corners = of_deciding(lambda one: one.corners)
-    decisions = tuple(decision for one in each for decision in one.open)
+    decisions = tuple(dict.fromkeys(decision for one in each for decision in one.open))
     uppers = uppers.max(axis=0)
     return ByForms(uppers, each[0].slopes, corners, drawn, between, decisions, len(each))
 

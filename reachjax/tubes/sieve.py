@@ -232,29 +232,26 @@ class Sieve:
             UnboundedError: a unit has no bounds over it.
         """
         items, horizon = [rows.item for rows in self._rows], len(self._directions) - 1
-        margins, still_open = no_margins(items, horizon), list[OpenDecision]()
+        margins, still_open = no_margins(items, horizon), dict[OpenDecision, None]()
         first = ByForms(_at_first(self._directions[0], box.lower[None], box.upper[None])[0], (), ())
         between = self._whole is not None
         whole = np.asarray(self._whole) if between else np.zeros(self._later.shape[:2], bool)
         given = self._on_host, part, box, self._directions[1:], self._start
         later = along_ways(*given, between=between, most=most)
         for k, each in enumerate(itertools.chain([[first]], later)):
-            still_open += [decision for one in each for decision in one.open]
+            still_open |= dict.fromkeys(decision for one in each for decision in one.open)
+            uppers = [one.offsets for one in each]
+            if between and k:
+                both = zip((one.between for one in each), uppers, strict=True)
+                uppers = [np.where(whole[k - 1], *pair) for pair in both]
+            uppers = [upper for upper in uppers if not np.isneginf(upper).all()]  # no states
             for rows in self._rows:
-                if rows.item.time != k:
-                    continue
-                found = [
-                    rows.judged(
-                        np.where(whole[k - 1], one.between, one.offsets)
-                        if between and k
-                        else one.offsets
-                    )
-                    for one in each
-                ]
-                margin, row = min(margin for *_, margin in found), margins[rows.item.name]
-                row[k] = margin
-                if not all(holds for holds, *_ in found):
-                    return Outcome(False, margins, open=tuple(still_open))
+                if rows.item.time == k:
+                    found = [rows.judged(upper) for upper in uppers]
+                    least = min((margin for *_, margin in found), default=np.inf)
+                    margins[rows.item.name][k] = least
+                    if not all(holds for holds, *_ in found):
+                        return Outcome(False, margins, open=tuple(still_open))
             if budget.overdue:
                 return Outcome(False, margins, open=tuple(still_open))
         return Outcome(True, margins)

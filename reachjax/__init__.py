@@ -46,7 +46,13 @@ from reachjax.loops import (
     runge_kutta,
     zero_order_hold,
 )
+from reachjax.methods.affine_forms import AffineForms
+from reachjax.methods.branch_and_cut import Branching
+from reachjax.methods.cells import Cells
+from reachjax.methods.problem import AbstractMethod, Problem, ReachSet
+from reachjax.methods.recursion import Recursion
 from reachjax.numerics.archives import UnreadableError
+from reachjax.numerics.budget import Interrupted
 from reachjax.numerics.compilations import keep_compilations
 from reachjax.programs.basis import ChangeOfBasis, change_of_basis
 from reachjax.programs.relaxations import (
@@ -59,12 +65,9 @@ from reachjax.programs.relaxations import (
     PaperQC,
 )
 from reachjax.proofs.branches import BranchCertificate, Rung
-from reachjax.proofs.cells import CellCertificate
+from reachjax.proofs.by_forms import CellCertificate, LinearCertificate
+from reachjax.proofs.by_products import Certificate, EllipsoidCertificate, MixedCertificate
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
-from reachjax.proofs.ellipsoids import EllipsoidCertificate
-from reachjax.proofs.facets import Certificate
-from reachjax.proofs.linear import LinearCertificate
-from reachjax.proofs.mixed import MixedCertificate
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import (
     AbstractSet,
@@ -78,6 +81,7 @@ from reachjax.sets import (
     Polytope,
     Template,
 )
+from reachjax.sets.pictures import plot_set
 from reachjax.solvers import (
     SCS,
     AbstractSolver,
@@ -94,32 +98,25 @@ from reachjax.training import (
     unsolved,
     volume_penalty,
 )
-from reachjax.tubes.by_branching import Branching
-from reachjax.tubes.by_cells import Cells
-from reachjax.tubes.by_forms import AffineForms
-from reachjax.tubes.by_programs import Recursion
-from reachjax.tubes.decisions import decide
-from reachjax.tubes.disagreements import DisagreementError
-from reachjax.tubes.interruptions import Interrupted
-from reachjax.tubes.largest import LargestSet, largest_set
 from reachjax.tubes.loading import load
-from reachjax.tubes.methods import AbstractMethod, Problem, ReachSet
-from reachjax.tubes.partitions import PartitionedTube, reach_partitioned
-from reachjax.tubes.plotting import plot_cells, plot_set, plot_tube
+from reachjax.tubes.partitions import PartitionedTube, plot_tube, reach_partitioned
 from reachjax.tubes.reach import ReachTube, reach, reach_step
-from reachjax.tubes.requirements import shortfall
+from reachjax.tubes.repeats import DisagreementError
 from reachjax.tubes.sizes import log_volume, log_widths, volume
-from reachjax.tubes.soundness import UnsoundError
-from reachjax.tubes.specs import verify
-from reachjax.tubes.verdicts import (
+from reachjax.verdicts.decide import decide
+from reachjax.verdicts.largest import LargestSet, largest_set
+from reachjax.verdicts.soundness import UnsoundError
+from reachjax.verdicts.specification import shortfall
+from reachjax.verdicts.verdict import (
     Counterexample,
     DecidedCell,
     Recurrence,
     Verdict,
     VerdictStatus,
 )
-from reachjax.tubes.winning import winning_set
-from reachjax.tubes.winning_sets import WinningSet
+from reachjax.verdicts.verify import verify
+from reachjax.verdicts.winning import winning_set
+from reachjax.verdicts.winning_sets import WinningSet, plot_cells
 
 __version__ = "0.1.0"
 

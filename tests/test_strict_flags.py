@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes import propagation
+from reachjax.methods import propagation
 
 NET = rj.MLP.from_layers([([[0.5, -0.4], [0.2, 0.1]], [0.1, 0.0]), ([[-0.4, 0.3]], [0.05])])
 PLANT = rj.AffinePlant([[0.9, 0.2], [-0.1, 0.8]], [[0.0], [0.3]])

@@ -6,12 +6,14 @@ from pathlib import Path
 
 ROOMS = (
     ("numerics", "checks, pytrees, rounding, the seam to the host"),
-    ("sets", "boxes, polytopes, ellipsoids, templates, linear programs"),
+    ("sets", "boxes, polytopes, ellipsoids, templates, hulls, pictures"),
     ("loops", "units, networks, plants, the closed loop: it simulates itself"),
     ("programs", "rows, bounds, facts, relaxations, windows, the one formula"),
-    ("proofs", "the recheck, certificates, witnesses"),
+    ("proofs", "the recheck, certificates"),
     ("solvers", "Clarabel, others by cvxpy, the interior-point method, cuts"),
-    ("tubes", "the step, reach, partitions, specifications, sizes, plots"),
+    ("methods", "affine forms, recursion, branch and cut, cells, witnesses"),
+    ("tubes", "reach, partitions, files, sizes, tables"),
+    ("verdicts", "specifications, counterexamples, winning sets, invariance"),
     ("training", "penalties, schedule, failures"),
 )
 TRUSTED = 5

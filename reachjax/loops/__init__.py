@@ -1,12 +1,15 @@
 """What is verified: units, networks, plants and the loop they close."""
 
 from reachjax.loops.closed_loop import ClosedLoop
-from reachjax.loops.discretisation import runge_kutta, zero_order_hold
-from reachjax.loops.networks import MLP, AbstractNetwork, Network
-from reachjax.loops.plants import AbstractPlant, AffinePlant, NonlinearPlant
-from reachjax.loops.residual import Residual
+from reachjax.loops.networks import MLP, AbstractNetwork, Network, Residual, Switched, one_of
+from reachjax.loops.plants import (
+    AbstractPlant,
+    AffinePlant,
+    NonlinearPlant,
+    runge_kutta,
+    zero_order_hold,
+)
 from reachjax.loops.sampled import SampledPlant
-from reachjax.loops.switching import Switched, one_of
 from reachjax.loops.units import (
     ISRU,
     AbstractActivation,

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.loops.draws import drawn
-from reachjax.loops.functions import Compiled
 from reachjax.loops.input_polytope import InputPolytope, input_set
 from reachjax.loops.networks import AbstractNetwork
 from reachjax.loops.plants import AbstractPlant
+from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units import AbstractUnit, AtUnit, clipped, evaluate, projected
 from reachjax.numerics.checks import (
     Numbers,

@@ -3,6 +3,11 @@
 The forward pass is written once, for any kind of number: `propagate` is given what to do at a
 nonlinear layer. With plain evaluation it is the network; with intervals or rows over a basis it
 yields bounds and the program that certifies the loop.
+
+A residual network adds to a linear map of its input, `pi(x) = S x + net(x)`. A switched controller
+is a function of JAX: which network acts is a place, such as `jnp.argmax` of the entries of a state
+that hold the last decision; a disturbance chooses among some vectors by the largest of as many
+numbers.
 """
 
 from __future__ import annotations
@@ -13,12 +18,14 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from reachjax.loops.functions import Function
+from reachjax.loops.tracing.functions import Function
 from reachjax.loops.units import AbstractActivation, AtUnit, ReLU, evaluate
-from reachjax.numerics.checks import Numbers, same_size, whole_number
-from reachjax.numerics.files import existing_file
+from reachjax.numerics.archives import existing_file
+from reachjax.numerics.checks import Numbers, described, require_kind, same_size, whole_number
 from reachjax.numerics.pytrees import Replaceable, converted, pytree, static
 
 
@@ -144,7 +151,7 @@ class MLP(AbstractNetwork):
             ValueError: it holds something else than a chain of linear layers, or computes something
                 else, or the order of its layers or the activation cannot be told.
         """
-        from reachjax.loops.formats.flax_layers import flax_layers, read_activation
+        from reachjax.loops.readers.flax_layers import flax_layers, read_activation
 
         known = read_activation(activation)
         read = flax_layers(source, known, module)
@@ -226,7 +233,7 @@ class Network(AbstractNetwork):
             >>> Network.from_file(path)([-3.0]).tolist()  # |x|
             [3.0]
         """
-        from reachjax.loops.formats.chains import ENDINGS, read_chain
+        from reachjax.loops.readers.chains import ENDINGS, read_chain
 
         path = existing_file("path", path)
         if path.suffix == ".onnx":
@@ -270,7 +277,7 @@ class Network(AbstractNetwork):
             TypeError: an operator's function has no bounds, or a name is no text.
             ValueError: it is no ONNX file, or is not understood; the error names the node.
         """
-        from reachjax.loops.formats.onnx_graphs import culprit, read_graph
+        from reachjax.loops.readers.onnx_graphs import culprit, read_graph
 
         path = existing_file("path", path)
         for name, value in (("inputs", inputs), ("output", output)):
@@ -299,3 +306,126 @@ class Network(AbstractNetwork):
     def propagate(self, x: Any, unit: AtUnit) -> Any:
         """The forward pass over any kind of number, with `unit` at each layer of units."""
         return self.f.propagate((x,), unit)
+
+
+@pytree
+class Residual(AbstractNetwork):
+    """`skip x + net(x)`. Networks may be nested: `net` may have such connections itself.
+
+    Args:
+        net: the network around which the connection skips.
+        skip: `(outputs, inputs)`; the identity when left out.
+
+    Raises:
+        TypeError: `net` is no network, or `skip` is not numeric.
+        ValueError: `skip` has another shape than the network; left out, the network has another
+            number of outputs than of inputs.
+
+    Example:
+        >>> from reachjax import MLP
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[1.0, 1.0]], [0.0])])  # |x|
+        >>> Residual(net)([-3.0]).tolist(), Residual(net, [[-1.0]])([-3.0]).tolist()
+        ([0.0], [6.0])
+    """
+
+    net: AbstractNetwork
+    skip: Float[Array, "out in"] = converted(converter=Numbers("(outputs, inputs)"), default=None)
+
+    def __post_init__(self):
+        require_kind("Residual.net", self.net, AbstractNetwork, "a network such as an MLP")
+        sizes = self.net.outputs, self.net.inputs
+        if self.skip is None:
+            if sizes[0] != sizes[1]:
+                raise ValueError(
+                    "without skip, the network must have as many outputs as inputs, but one of "
+                    f"{sizes[1]} inputs and {sizes[0]} outputs arrived"
+                )
+            self._set(skip=jnp.eye(sizes[0]))
+        elif self.skip.shape != sizes:
+            raise ValueError(
+                f"Residual.skip must be of shape {sizes}, the network's outputs and inputs, but "
+                f"one of shape {self.skip.shape} arrived"
+            )
+
+    @property
+    def inputs(self) -> int:
+        """The number of inputs."""
+        return self.net.inputs
+
+    @property
+    def outputs(self) -> int:
+        """The number of outputs."""
+        return self.net.outputs
+
+    def propagate(self, x: Any, unit: AtUnit) -> Any:
+        """The forward pass over any kind of number, with `unit` at each layer of units."""
+        return self.skip @ x + self.net.propagate(x, unit)
+
+
+def Switched(  # noqa: N802  (it stands for a network)
+    controllers: Sequence[AbstractNetwork], by: Callable[[Array], Array]
+) -> Network:
+    """The network that is one of several, whichever the state says.
+
+    Over states of which it is known which one acts, the others are not looked at. Where it is not
+    known, all that may act are followed.
+
+    Args:
+        controllers: networks of as many inputs, and as many outputs.
+        by: the place among them of the one that acts, a function of JAX of what the controller is
+            given: `lambda x: jnp.argmax(x[2:])`, or `lambda x: (x[0] > 1.0).astype(int)`.
+
+    Raises:
+        TypeError: a controller is none, or `by` is no function.
+        ValueError: there are no controllers, or they have different sizes.
+
+    Example:
+        >>> from reachjax import MLP
+        >>> slow, fast = (MLP.from_layers([([[gain]], [0.0])]) for gain in (-0.5, -2.0))
+        >>> net = Switched([slow, fast], by=lambda x: (jnp.abs(x[0]) > 1.0).astype(int))
+        >>> net([0.5]).tolist(), net([2.0]).tolist()
+        ([-0.25], [-4.0])
+    """
+    given = tuple(controllers)
+    if not given:
+        raise ValueError("Switched.controllers must be networks, but none arrived")
+    for each in given:
+        if not isinstance(each, AbstractNetwork):
+            raise TypeError(
+                f"Switched.controllers must be networks, but {described(each)} arrived: an "
+                "rj.Network makes one of a function"
+            )
+    if not callable(by):
+        raise TypeError(f"Switched.by must be a function, but {described(by)} arrived")
+    for each in given[1:]:
+        for name in ("inputs", "outputs"):
+            same_size(
+                f"the first controller's number of {name} is",
+                f"the number of {name} of another one is",
+                (getattr(given[0], name), getattr(each, name)),
+            )
+
+    def acting(nets: tuple[AbstractNetwork, ...], x: Array) -> Array:
+        return jax.lax.switch(by(x), [net.__call__ for net in nets], x)
+
+    function = jax.tree_util.Partial(acting, given)
+    return Network(function, given[0].inputs, given[0].outputs)
+
+
+def one_of(options: Float[ArrayLike, "m n"], w: Float[ArrayLike, " m"]) -> Any:
+    """The option whose number is the largest: any of them, if `w` is anything in a box.
+
+    Of a plant with a disturbance in `Box(zeros(m), ones(m))` a person or a pilot may take any of
+    `m` options at each step: the worst case is certified.
+
+    Args:
+        options: vectors.
+        w: as many numbers as there are options.
+
+    Example:
+        >>> one_of([[-1.0], [0.0], [1.0]], jnp.array([0.2, 0.9, 0.1])).tolist()
+        [0.0]
+    """
+    options = Numbers("(m, n)")(options, "options")
+    same_size("the number of options is", "that of w is", (len(options), jnp.shape(w)[0]))
+    return options[jnp.argmax(jnp.asarray(w))]

@@ -14,11 +14,11 @@ from reachjax.loops.flows.flow import AbstractFlow, Flow
 from reachjax.loops.flows.linear import LinearFlow
 from reachjax.loops.flows.series import Tape
 from reachjax.loops.flows.steps import Settings
-from reachjax.loops.functions import Function
-from reachjax.loops.limits import Limits
 from reachjax.loops.plants import AbstractPlant, AffinePlant
+from reachjax.loops.tracing.functions import Function
+from reachjax.loops.tracing.limits import Limits
+from reachjax.loops.tracing.values import UnsupportedError, Value
 from reachjax.loops.units import AtUnit, UnboundedError, evaluate
-from reachjax.loops.values import UnsupportedError, Value
 from reachjax.numerics.checks import Numbers, is_concrete, real_number, whole_number
 from reachjax.numerics.pytrees import converted, pytree, static
 from reachjax.numerics.rounding import Ball, namespace
@@ -94,7 +94,7 @@ class AbstractSampledPlant(AbstractPlant):
                 if type(x) is Ball:
                     return self.flow.enclosed(tuple(map(_interval, given)))
                 if isinstance(x, Limits):
-                    return self._limits(given)
+                    return self._limits((x, *given[1:]))
                 return unit(self.flow, *given)
         except UnboundedError as error:
             unit_of, _, lower, upper = error.given
@@ -196,8 +196,8 @@ class SampledPlant(AbstractSampledPlant):
         >>> def pendulum(x, u):
         ...     return jnp.array([x[1], jnp.sin(x[0]) + u[0]])
         >>> plant = SampledPlant(pendulum, states=2, inputs=1, period=0.1)
-        >>> plant.propagate(jnp.array([0.0, 1.0]), jnp.array([-2.0])).round(6).tolist()
-        [0.090146, 0.804668]
+        >>> plant.propagate(jnp.array([0.0, 1.0]), jnp.array([-2.0])).round(4)
+        Array([0.0902, 0.8047], dtype=float64)
     """
 
     f: Function

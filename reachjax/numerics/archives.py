@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from reachjax.numerics.checks import require_kind
 
 DOCUMENT = "document"
 
@@ -118,3 +121,37 @@ def _array(file: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
             raise UnreadableError(f"{info.filename} is no array of {left} bytes of numbers")
         held = np.frombuffer(bytearray(entry.read()), kind)
     return held.reshape(shape, order="F" if by_columns else "C")
+
+
+def existing_file(name: str, path: Any) -> Path:
+    """The path of a file.
+
+    Raises:
+        FileNotFoundError: there is none.
+        TypeError: it is no path.
+    """
+    require_kind(name, path, (str, os.PathLike), "the path of a file")
+    found = Path(path)
+    if not found.is_file():
+        raise FileNotFoundError(f"{name} must be that of a file, but there is none at {found}")
+    return found
+
+
+def writable(name: str, path: Any) -> Path:
+    """The path of a file that may be written.
+
+    Raises:
+        FileNotFoundError: its folder does not exist.
+        IsADirectoryError: it is that of a folder.
+        TypeError: it is no path.
+    """
+    require_kind(name, path, (str, os.PathLike), "the path of a file")
+    found = Path(path)
+    if found.is_dir():
+        raise IsADirectoryError(
+            f"{name} must be that of a file, but {found} is a folder: give the name of a file in "
+            f"it, such as {found / 'tube.reach'}"
+        )
+    if not found.parent.is_dir():
+        raise FileNotFoundError(f"{name} must lie in a folder, but there is none at {found.parent}")
+    return found

@@ -1,7 +1,8 @@
 """What a call may spend: one clock that every loop asks, and the work of its programs.
 
 A limit is a limit: whatever may take long asks the clock before it begins, or is given what is
-left. A part of the time is a budget too, so that nobody takes what others were to have.
+left. A part of the time is a budget too, so that nobody takes what others were to have. What was
+found when a call is interrupted is not lost.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Self
+from typing import Any, Self
 
 from reachjax.numerics.checks import real_number
 
@@ -206,3 +207,30 @@ def require_memory(what: str, numbers: float, operations: float) -> None:
         raise MemoryError(f"{what} would take {asked:.3g} GiB, and {most:.3g} GiB is the most")
     if operations > PACE * clock().left:
         raise TimeOverError
+
+
+class Interrupted(KeyboardInterrupt):
+    """A call was interrupted (Ctrl-C): what was found by then is not lost.
+
+    Its message says how to go on. It can be pickled, as when it comes from another process.
+
+    Attributes:
+        found: of `reach` and `ReachTube.extended`, the tube of the steps that were done, also as
+            `tube`: `tube.extended(steps)` goes on. Of `reach_partitioned`, the tubes of the cells
+            that were done, from which `known=` goes on. Of `winning_set`, a `WinningSet`, from
+            which `known=` goes on. Of `largest_set`, the largest set so far, whose `region` is
+            where to go on. Of `decide` and `verify`, the verdict so far.
+    """
+
+    def __init__(self, message: str, found: Any):
+        super().__init__(message)
+        self.found = found
+
+    def __reduce__(self) -> tuple[type, tuple[str, Any]]:
+        """How it is pickled."""
+        return type(self), (str(self), self.found)
+
+    @property
+    def tube(self) -> Any:
+        """What was found, where that is a tube."""
+        return self.found

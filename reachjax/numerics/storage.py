@@ -31,6 +31,30 @@ PACKAGE = __name__.partition(".")[0]
 SEAL = "seal"
 """A field with a hash of all others, which differs where another version writes them otherwise."""
 
+MOVED = {
+    "reachjax.loops.formats": "reachjax.loops.readers",
+    "reachjax.loops.functions": "reachjax.loops.tracing.functions",
+    "reachjax.loops.residual": "reachjax.loops.networks",
+    "reachjax.loops.switching": "reachjax.loops.networks",
+    "reachjax.loops.units.clip": "reachjax.loops.units.piecewise",
+    "reachjax.loops.units.hard_tanh": "reachjax.loops.units.piecewise",
+    "reachjax.loops.units.leaky_relu": "reachjax.loops.units.piecewise",
+    "reachjax.loops.units.relu": "reachjax.loops.units.piecewise",
+    "reachjax.loops.units.within": "reachjax.loops.units.powers",
+    "reachjax.proofs.cells": "reachjax.proofs.by_forms",
+    "reachjax.proofs.linear": "reachjax.proofs.by_forms",
+    "reachjax.proofs.ellipsoids": "reachjax.proofs.by_products",
+    "reachjax.proofs.facets": "reachjax.proofs.by_products",
+    "reachjax.proofs.mixed": "reachjax.proofs.by_products",
+    "reachjax.sets.box": "reachjax.sets.base",
+    "reachjax.sets.normal_form": "reachjax.sets.base",
+    "reachjax.sets.ellipsoid_template": "reachjax.sets.templates",
+    "reachjax.sets.mixed_template": "reachjax.sets.templates",
+    "reachjax.sets.template": "reachjax.sets.templates",
+    "reachjax.tubes.kept": "reachjax.tubes.saving",
+}
+"""Modules, and folders of them, that files written earlier name otherwise."""
+
 PLAIN = bool | int | float | str | None
 
 
@@ -127,7 +151,7 @@ def _class(name: str) -> Any:
     if module.partition(".")[0] != PACKAGE:
         raise ValueError(f"it names {name}, which is not of {PACKAGE}")
     try:
-        found = importlib.import_module(module)
+        found = importlib.import_module(_moved(module))
         for part in path.split("."):
             found = getattr(found, part)
     except (ImportError, AttributeError):
@@ -137,6 +161,14 @@ def _class(name: str) -> Any:
     if found.__module__.partition(".")[0] != PACKAGE or found.__qualname__ != path:
         raise ValueError(f"it names {name}, which is not of {PACKAGE}")
     return found
+
+
+def _moved(module: str) -> str:
+    """The name of a module today, as `MOVED` has it for itself or for its folder."""
+    folder, _, last = module.rpartition(".")
+    if folder in MOVED:
+        module = f"{MOVED[folder]}.{last}"
+    return MOVED.get(module, module)
 
 
 def _enumeration(name: str) -> type[enum.Enum]:

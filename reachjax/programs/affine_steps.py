@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from reachjax.loops import ClosedLoop
 from reachjax.loops.closed_loop import UnitLayer
 from reachjax.loops.flows.flow import AbstractFlow
-from reachjax.loops.limits import Limits
+from reachjax.loops.tracing.limits import Limits
 from reachjax.loops.units import AbstractUnit, Bilinear, Quadratic, SmoothUnit, UnboundedError
 from reachjax.numerics.rounding import TINY, Ball, gamma, namespace
 from reachjax.programs.affine import AffineForms, Place, joined

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.functions import Compiled
+from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Block, Facts, Line, Lines, Mark
 from reachjax.numerics.checks import require_double_precision, require_kind
 from reachjax.numerics.flags import lenient

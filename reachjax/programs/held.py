@@ -19,7 +19,7 @@ from reachjax.programs.affine_steps import UnitForms, step_columns
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.initial import InitialColumns
 from reachjax.programs.moving import INTERVAL, KNOWN, HeldBounds
-from reachjax.sets.polyhedra import support
+from reachjax.sets.linear_programs import support
 
 NEAR = 1e-7
 """Values of a row that differ by a smaller part of its size are the same."""

@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.numerics.rounding import Ball, constant, gamma, larger, namespace, settled, smaller
 from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
-from reachjax.sets.polyhedra import support
+from reachjax.sets.linear_programs import support
 
 Rows = Float[Array | np.ndarray, "k n"]
 

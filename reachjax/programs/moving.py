@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.functions import with_constants
+from reachjax.loops.tracing.functions import with_constants
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.derivatives import moved_by

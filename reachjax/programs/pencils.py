@@ -19,9 +19,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.programs.generators import Generators
 from reachjax.programs.lmi import Program
-from reachjax.programs.presolve import NormalProgram
+from reachjax.programs.presolve import Generators, NormalProgram
 
 
 class Pencil(NamedTuple):

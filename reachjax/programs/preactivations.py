@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.closed_loop import UnitLayer
-from reachjax.loops.functions import Compiled
+from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Line
 from reachjax.numerics.rounding import Ball, gamma
 from reachjax.programs.basis import Rows, columns, loop_rows

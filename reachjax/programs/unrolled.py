@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.functions import Compiled
+from reachjax.loops.tracing.functions import Compiled
 from reachjax.numerics.host import in_numpy
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
@@ -180,7 +180,7 @@ def unrolled_at_once(
     A polytope counts as the box around it. Arguments are those of `unrolled`.
     """
     start = InitialColumns.of(X0, box, loop.curved)
-    (more, between), steps = step_columns(loop), len(directions)
+    (more, scratch), steps = step_columns(loop), len(directions)
     first, end = start.count, start.count + steps * more
 
     # a derivative computes a step again: storing what it needs of it is most of what is compiled
@@ -194,7 +194,7 @@ def unrolled_at_once(
         )
         return state, _bounds(rows, state, units, start, spans)
 
-    state = AffineForms.beginning(start, end + between)
+    state = AffineForms.beginning(start, end + scratch)
     return jax.lax.scan(advance, state, (jnp.arange(steps), directions))[1]
 
 

@@ -7,6 +7,10 @@ window of one step is the paper's recursion; one that begins at the initial set 
 A window grows by one step at a time, by functions that are compiled once. Units that bounds prove
 to be affine leave the basis; outside of `jax.jit` their columns can be left out as well
 (`drop_columns`), so that a window of many steps has as many columns as it has units that switch.
+
+**Scaling.** The scaling of a basis: `xi = T eta`, the entries of `eta` being in `[-1, 1]`. The
+optimal value of a program does not depend on it, but its derivative at inexact multipliers does:
+with the scaling's share, facts of thin sets keep their size and errors cancel.
 """
 
 from __future__ import annotations
@@ -20,18 +24,69 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.functions import Compiled
+from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units import Facts
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.numerics.rounding import Ball
-from reachjax.programs.basis import Rows, columns, loop_rows
+from reachjax.programs.basis import Rows, columns, loop_rows, picking
 from reachjax.programs.bounds import LoopBounds, loop_bounds
 from reachjax.programs.facts import FactLayout, Kind, StepFacts
 from reachjax.programs.lmi import Origin, Program
 from reachjax.programs.preactivations import bounds_over, known_inputs
 from reachjax.programs.relaxations import AbstractRelaxation
-from reachjax.programs.scaling import scaled_states, scaled_units
 from reachjax.sets import AbstractSet, Box, Ellipsoid
+
+CONSTANT = 1e-9
+"""An output whose radius is a smaller part than this of its input's size has a single value."""
+
+
+def scaled_states(box: Box, ball: Ellipsoid | None) -> Float[Array, "n_x+1 n_x+1"]:
+    """The scaling of `[x, 1]`.
+
+    Args:
+        box: a box around the states.
+        ball: an ellipsoid around them, if one fits better.
+    """
+    n, around = box.dimension, Ball.between(box.lower, box.upper)
+    T = jnp.diag(jnp.append(around.rad, 1.0)).at[:-1, -1].set(around.mid)
+    if ball is not None:
+        T = T.at[:n, :n].set(ball.from_ball()).at[:n, -1].set(ball.center)
+    return jax.lax.optimization_barrier(T)
+
+
+def scaled_units(
+    T: Float[Array, "n n"], places: Int[Array | np.ndarray, " k"], bounds: LoopBounds, prune: bool
+) -> Float[Array, "n n"]:
+    """The scaling with the outputs of units in it.
+
+    Args:
+        T: without them.
+        places: the column of each unit; negative for those without one.
+        bounds: of the units.
+        prune: whether units that the bounds prove to be affine have left the basis.
+    """
+    here = picking(places, len(T)).mid
+    mid, rad = _ranges(bounds, prune)
+    T = T.at[:, -1].add(mid @ here) + jnp.diag(rad @ here)
+    # one rounding of it for all rows, whatever the compiler fuses
+    return jax.lax.optimization_barrier(T)
+
+
+def _ranges(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """Midpoint and radius of the output of each unit.
+
+    A unit that has left the basis gets radius zero. One that stays although its output has a single
+    value (a dead neuron that the paper keeps) is scaled by its input, so that it does stay: a
+    radius at rounding level would tell the solver what the paper's constraints do not.
+    """
+    y, z = bounds.preactivation, bounds.output
+    if prune:
+        return jnp.where(bounds.affine, 0.0, z.mid), jnp.where(bounds.affine, 0.0, z.rad)
+    size = abs(y.mid) + y.rad
+    constant = z.rad <= CONSTANT * size
+    # a tenth of the input's size: measured, solvers lose digits at the whole and at a hundredth
+    return z.mid, jnp.where(constant, jnp.where(size > 0, size / 10, 1.0), z.rad)
+
 
 COLUMNS = 16
 """Where columns are dropped, those that stay come in multiples of this many."""

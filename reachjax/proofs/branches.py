@@ -19,8 +19,8 @@ from reachjax.numerics.rounding import gamma
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import upper_bounds
 from reachjax.programs.initial import InitialColumns
+from reachjax.proofs.by_products import Certificate
 from reachjax.proofs.certificates import AbstractProof, told
-from reachjax.proofs.facets import Certificate
 
 
 class Rung(enum.IntEnum):

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.functions import Compiled
+from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Bilinear, Mark
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.programs.affine_steps import UnitForms

@@ -26,16 +26,14 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.pytrees import converted, pytree
 from reachjax.sets import outlines, outward
-from reachjax.sets.base import AbstractSet, Matrix, Vector
-from reachjax.sets.box import Box
-from reachjax.sets.normal_form import NormalForm
+from reachjax.sets.base import Box, Matrix, NormalForm, RoundSet, Vector
 
 SINGULAR = 1e-14
 """A shape matrix counts as singular if scaling its diagonal to 1 leaves no larger eigenvalue."""
 
 
 @pytree
-class Ellipsoid(AbstractSet):
+class Ellipsoid(RoundSet):
     """The ellipsoid `(x - center)' shape^-1 (x - center) <= 1` (the paper's proposition 2).
 
     Args:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, HalfspaceIntersection, QhullError
 
 from reachjax.sets.balance import Balanced, balanced, lengths
-from reachjax.sets.polyhedra import NOTHING, boxed, chebyshev, maximiser
+from reachjax.sets.linear_programs import NOTHING, boxed, chebyshev, maximiser
 from reachjax.sets.unusable import ThinSetError
 
 TOO_THIN = "the polytope is too thin for its corners to be told apart"

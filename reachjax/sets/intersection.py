@@ -15,10 +15,8 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from reachjax.numerics.checks import is_concrete, require_kind, same_size
 from reachjax.numerics.pytrees import pytree
 from reachjax.sets import outlines
-from reachjax.sets.base import AbstractSet, Matrix, Vector
-from reachjax.sets.box import Box
+from reachjax.sets.base import AbstractSet, Box, Matrix, PolyhedralSet, Vector
 from reachjax.sets.ellipsoid import Ellipsoid
-from reachjax.sets.polyhedral_set import PolyhedralSet
 from reachjax.sets.unusable import ThinSetError, UnusableSetError
 
 DRAWS = (1, 9, 81)

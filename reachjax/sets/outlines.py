@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from reachjax.sets.balance import exponents
-from reachjax.sets.normal_form import NormalForm
 
 COUNT = 200
 """Points of an ellipse's outline."""
@@ -29,7 +30,7 @@ def hull(points: Points) -> Points:
         return points[np.lexsort(points.T)[[0, -1]]]
 
 
-def cut(corners: Points, ellipse: NormalForm) -> Points:
+def cut(corners: Points, ellipse: tuple[Any, Any]) -> Points:
     """What the tangents of an ellipse leave of a convex polygon, corners in order."""
     A, b = (np.asarray(part) for part in ellipse)
     for tangent in circle():

@@ -9,9 +9,8 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from reachjax.numerics.checks import Numbers, is_concrete, require_double_precision, same_size
 from reachjax.numerics.pytrees import converted, pytree
-from reachjax.sets import envelopes, hulls
-from reachjax.sets.box import Box
-from reachjax.sets.polyhedral_set import PolyhedralSet
+from reachjax.sets import hulls, supports
+from reachjax.sets.base import Box, PolyhedralSet
 
 EXACT_DIMENSIONS = 4
 """Beyond so many, corners multiply too fast for a volume that is computed at every step."""
@@ -107,7 +106,7 @@ class Polytope(PolyhedralSet):
         Raises:
             ValueError: the polytope is empty or unbounded.
         """
-        return envelopes.support(self.A, self.b, self._directions(directions))
+        return supports.support(self.A, self.b, self._directions(directions))
 
     def bounding_box(self) -> Box:
         """The smallest box around the polytope.
@@ -116,7 +115,7 @@ class Polytope(PolyhedralSet):
             ValueError: the polytope is empty or unbounded.
         """
         require_double_precision(set=self)
-        return Box(*envelopes.bounding_box(self.A, self.b))
+        return Box(*supports.bounding_box(self.A, self.b))
 
     def cut(self, box: Box) -> Polytope:
         """The points that lie in a box as well."""
@@ -144,5 +143,5 @@ class Polytope(PolyhedralSet):
     def size(self) -> Float[Array, ""]:
         """The volume; beyond four dimensions, that of the bounding box. Differentiable."""
         if self.dimension <= EXACT_DIMENSIONS:
-            return envelopes.volume(self.A, self.b)
+            return supports.volume(self.A, self.b)
         return jnp.prod(self.bounding_box().widths)

@@ -11,9 +11,8 @@ from reachjax.numerics.checks import whole_number
 from reachjax.programs.lmi import Program
 from reachjax.programs.pencils import AbstractInequality
 from reachjax.proofs.proposal import ANSWERS, Proposal, SolverStatus
-from reachjax.solvers.base import AbstractSolver
+from reachjax.solvers.base import AbstractSolver, proposed
 from reachjax.solvers.clarabel import Clarabel
-from reachjax.solvers.faults import proposed
 from reachjax.solvers.interior_point import InteriorPoint
 
 

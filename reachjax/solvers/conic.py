@@ -19,8 +19,15 @@ from reachjax.programs.lmi import Program
 from reachjax.programs.pencils import AbstractInequality, Pencil
 from reachjax.programs.presolve import THINNEST
 from reachjax.proofs.proposal import Proposal, SolverStatus
-from reachjax.solvers.base import RESCALINGS, AbstractSolver, Found, proposed_by, require_positive
-from reachjax.solvers.faults import UnknownOptionError, UnknownSolverError
+from reachjax.solvers.base import (
+    RESCALINGS,
+    AbstractSolver,
+    Found,
+    UnknownOptionError,
+    UnknownSolverError,
+    proposed_by,
+    require_positive,
+)
 
 STATUSES = {
     "optimal": SolverStatus.SOLVED,

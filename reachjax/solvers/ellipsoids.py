@@ -13,18 +13,16 @@ import scipy.sparse as sp
 from jaxtyping import Array, Float
 
 from reachjax.numerics.pytrees import pytree
-from reachjax.programs.generators import Generators
 from reachjax.programs.lmi import Program, Slopes, form_rows, inequality_slopes
 from reachjax.programs.pencils import Pencil, Shape
-from reachjax.programs.presolve import NormalProgram, presolved
-from reachjax.proofs.ellipsoids import EllipsoidCertificate
+from reachjax.programs.presolve import Generators, NormalProgram, presolved
+from reachjax.proofs.by_products import EllipsoidCertificate
 from reachjax.proofs.proposal import Proposal
 from reachjax.proofs.recheck import clipped
 from reachjax.proofs.reported import Judged, Sized, judged_shape
 from reachjax.proofs.slopes import held_level
 from reachjax.sets import Ellipsoid, NormalForm
-from reachjax.solvers.base import AbstractSolver
-from reachjax.solvers.faults import proposed
+from reachjax.solvers.base import AbstractSolver, proposed
 from reachjax.solvers.goals import AbstractGoal
 
 

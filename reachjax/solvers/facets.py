@@ -12,22 +12,19 @@ import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.numerics.pytrees import pytree
-from reachjax.programs.generators import Generators
 from reachjax.programs.lmi import Program, Slopes, inequality_slopes
 from reachjax.programs.pencils import Pencil, Shape
-from reachjax.programs.presolve import NormalProgram, presolved
+from reachjax.programs.presolve import Generators, NormalProgram, presolved
 from reachjax.programs.relaxations import Products
-from reachjax.proofs.facets import Certificate
+from reachjax.proofs.by_products import Certificate
 from reachjax.proofs.proposal import Proposal, SolverStatus
 from reachjax.proofs.recheck import clipped, interval_offsets, sound_offsets
 from reachjax.proofs.reported import Judged, judged_offsets
 from reachjax.proofs.slopes import held_offsets
 from reachjax.sets import Polytope
-from reachjax.solvers.base import AbstractSolver
-from reachjax.solvers.cut_pool import NONE, CutPool, joint
-from reachjax.solvers.faults import proposed
+from reachjax.solvers.base import AbstractSolver, proposed
+from reachjax.solvers.cutting_planes import NONE, CutPool, Rounds, Shown, idle, in_rounds, joint
 from reachjax.solvers.goals import AbstractGoal
-from reachjax.solvers.rounds import Rounds, Shown, idle, in_rounds
 
 NEAR = 1e-9
 """Offsets that differ by less, in parts of the facet's interval, are equally good."""

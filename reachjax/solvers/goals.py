@@ -49,10 +49,8 @@ from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.proposal import Proposal
 from reachjax.proofs.reported import Judged
 from reachjax.sets import AbstractSet
-from reachjax.solvers.base import AbstractSolver
-from reachjax.solvers.cut_pool import NONE, CutPool, joint
-from reachjax.solvers.faults import proposed
-from reachjax.solvers.rounds import Rounds, Shown, idle, in_rounds
+from reachjax.solvers.base import AbstractSolver, proposed
+from reachjax.solvers.cutting_planes import NONE, CutPool, Rounds, Shown, idle, in_rounds, joint
 
 
 class AbstractGoal(AbstractInequality):

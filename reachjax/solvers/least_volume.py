@@ -24,14 +24,13 @@ from reachjax.proofs.proposal import ANSWERS, Proposal, SolverStatus
 from reachjax.proofs.reported import Judged, Sized, judged_least
 from reachjax.sets import NormalForm
 from reachjax.solvers.barrier import FROM_AFAR, WEIGHTS, Barrier, Centre, solved
-from reachjax.solvers.base import AbstractSolver
+from reachjax.solvers.base import AbstractSolver, proposed
 from reachjax.solvers.ellipsoids import (
     AbstractEllipsoid,
     ellipsoid_pencil,
     form_slopes,
     level_slopes,
 )
-from reachjax.solvers.faults import proposed
 
 ATTEMPTS = 3
 """How often a program is solved, each time in better coordinates."""

@@ -15,16 +15,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.methods.problem import AbstractMethod
+from reachjax.methods.propagation import require_kinds
 from reachjax.numerics.checks import described, is_concrete, whole_number
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import unlogged
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds, LocalBounds
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
 from reachjax.sets.cells import grid_ends
-from reachjax.tubes.methods import AbstractMethod
-from reachjax.tubes.propagation import require_kinds
 from reachjax.tubes.reach import ReachTube, reach
-from reachjax.tubes.requirements import (
+from reachjax.tubes.sizes import log_volume
+from reachjax.verdicts.specification import (
     AvoidSets,
     Region,
     Timed,
@@ -33,7 +34,6 @@ from reachjax.tubes.requirements import (
     requirements,
     shortfall,
 )
-from reachjax.tubes.sizes import log_volume
 
 
 @unlogged

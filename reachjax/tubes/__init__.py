@@ -1,1 +1,1 @@
-"""What a user asks for: reachable sets over time, partitions, specifications, sizes, pictures."""
+"""Reachable sets over time as a user holds them: tubes, partitions, files, sizes, tables."""

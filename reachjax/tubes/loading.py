@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.archives import UnreadableError
+from reachjax.methods.problem import Problem
+from reachjax.methods.propagation import Options, check_problem
+from reachjax.methods.searches import Bar
+from reachjax.numerics.archives import UnreadableError, existing_file
 from reachjax.numerics.checks import (
     owned,
     require_bar,
@@ -16,17 +19,13 @@ from reachjax.numerics.checks import (
     require_kind,
     wrapped,
 )
-from reachjax.numerics.files import existing_file
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.numerics.storage import read
-from reachjax.tubes.kept import Kept
-from reachjax.tubes.methods import Problem
 from reachjax.tubes.partitions import PartitionedTube
-from reachjax.tubes.propagation import Options, check_problem
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.rechecks import Recheck, require_partition
-from reachjax.tubes.searches import Bar
+from reachjax.tubes.saving import Kept
 
 MISSING = (
     "was written without its loop, whose functions cannot be stored: give the loop again, "

@@ -18,7 +18,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from reachjax.loops import ClosedLoop
-from reachjax.numerics.budget import Budget
+from reachjax.methods.cell_tree import CellTree, Node
+from reachjax.methods.problem import AbstractMethod, Problem
+from reachjax.methods.propagation import GAP, SAMPLES, Options
+from reachjax.methods.searches import AbstractSearch, Bar, Question
+from reachjax.numerics.archives import writable
+from reachjax.numerics.budget import Budget, Interrupted
 from reachjax.numerics.checks import (
     is_concrete,
     owned,
@@ -28,24 +33,17 @@ from reachjax.numerics.checks import (
     require_executor,
     require_kind,
 )
-from reachjax.numerics.files import writable
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.numerics.pytrees import Replaceable, pytree
+from reachjax.numerics.seals import Seal, require_sealed, seal_of
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
 from reachjax.sets import AbstractSet, Template
+from reachjax.sets.pictures import draw_flowpipes
 from reachjax.solvers import AbstractSolver, Auto
-from reachjax.tubes.cell_tree import CellTree, Node
-from reachjax.tubes.displays import SAMPLES as SHOWN
-from reachjax.tubes.displays import display, picture, table
-from reachjax.tubes.interruptions import Interrupted
-from reachjax.tubes.kept import keep
-from reachjax.tubes.methods import AbstractMethod, Problem
-from reachjax.tubes.propagation import GAP, SAMPLES, Options
+from reachjax.tubes.displays import DRAWN, SHOWN, display, frame, picture, rows, table
 from reachjax.tubes.reach import ReachTube, tube_of
-from reachjax.tubes.seals import Seal, require_sealed, seal_of
-from reachjax.tubes.searches import AbstractSearch, Bar, Question
-from reachjax.tubes.tables import frame, rows
+from reachjax.tubes.saving import keep
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -118,14 +116,20 @@ class PartitionedTube(Replaceable):
         Raises:
             ImportError: pandas is missing; it comes with `pip install 'reachjax[tables]'`.
         """
-        numbered = enumerate(self.tubes)
-        return frame([{"cell": cell} | row for cell, tube in numbered for row in rows(tube)])
+        return frame(
+            [
+                {"cell": cell} | row
+                for cell, tube in enumerate(self.tubes)
+                for row in rows(tube.template, tube.certificates)
+            ]
+        )
 
-    def plot(self, ax: Axes | None = None, **options: Any) -> Axes:
-        """Draw the sets of all cells: `reachjax.plot_tube(tube, ax, **options)`."""
-        from reachjax.tubes.plotting import plot_tube
-
-        return plot_tube(self, ax, **options)
+    def plot(
+        self, ax: Axes | None = None, samples: int = DRAWN, coordinates: tuple[int, int] = (0, 1)
+    ) -> Axes:
+        """Draw the sets of all cells over simulated states, see `reachjax.plot_tube`."""
+        flowpipes = [tube.flowpipe(samples) for tube in self.tubes]
+        return draw_flowpipes(flowpipes, ax, coordinates)
 
     def _repr_html_(self) -> str:
         times = range(1, self.horizon + 1)
@@ -432,3 +436,29 @@ def _worst(
     beyond = (bounds - witnesses) / np.where(widths > 0, widths, np.inf)
     widest = beyond.max(axis=(1, 2))
     return [int(i) for i in np.argsort(-widest, stable=True) if widest[i] > gap / 2]
+
+
+@lenient
+def plot_tube(
+    tube: ReachTube | PartitionedTube,
+    ax: Axes | None = None,
+    samples: int = DRAWN,
+    coordinates: tuple[int, int] = (0, 1),
+) -> Axes:
+    """Draw the sets of a tube over simulated states: shadows, where there are more than two.
+
+    Args:
+        tube: of a loop with two or more states.
+        ax: where to draw; a new figure with a legend by default.
+        samples: how many trajectories to show; of a partitioned tube so many from each cell.
+        coordinates: the two states to draw, counted from 0: the horizontal axis, then the vertical
+            one.
+
+    Raises:
+        TypeError: the tube is none.
+        ValueError: the loop has one state, or the coordinates are not two of its states.
+    """
+    require_kind(
+        "tube", tube, (ReachTube, PartitionedTube), "a ReachTube, as reach(...) returns it"
+    )
+    return tube.plot(ax, samples, coordinates)

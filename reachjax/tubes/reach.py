@@ -16,28 +16,9 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
-from reachjax.numerics.checks import (
-    floats_of,
-    is_concrete,
-    owned,
-    require_double_precision,
-    whole_number,
-)
-from reachjax.numerics.files import writable
-from reachjax.numerics.flags import lenient
-from reachjax.numerics.logs import logged
-from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
-from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
-from reachjax.proofs.certificates import AbstractProof, told
-from reachjax.proofs.witnesses import initial_states
-from reachjax.sets import AbstractSet, AbstractTemplate, Polytope
-from reachjax.solvers import AbstractSolver, Auto
-from reachjax.tubes.displays import SAMPLES as SHOWN
-from reachjax.tubes.displays import display, picture, table
-from reachjax.tubes.interruptions import Interrupted
-from reachjax.tubes.kept import keep
-from reachjax.tubes.methods import AbstractMethod, Problem, ReachSet, at
-from reachjax.tubes.propagation import (
+from reachjax.methods.affine_forms import spans_by_forms
+from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
+from reachjax.methods.propagation import (
     GAP,
     SAMPLES,
     Options,
@@ -45,9 +26,28 @@ from reachjax.tubes.propagation import (
     check_problem,
     propagated,
 )
-from reachjax.tubes.seals import Seal, require_sealed, seal_of
-from reachjax.tubes.spans import spans_by_forms
-from reachjax.tubes.tables import frame, rows
+from reachjax.methods.witnesses import initial_states
+from reachjax.numerics.archives import writable
+from reachjax.numerics.budget import Interrupted
+from reachjax.numerics.checks import (
+    floats_of,
+    is_concrete,
+    owned,
+    require_double_precision,
+    whole_number,
+)
+from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
+from reachjax.numerics.pytrees import Replaceable, pytree, static, unchecked
+from reachjax.numerics.seals import Seal, require_sealed, seal_of
+from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut
+from reachjax.proofs.certificates import AbstractProof, told
+from reachjax.sets import AbstractSet, AbstractTemplate, Polytope
+from reachjax.sets.pictures import Flowpipe, draw_flowpipes
+from reachjax.sets.unusable import ThinSetError
+from reachjax.solvers import AbstractSolver, Auto
+from reachjax.tubes.displays import DRAWN, SHOWN, display, frame, picture, rows, table
+from reachjax.tubes.saving import keep
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -180,13 +180,21 @@ class ReachTube(Replaceable):
             >>> table.groupby("t").bound.max().round(6).to_dict()
             {1: 1.0, 2: 0.5}
         """
-        return frame(rows(self))
+        return frame(rows(self.template, self.certificates))
 
-    def plot(self, ax: Axes | None = None, **options: Any) -> Axes:
-        """Draw the sets over simulated states: `reachjax.plot_tube(tube, ax, **options)`."""
-        from reachjax.tubes.plotting import plot_tube
+    def plot(
+        self, ax: Axes | None = None, samples: int = DRAWN, coordinates: tuple[int, int] = (0, 1)
+    ) -> Axes:
+        """Draw the sets over simulated states, see `reachjax.plot_tube`."""
+        return draw_flowpipes([self.flowpipe(samples)], ax, coordinates)
 
-        return plot_tube(self, ax, **options)
+    def flowpipe(self, samples: int) -> Flowpipe:
+        """The sets, with the states of simulated trajectories; none of a set too thin to sample."""
+        try:
+            states = np.asarray(self.simulate(samples))
+        except ThinSetError:
+            states = np.zeros((0, self.horizon + 1, self.loop.states))
+        return self.sets, states
 
     def _repr_html_(self) -> str:
         steps = [_shown(self, t) for t in range(1, self.horizon + 1)]

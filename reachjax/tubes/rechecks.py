@@ -16,14 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.scenarios import Scenarios
+from reachjax.numerics.seals import seal_of
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.sets import AbstractSet, Ellipsoid, Intersection, Polytope
-from reachjax.sets.covers import covers
-from reachjax.tubes.disagreements import DisagreementError
+from reachjax.sets.cells import covers
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
-from reachjax.tubes.repeats import Repeat
-from reachjax.tubes.seals import seal_of
+from reachjax.tubes.repeats import DisagreementError, Repeat
 
 ROUNDING = 1e-9
 """The part of a number's size by which a recheck may differ on another machine."""

@@ -17,6 +17,9 @@ from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
+from reachjax.methods.ladder import Ladder
+from reachjax.methods.steps import Setting, Step, boxed
+from reachjax.methods.successors import goals_of
 from reachjax.numerics.budget import ENDLESS
 from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Origin, Program
@@ -30,17 +33,35 @@ from reachjax.programs.relaxations import (
 from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.programs.windows import Window
 from reachjax.proofs.branches import BranchCertificate
-from reachjax.proofs.cells import CellCertificate
+from reachjax.proofs.by_forms import CellCertificate, LinearCertificate
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
-from reachjax.proofs.linear import LinearCertificate
 from reachjax.sets import AbstractSet, AbstractTemplate, Polytope
 from reachjax.sets.cells import from_tree
 from reachjax.solvers import Auto
-from reachjax.tubes.disagreements import DisagreementError
-from reachjax.tubes.ladder import Ladder
 from reachjax.tubes.reach import ReachTube
-from reachjax.tubes.steps import Setting, Step, boxed
-from reachjax.tubes.successors import goals_of
+
+
+class DisagreementError(ValueError):
+    """A tube says what its own certificates do not prove.
+
+    Attributes:
+        step: how many steps after the initial set; None if it is not about one.
+        facet: the number of the facet; None if it is not about one.
+        said: what the tube says.
+        proved: what is proved, or simulated.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        step: int | None = None,
+        facet: int | None = None,
+        said: Any = None,
+        proved: Any = None,
+    ):
+        super().__init__(message)
+        self.step, self.facet, self.said, self.proved = step, facet, said, proved
+
 
 Again = tuple[AbstractProof, Float[np.ndarray, " f"]]
 """A proof with all that it rests on made again, and the bounds that it proves."""

@@ -15,9 +15,9 @@ import onnx
 import scipy.io
 from onnx import helper
 
-from reachjax.loops.formats import onnx_graphs, onnx_runtime
-from reachjax.loops.formats.chains import read_chain
-from reachjax.loops.formats.onnx_graphs import read_graph
+from reachjax.loops.readers import onnx_graphs
+from reachjax.loops.readers.chains import read_chain
+from reachjax.loops.readers.onnx_graphs import read_graph
 from tests.loops.onnx_models import make_model, node, tensor
 
 
@@ -415,7 +415,7 @@ def judged(folder, count, monkeypatch):
 def _against_runtime(path, graph, wrong):
     with np.errstate(all="ignore"):
         try:
-            onnx_runtime.require_same(path, graph, onnx_runtime_points(graph))
+            onnx_graphs.require_same(path, graph, onnx_runtime_points(graph))
         except ValueError as error:
             if "refuses" in str(error):
                 return "accepted, refused by onnxruntime"

@@ -213,7 +213,6 @@ def test_constants_of_parameters_have_derivatives():
 
 SCANNED = {
     "as numbers": lambda x: jax.lax.map(lambda m: m.astype(float), x > 0),
-    "as numbers of 32 bits": lambda x: jax.lax.map(lambda m: m.astype(F32), x > 0).astype(float),
     "times numbers": lambda x: jax.lax.map(lambda m: m * 2.0, x > 0),
     "summed": lambda x: jax.lax.scan(lambda c, m: (c + m, c), 0.0, x > 0)[1],
     "indexed": lambda x: (x > 0)[:1].astype(float),
@@ -224,10 +223,22 @@ SCANNED = {
 
 
 @pytest.mark.parametrize("name", SCANNED)
-def test_a_comparison_is_no_number(name):
-    function = SCANNED[name]
-    with pytest.raises(TypeError, match="cannot be certified"):
-        rj.NonlinearPlant(lambda x, u: function(x), states=1, inputs=1)
+def test_a_comparison_is_the_number_that_it_is_in_jax(name):
+    plant = rj.NonlinearPlant(lambda x, u: SCANNED[name](x), states=1, inputs=1)
+    loop, template = rj.ClosedLoop(plant, STILL), rj.Template.box(1)
+    for X0 in (rj.Box([-1.0], [-0.5]), rj.Box([0.5], [1.0]), rj.Box([-1.0], [2.0])):
+        upper, lower = rj.reach(loop, X0, 1, template, rj.LinearBounds()).sets[1].b
+        values = np.asarray([SCANNED[name](end) for end in (X0.lower, X0.upper)], float)
+        assert -lower <= values.min() <= values.max() <= upper
+        assert upper + lower <= np.ptp(values) + 1e-9
+
+
+def test_a_comparison_as_numbers_of_32_bits_is_refused():
+    def step(x, u):
+        return jax.lax.map(lambda m: m.astype(F32), x > 0).astype(float)
+
+    with pytest.raises(TypeError, match="it rounds to float32"):
+        rj.NonlinearPlant(step, states=1, inputs=1)
 
 
 class Normalised(nnx.Module):

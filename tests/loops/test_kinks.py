@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.loops.rationals import Rationals, evaluated
+from reachjax.loops.tracing.rationals import Rationals, evaluated
 from reachjax.loops.units import Cos, Exp, Log, ReLU, Sin, Sqrt
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine import AffineForms

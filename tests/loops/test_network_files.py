@@ -268,7 +268,7 @@ def test_an_operator_without_bounds_is_named_with_its_node(tmp_path):
 
 
 def test_what_onnxruntime_computes_otherwise_is_refused_with_both(tmp_path, monkeypatch):
-    from reachjax.loops.formats import operators
+    from reachjax.loops.readers import operators
 
     path = saved(tmp_path / "net.onnx", [node("Tanh", "x")])
     wrong = operators.Operator(lambda attributes, x: x)

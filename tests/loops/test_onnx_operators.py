@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.loops.formats.onnx_graphs import read_graph
-from reachjax.loops.formats.operators import OPERATORS
+from reachjax.loops.readers.onnx_graphs import read_graph
+from reachjax.loops.readers.operators import OPERATORS
 from tests.loops.onnx_models import node, run, saved
 
 SHAPES = [(1, 3), (1, 2, 3), (3,), (1, 2, 1, 3)]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.loops.limits import Limits
+from reachjax.loops.tracing.limits import Limits
 from reachjax.loops.units import Bilinear, Lines
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.bounds import successor_box
@@ -111,11 +111,11 @@ def test_facts_are_not_negative_and_leave_one_value_at_each_corner(terms):
         blocks = unit.facts(exact, z + mpmath.mpf(0), lower, upper).blocks
         assert len(blocks) == 4
         assert all(np.all(block.rows >= 0) for block in blocks)
-    corner = np.concatenate([lower[: 4 * terms], upper[4 * terms :]])
-    for off in (-1e-3, 1e-3):
-        z = unit(*np.split(corner, 2)) * (1 + off)
-        rows = [block.rows for block in unit.facts(corner, z, lower, upper).blocks]
-        assert np.all(np.min(rows, axis=0) < 0)
+        corner = np.concatenate([lower[: 4 * terms], upper[4 * terms :]])
+        for off in (-1e-3, 1e-3):
+            z = unit(*np.split(corner, 2)) * (1 + off)
+            rows = [block.rows for block in unit.facts(corner, z, lower, upper).blocks]
+            assert np.all(np.min(rows, axis=0) < 0)
 
 
 def test_products_of_multiples_of_one_number_are_squares():

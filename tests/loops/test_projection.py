@@ -200,7 +200,7 @@ def test_the_loop_keeps_normals_in_its_structure_and_offsets_among_its_numbers()
     np.testing.assert_array_equal(loop.input_box.normals, C)
     np.testing.assert_array_equal(loop.input_box.polytope.b, d)
     assert len(jax.tree.leaves(loop.input_box)) == 1
-    assert loop.unit_layers[-1] == (ProjectionSlack.scaled(C, d).kind, 5)
+    assert loop.unit_layers[-1] == (ProjectionSlack.scaled(C, d).kind, 5, 5)
     twice = loop.replace(input_box=rj.Polytope(np.tile(C, (2, 1)), np.append(d + 1, d)))
     np.testing.assert_array_equal(twice.input_box.normals, C)
     np.testing.assert_array_equal(twice.input_box.offsets, d)

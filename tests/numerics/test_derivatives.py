@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.methods import propagation
 from reachjax.numerics.derivatives import ONLY_FIRST, first_order, moved_by
-from reachjax.tubes import propagation
 from tests.closed_loops import autonomous
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.methods.witnesses import initial_states
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, joined, upper_bounds
-from reachjax.proofs.witnesses import initial_states
 from tests.closed_loops import initial_set, on_host, switching_loop, that_switches
 
 STEPS = 3

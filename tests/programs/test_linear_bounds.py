@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.methods.steps import Setting, Step
 from reachjax.programs.bounds import loop_bounds, successor_box
 from reachjax.programs.preactivations import bounds_over, known_inputs
 from reachjax.programs.windows import Window
-from reachjax.tubes.steps import Setting, Step
 from tests.closed_loops import closed_loop, random_loop
 from tests.networks import (
     affine_network,

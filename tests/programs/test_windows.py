@@ -85,7 +85,7 @@ def test_a_window_of_any_length_may_be_asked_for():
 
 @pytest.mark.costly
 def test_the_length_is_chosen_by_the_columns_that_are_needed(monkeypatch):
-    monkeypatch.setattr(importlib.import_module("reachjax.tubes.by_programs"), "LARGEST_WINDOW", 8)
+    monkeypatch.setattr(importlib.import_module("reachjax.methods.recursion"), "LARGEST_WINDOW", 8)
     data = random_loop(2, hidden=(5, 4), seed=2)
     tube = tube_of(data, rj.CuttingPlanes(), None)
     used = [int(tube.proof(t).program.used.sum()) for t in range(1, HORIZON + 1)]

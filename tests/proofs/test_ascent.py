@@ -9,8 +9,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.loops.scenarios import Scenarios
-from reachjax.proofs.ascent import ascended
-from reachjax.proofs.witnesses import Simulations
+from reachjax.methods.witnesses import Simulations, ascended
 from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
 from tests.networks import plant, simulate
 from tests.quick_cases import some

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from reachjax.sets import Box, Polytope, Template, formulas, hulls
+from reachjax.sets import Box, Polytope, Template, hulls, supports
 
 
 def polygon(seed):
@@ -25,7 +25,7 @@ def polygon(seed):
 def test_the_area_and_its_derivatives_are_those_of_qhull(seed):
     A, b, lengths = polygon(seed)
     area, areas, centroids = hulls.facet_areas(A, b)
-    value, (by_normals, by_offsets) = jax.value_and_grad(formulas.area, argnums=(0, 1))(A, b)
+    value, (by_normals, by_offsets) = jax.value_and_grad(supports.area, argnums=(0, 1))(A, b)
     assert float(value) == pytest.approx(area, rel=1e-8)
     swept = areas / lengths
     np.testing.assert_allclose(by_offsets, swept, atol=1e-7 * swept.max())
@@ -35,7 +35,7 @@ def test_the_area_and_its_derivatives_are_those_of_qhull(seed):
 
 def test_facets_that_are_there_twice_count_once():
     A, b, _ = polygon(3)
-    twice = formulas.area(np.r_[A, 2 * A], np.r_[b, 2 * b])
+    twice = supports.area(np.r_[A, 2 * A], np.r_[b, 2 * b])
     assert float(twice) == pytest.approx(hulls.volume(A, b), rel=1e-8)
 
 
@@ -50,7 +50,7 @@ def test_facets_that_are_there_twice_count_once():
     ids=["empty box", "empty triangle", "a quadrant", "half a strip"],
 )
 def test_what_is_empty_or_unbounded_has_no_area_and_no_derivative(A, b):
-    value, slope = jax.value_and_grad(formulas.area, argnums=1)(jnp.array(A), jnp.array(b))
+    value, slope = jax.value_and_grad(supports.area, argnums=1)(jnp.array(A), jnp.array(b))
     assert np.isnan(value)
     assert np.isnan(slope).any()
 
@@ -60,23 +60,23 @@ def test_boxes_are_told_apart_and_their_ends_are_exact(n):
     box = Box(-np.arange(1.0, n + 1) / 3, np.arange(n) + 1 / 7)
     A, b = (np.asarray(part) for part in Template.box(n).polytope(jnp.zeros(2 * n)).facets)
     b = np.asarray(box.support(A))
-    ends = formulas.box_ends(A, b)
+    ends = supports.box_ends(A, b)
     assert ends is not None
     lower, upper = ends
     np.testing.assert_array_equal(lower, box.lower)
     np.testing.assert_array_equal(upper, box.upper)
-    assert formulas.box_ends(2 * A, b) is None  # b / 2 would have to be rounded outwards
-    assert formulas.box_ends(A[1:], b[1:]) is None  # unbounded
+    assert supports.box_ends(2 * A, b) is None  # b / 2 would have to be rounded outwards
+    assert supports.box_ends(A[1:], b[1:]) is None  # unbounded
     if n > 1:
         octagonal = np.asarray(Template.octagonal(n).directions)
-        assert formulas.box_ends(octagonal, octagonal[:, 0]) is None
+        assert supports.box_ends(octagonal, octagonal[:, 0]) is None
 
 
 def test_the_inner_one_of_two_facets_bounds_a_box_and_an_empty_one_has_no_ends():
     A = np.array([[1.0], [1.0], [-1.0]])
 
     def widths(b):
-        ends = formulas.box_ends(A, b)
+        ends = supports.box_ends(A, b)
         assert ends is not None
         return (ends[1] - ends[0])[0]
 
@@ -122,15 +122,15 @@ def test_offsets_along_facets_bound_the_support_and_are_found_by_direction_alone
     A = np.array([[2.0, 0.0], [0.0, 1.0], [-1.0, -1.0], [1.0, 0.0], [3.0, 3.0]])
     b = np.array([2.0, 1.0, 1.0, 0.5, 30.0])
     wanted = np.array([[4.0, 0.0], [-0.5, -0.5], [1.0, 1.0]])
-    found, known = (np.asarray(part) for part in formulas.offsets_along(A, b, wanted))
+    found, known = (np.asarray(part) for part in supports.offsets_along(A, b, wanted))
     assert known.all()
     np.testing.assert_allclose(found, [2.0, 0.5, 10.0])  # the least of two; the last is redundant
     assert np.all(found >= np.asarray(Polytope(A, b).support(wanted)) * (1 - 1e-12))
     for others in (np.array([[1.0, 2.0]]), np.zeros((1, 2))):
-        offsets, known = formulas.offsets_along(A, b, others)
+        offsets, known = supports.offsets_along(A, b, others)
         assert np.isinf(offsets).all()
         assert not known.any()
-    traced = jax.jit(formulas.offsets_along)(A, b, wanted)
+    traced = jax.jit(supports.offsets_along)(A, b, wanted)
     np.testing.assert_array_equal(traced[0], found)
     np.testing.assert_array_equal(traced[1], True)
 

@@ -6,8 +6,8 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from reachjax.sets import polyhedra
-from reachjax.sets.separation import separation_and_multipliers
+from reachjax.sets import linear_programs
+from reachjax.sets.linear_programs import separation_and_multipliers
 from tests.networks import box_region, simplex_region
 
 fractions = np.vectorize(Fraction, otypes=[object])
@@ -26,7 +26,7 @@ def region(request):
 
 def test_dual_multipliers_are_nonnegative_and_prove_the_support(region):
     for a in np.random.default_rng(0).normal(size=(10, region.A.shape[1])):
-        y, x = polyhedra.maximiser(region.A, region.b, a)
+        y, x = linear_programs.maximiser(region.A, region.b, a)
         assert x @ a == pytest.approx((region.corners @ a).max(), abs=1e-9)
         assert (y >= 0).all()
         np.testing.assert_allclose(y @ region.A, a, atol=1e-12)
@@ -36,16 +36,16 @@ def test_dual_multipliers_are_nonnegative_and_prove_the_support(region):
 @pytest.mark.parametrize("size", [1e-200, 1e200])
 def test_supports_in_directions_whose_squares_are_no_numbers(region, size):
     D = np.random.default_rng(1).normal(size=(10, region.A.shape[1]))
-    values = polyhedra.support(region.A, region.b, size * D)[0]
+    values = linear_programs.support(region.A, region.b, size * D)[0]
     np.testing.assert_allclose(
-        values / size, polyhedra.support(region.A, region.b, D)[0], rtol=1e-9
+        values / size, linear_programs.support(region.A, region.b, D)[0], rtol=1e-9
     )
 
 
 def test_bounds_hold_for_the_exact_corners_of_a_long_thin_triangle():
     # x <= 1, x + 1e6 y >= 0 and x - 1e6 y >= 0: corners (0, 0) and (1, -+1e-6), to rounding
     A, b = np.array([[1.0, 0.0], [-1.0, -1e6], [-1.0, 1e6]]), np.array([1.0, 0.0, 0.0])
-    lower, upper = (fractions(part) for part in polyhedra.bounding_box(A, b)[:2])
+    lower, upper = (fractions(part) for part in linear_programs.bounding_box(A, b)[:2])
     tip = 1 / Fraction(1e6)
     assert lower[0] <= 0
     assert lower[1] <= -tip
@@ -55,34 +55,34 @@ def test_bounds_hold_for_the_exact_corners_of_a_long_thin_triangle():
 
 
 def test_bounds_pay_for_inexact_multipliers(monkeypatch):
-    A, b, inexact = *cube([-2, -1], [1, 3]), polyhedra.maximiser
+    A, b, inexact = *cube([-2, -1], [1, 3]), linear_programs.maximiser
 
     def sloppy(A, b, a):
         y, x = inexact(A, b, a)
         return 0.99 * y + 0.001, x
 
-    monkeypatch.setattr(polyhedra, "maximiser", sloppy)
-    lower, upper, *_ = polyhedra.bounding_box(A, b)
+    monkeypatch.setattr(linear_programs, "maximiser", sloppy)
+    lower, upper, *_ = linear_programs.bounding_box(A, b)
     assert (lower <= [-2, -1]).all()
     assert (upper >= [1, 3]).all()
     directions = np.array([[1.0, 1.0], [-1.0, 0.5]])
-    assert (polyhedra.support(A, b, directions)[0] >= [4.0, 3.5]).all()
+    assert (linear_programs.support(A, b, directions)[0] >= [4.0, 3.5]).all()
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
 def test_the_largest_ball_in_a_cube_and_in_a_simplex(n):
-    center, radius = polyhedra.chebyshev(*cube([1.0] * n, [1.5] * n))
+    center, radius = linear_programs.chebyshev(*cube([1.0] * n, [1.5] * n))
     np.testing.assert_allclose(center, 1.25)
     assert radius == pytest.approx(0.25)
     A, b = np.vstack([-np.eye(n), np.ones((1, n))]), np.r_[np.zeros(n), 1.0]
-    assert polyhedra.chebyshev(A, b)[1] == pytest.approx(1 / (n + np.sqrt(n)))
+    assert linear_programs.chebyshev(A, b)[1] == pytest.approx(1 / (n + np.sqrt(n)))
 
 
 def test_the_largest_ball_of_an_unbounded_or_empty_polytope_is_refused():
     with pytest.raises(ValueError, match="unbounded"):
-        polyhedra.chebyshev(np.array([[1.0, 0.0]]), np.array([1.0]))
+        linear_programs.chebyshev(np.array([[1.0, 0.0]]), np.array([1.0]))
     with pytest.raises(ValueError, match="empty"):
-        polyhedra.chebyshev(np.array([[1.0], [-1.0]]), np.array([0.0, -1.0]))
+        linear_programs.chebyshev(np.array([[1.0], [-1.0]]), np.array([0.0, -1.0]))
 
 
 # Boxes around the origin against a box whose nearest facet is `gap` away: margins are known.
@@ -140,7 +140,7 @@ def test_boxes_of_any_scale_are_found_with_facets_of_any_length(lower, upper, ro
     logs = np.log10(np.where(b == 0, 1.0, abs(b))) + np.log10(rows)
     kept = (b == 0) | (abs(logs) < 300)  # offsets that floats hold
     A, b = np.vstack([A, A[kept] * rows]), np.r_[b, b[kept] * rows]
-    found = polyhedra.bounding_box(A, b)
+    found = linear_programs.bounding_box(A, b)
     size = 1e-12 * np.maximum(np.abs(lower), np.abs(upper))
     assert (found[0] <= lower).all()
     assert (found[1] >= upper).all()
@@ -161,5 +161,7 @@ def test_separations_and_supports_grow_with_their_sets(size):
     scaled = separation_and_multipliers(triangle.A, size * triangle.b, box[0], size * box[1])[0]
     assert scaled == pytest.approx(size * once, rel=1e-9)
     D = np.array([[1.0, 2.0], [-1.0, 0.5]])
-    values = polyhedra.support(triangle.A, size * triangle.b, D)[0]
-    np.testing.assert_allclose(values, size * polyhedra.support(triangle.A, triangle.b, D)[0], 1e-9)
+    values = linear_programs.support(triangle.A, size * triangle.b, D)[0]
+    np.testing.assert_allclose(
+        values, size * linear_programs.support(triangle.A, triangle.b, D)[0], 1e-9
+    )

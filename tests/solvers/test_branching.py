@@ -8,14 +8,13 @@ import pytest
 from scipy.optimize import linprog
 
 from experiments.tightness.exact import exact_maxima
+from reachjax.methods.witnesses import initial_states
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, upper_bounds
 from reachjax.programs.initial import InitialColumns
 from reachjax.proofs.branches import Branches, HorizonFacts, bounds_of, leaf_bounds
-from reachjax.proofs.witnesses import initial_states
 from reachjax.solvers.branching import Tree, affine_leaf, attained_multipliers
-from reachjax.solvers.conic_programs import ConicPrograms
-from reachjax.solvers.linear_programs import LinearPrograms
+from reachjax.solvers.linear_programs import ConicPrograms, LinearPrograms
 from tests.closed_loops import initial_set, on_host, switching_loop
 
 

@@ -11,7 +11,7 @@ import pytest
 import reachjax as rj
 from reachjax.programs.windows import Window
 from reachjax.solvers import Facets, Rounds
-from reachjax.solvers.cut_pool import CutPool, joint
+from reachjax.solvers.cutting_planes import CutPool, joint
 from tests.closed_loops import closed_loop, random_loop
 from tests.networks import box_region, dead_network, saturating_network, simplex_region, simulate
 from tests.quick_cases import some

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes.requirements import requirements
+from reachjax.verdicts.specification import requirements
 
 CORNERS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 ROUND = rj.Ellipsoid([0.3, 0.1], [[0.2, 0.05], [0.05, 0.1]])

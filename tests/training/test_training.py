@@ -409,7 +409,7 @@ def test_mistakes_in_a_specification_are_named_before_anything_is_solved(
 class Never(rj.AbstractSolver):
     """A solver that must not be asked."""
 
-    def solve(self, program):
+    def solve(self, program, goal):
         raise AssertionError("a program was solved")
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.methods import searches
+from reachjax.methods.cell_tree import CellTree
 from reachjax.sets.cells import from_tree
-from reachjax.tubes import searches
-from reachjax.tubes.cell_tree import CellTree
 
 ROOM = str(Path(searches.__file__).parent)
 WATCHED = ("winning.py", "cell_decisions.py", "cell_tree.py", "searches.py", "cell_jobs.py")

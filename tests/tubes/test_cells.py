@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes.cell_tree import Node
+from reachjax.methods.cell_tree import Node
 from tests.quick_cases import some
 
 PERIOD = 0.1
@@ -103,7 +103,7 @@ def test_what_is_interrupted_keeps_what_is_proved(monkeypatch):
     def stopped(self):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("reachjax.tubes.by_cells._Search.run", stopped)
+    monkeypatch.setattr("reachjax.methods.cells._Search.run", stopped)
     with pytest.raises(rj.Interrupted) as caught:
         rj.reach(loop_of(2), STARTS["two"], 3, rj.Template.box(2))
     assert caught.value.tube.horizon == 2

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +48,13 @@ def arrays(tree):
 def equal(one, other):
     assert jax.tree.structure(one) == jax.tree.structure(other)
     assert all(map(np.array_equal, arrays(one), arrays(other), [True] * len(arrays(one))))
+
+
+@pytest.mark.parametrize("name", ["default", "mixed", "cells"])
+def test_files_that_name_classes_by_the_modules_of_an_earlier_layout_are_read(name):
+    path = Path(__file__).parents[1] / "data" / "tubes" / f"{name}.npz"
+    tube = rj.load(path, recheck=True)
+    assert isinstance(tube, rj.PartitionedTube if name == "cells" else rj.ReachTube)
 
 
 def sine(p, x, u):

@@ -7,7 +7,7 @@ import pytest
 
 import reachjax as rj
 from experiments.quadrotor import model
-from reachjax.tubes.recurrent_sets import _safe_part
+from reachjax.verdicts.recurrent_sets import _safe_part
 
 LATER = 2000
 """Steps of simulation, beyond what any proof looks at."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes.by_cells import Cells
+from reachjax.methods.cells import Cells
 
 STEPS, H = 3, Fraction(1, 4)
 

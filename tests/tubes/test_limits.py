@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.methods import cells, recursion
 from reachjax.numerics import budget
-from reachjax.tubes import by_cells, by_programs, recurrence
+from reachjax.verdicts import invariance
 from tests.networks import he_network
 
 PATIENCE = 8.0
@@ -209,7 +210,7 @@ def test_steps_that_keep_to_their_shares_are_begun_and_others_are_not(
     small, spent, by_programs_are, monkeypatch
 ):
     """A step that took more than its share is followed by none that would end after the time."""
-    clock, begun, successors = Clock(), [], by_programs.successors
+    clock, begun, successors = Clock(), [], recursion.successors
 
     def slowly(*given):
         found = successors(*given)
@@ -217,7 +218,7 @@ def test_steps_that_keep_to_their_shares_are_begun_and_others_are_not(
         begun.append(found)
         return found
 
-    monkeypatch.setattr(by_programs, "successors", slowly)
+    monkeypatch.setattr(recursion, "successors", slowly)
     monkeypatch.setattr(budget, "time", clock)
     given = small, rj.Box([1.0], [2.0]), 3, rj.Template.box(1), rj.LocalBounds()
     tube = rj.reach(*given, time_limit=9.0)
@@ -253,14 +254,14 @@ def test_compiled_ellipsoids_are_what_was_asked_for_however_slowly_they_are_trac
 
 def test_cells_that_would_end_after_the_time_are_not_begun(monkeypatch):
     """A cell of a long horizon may take seconds."""
-    made, unrolled = [], by_cells.unrolled
+    made, unrolled = [], cells.unrolled
 
     def slowly(*given):
         made.append(given)
         time.sleep(2.5)
         return unrolled(*given)
 
-    monkeypatch.setattr(by_cells, "unrolled", slowly)
+    monkeypatch.setattr(cells, "unrolled", slowly)
     plant = rj.NonlinearPlant(lambda x, u: x - 0.5 * jnp.sin(2 * x) + 0 * u, 1, 1)
     loop = rj.ClosedLoop(plant, rj.Network(lambda x: 0 * x, 1, 1))
     tube = rj.reach(loop, rj.Box([-1.0], [2.0]), 2, rj.Template.box(1), time_limit=4.0)
@@ -272,10 +273,10 @@ def test_without_time_no_more_is_simulated_for_ever_than_one_turn(small):
     """Hundreds of steps of hundreds of trajectories of a wide network take seconds."""
     X0 = rj.Box([1.0], [2.0])
     runs = [
-        recurrence._long_runs(small, X0, 0, 0, budget.Budget(seconds)) for seconds in (0.0, 600.0)
+        invariance._long_runs(small, X0, 0, 0, budget.Budget(seconds)) for seconds in (0.0, 600.0)
     ]
     some, every = (len(each.states) for each in runs)
-    assert some == len(runs[0].scenarios) == -(-every // recurrence.TURNS)
+    assert some == len(runs[0].scenarios) == -(-every // invariance.TURNS)
     np.testing.assert_allclose(runs[0].states, runs[1].states[:some], rtol=1e-12)
     tube = rj.reach(small, X0, 2, rj.Template.box(1))
     found = rj.verify(tube, safe=rj.Box([-3.0], [3.0]), forever=True, time_limit=0.0)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes.by_branching import Branching
-from reachjax.tubes.by_cells import Cells
-from reachjax.tubes.by_forms import AffineForms
-from reachjax.tubes.by_programs import Recursion
-from reachjax.tubes.disagreements import DisagreementError
-from reachjax.tubes.methods import AbstractMethod
+from reachjax.methods.affine_forms import AffineForms
+from reachjax.methods.branch_and_cut import Branching
+from reachjax.methods.cells import Cells
+from reachjax.methods.problem import AbstractMethod
+from reachjax.methods.recursion import Recursion
+from reachjax.tubes.repeats import DisagreementError
 from tests.networks import he_network
 
 HORIZON = 3
@@ -104,6 +104,7 @@ def test_cells_of_branches_are_tighter_than_both(switching, by_cells):
 def test_what_is_proved_of_cells_is_kept_and_proved_again(by_cells, tmp_path):
     by_cells.save(tmp_path / "tube")
     again = rj.load(tmp_path / "tube", by_cells.loop, recheck=True)
+    assert isinstance(again, rj.ReachTube)
     for t in (1, 2, 3):
         np.testing.assert_allclose(again.sets[t].b, by_cells.sets[t].b, rtol=0, atol=1e-9)
 
@@ -115,6 +116,7 @@ def test_tubes_by_cells_that_went_on_are_proved_again(switching, tmp_path):
     assert len(tube.proof(2).proofs[0]) == 2 or not tube.proof(2).proofs[0]
     tube.save(tmp_path / "tube")
     again = rj.load(tmp_path / "tube", switching, recheck=True)
+    assert isinstance(again, rj.ReachTube)
     for t in (1, 2, 3):
         np.testing.assert_allclose(again.sets[t].b, tube.sets[t].b, rtol=0, atol=1e-9)
 

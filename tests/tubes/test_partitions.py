@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.methods.cell_tree import CellTree, Node
 from reachjax.sets.cells import grid, halves_along
-from reachjax.tubes.cell_tree import CellTree, Node
 from tests.closed_loops import autonomous, closed_loop, random_loop, recursion
 
 RECURSION = {"relaxation": rj.LocalBounds(), "window": 1}
@@ -247,7 +247,7 @@ def test_threads_leave_the_filters_of_warnings_alone(loop):
 @pytest.mark.costly
 def test_an_error_in_a_cell_ends_the_run(loop):
     class Broken(rj.Clarabel):
-        def solve(self, program):
+        def solve(self, program, goal):
             raise KeyboardInterrupt("stopped")  # what else a solver raises is a failed proposal
 
     with pytest.raises(KeyboardInterrupt, match="stopped"):

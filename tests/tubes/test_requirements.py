@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes.requirements import Compared, Requirement
+from reachjax.verdicts.specification import Compared, Requirement
 from tests.closed_loops import recursion
 
 

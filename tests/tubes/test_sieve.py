@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from reachjax.tubes.requirements import requirements
-from reachjax.tubes.sieve import TOGETHER, Sieve
+from reachjax.verdicts.sieve import TOGETHER, Sieve
+from reachjax.verdicts.specification import requirements
 from tests.closed_loops import closed_loop, random_loop
 from tests.disturbed_loops import attacked, double_integrator
 from tests.input_polytopes import polygon, polytope_loop

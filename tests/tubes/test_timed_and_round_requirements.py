@@ -6,7 +6,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
-from reachjax.tubes.requirements import requirements
+from reachjax.verdicts.specification import requirements
 from tests.closed_loops import autonomous
 
 HALVES = autonomous(0.5 * np.eye(2))

@@ -10,7 +10,7 @@ from reachjax.loops.flows.integration import integrated
 from reachjax.loops.flows.series import Tape
 from reachjax.loops.flows.steps import Flowed, Settings, flowed
 from reachjax.loops.flows.taylor_models import TaylorModels, joined
-from reachjax.loops.functions import Function
+from reachjax.loops.tracing.functions import Function
 from reachjax.loops.units import AtUnit
 from reachjax.numerics.rounding import Ball
 

@@ -33,7 +33,8 @@ from reachjax.loops.flows.taylor_models import (
     straight,
     zeros,
 )
-from reachjax.loops.recording import Recorder
+from reachjax.loops.tracing.recording import Recorder
+from reachjax.loops.tracing.values import Step, UnsupportedError, Value
 from reachjax.loops.units import (
     ISRU,
     AbstractUnit,
@@ -59,7 +60,6 @@ from reachjax.loops.units import (
     evaluate,
 )
 from reachjax.loops.units import Step as Jump
-from reachjax.loops.values import Step, UnsupportedError, Value
 from reachjax.numerics.numbers import AbstractNumber, size, widened
 from reachjax.numerics.rounding import UNIT, Ball, namespace
 

@@ -13,21 +13,17 @@ from reachjax.loops.units.base import (
     evaluate,
 )
 from reachjax.loops.units.bilinear import Bilinear
-from reachjax.loops.units.clip import clipped
 from reachjax.loops.units.disturbance import Constraint, Disturbance
 from reachjax.loops.units.exponential import Exp, Log, XLogX
-from reachjax.loops.units.hard_tanh import HardTanh
 from reachjax.loops.units.hyperbolic import Sigmoid, Softplus, Tanh
-from reachjax.loops.units.leaky_relu import LeakyReLU
 from reachjax.loops.units.one_hot import OneHot
-from reachjax.loops.units.powers import Reciprocal, Sqrt, Square
+from reachjax.loops.units.piecewise import HardTanh, LeakyReLU, ReLU, clipped
+from reachjax.loops.units.powers import Reciprocal, Sqrt, Square, Within
 from reachjax.loops.units.projection import ProjectionSlack, projected
-from reachjax.loops.units.relu import ReLU
 from reachjax.loops.units.saturating import ISRU, Asin, Asinh, Erf
 from reachjax.loops.units.smooth import Origin, Quadratic, SmoothUnit, UnboundedError
 from reachjax.loops.units.step import Entered, Floor, Gated, Step
 from reachjax.loops.units.trigonometric import Atan, Cos, Sin, Sinc
-from reachjax.loops.units.within import Within
 
 __all__ = [
     "ISRU",

@@ -118,7 +118,7 @@ class AbstractActivation(abc.ABC):
     def propagate(self, y: Any, unit: AtUnit) -> Any:
         """The value for any kind of number, with `unit` at each unit that it is made of."""
 
-    def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
+    def __call__(self, y: Float[Array, "*k"], /) -> Float[Array, "*k"]:
         """The value `f(y)`."""
         return self.propagate(y, evaluate)
 
@@ -162,8 +162,8 @@ class AbstractUnit(AbstractActivation):
         return self
 
     @abc.abstractmethod
-    def __call__(self, *y: Float[Array, "*k"]) -> Float[Array, "*k"]:
-        """The value `f(y)`."""
+    def __call__(self, y: Float[Array, "*k"], /) -> Float[Array, "*k"]:
+        """The value `f(y)`; units of several inputs take as many vectors."""
 
     def combined(self, y: Any) -> Any:
         """What the inputs of each unit add up to, for any kind of number: of one, itself."""

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.loops.units.active_sets import ActiveSets, Normals, active_sets
+from reachjax.loops.units.active_sets import ActiveSets, Cases, Normals, active_sets
 from reachjax.loops.units.base import AbstractUnit, AtUnit, Block, Facts, Line, Lines, Mark
-from reachjax.loops.units.cases import Cases
-from reachjax.loops.units.relu import PRODUCTS, ZERO
+from reachjax.loops.units.piecewise import PRODUCTS, ZERO
 from reachjax.numerics.rounding import namespace, smaller
 
 ROUNDED = 1e-14

@@ -1,0 +1,155 @@
+"""Proofs of facets by affine forms, over the initial set or over each cell of it."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from reachjax.loops import ClosedLoop
+from reachjax.numerics.checks import floats_of, require_double_precision
+from reachjax.numerics.pytrees import pytree, static
+from reachjax.programs.unrolled import unrolled
+from reachjax.proofs.certificates import AbstractProof, told
+from reachjax.sets import AbstractSet
+from reachjax.sets.cells import from_tree
+
+
+@pytree
+class LinearCertificate(AbstractProof):
+    """Proof of the offsets of one step, `directions x[t] <= bounds`, by affine forms from `X0`.
+
+    What it rests on are the slopes of the lines that stand for the units: they and the loop are all
+    that the forms are made of.
+
+    Attributes:
+        loop: the closed loop.
+        X0: the initial set.
+        directions: `(f, n_x)`, of the facets.
+        slopes: `(k, units)`, of the units at each time before.
+        corners: `(f, n_x)`, initial states at which the forms are largest.
+        k: how many steps after the initial set.
+        start: the time of the initial set.
+    """
+
+    loop: ClosedLoop
+    X0: AbstractSet
+    directions: Float[Array | np.ndarray, "f n_x"]
+    slopes: Float[Array | np.ndarray, "k units"]
+    corners: Float[Array | np.ndarray, "f n_x"]
+    k: int = static()
+    start: int = static()
+
+    def __repr__(self) -> str:
+        return f"LinearCertificate(facets={len(self.bounds)}, steps={self.k})"
+
+    def recheck(
+        self, slopes: Float[np.ndarray, "k units"] | None = None
+    ) -> Float[np.ndarray, " f"]:
+        """Prove the offsets anew, step by step from the initial set, with these or other slopes.
+
+        Sound for any slopes: where two lines of this slope must lie to hold a unit between them is
+        found again on the intervals that are proved on the way. Infinite where they overflow.
+
+        Raises:
+            ValueError: the slopes contain NaN or infinity, or have another shape.
+
+        Example:
+            >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, Template
+            >>> from reachjax import LinearBounds, reach
+            >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+            >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net)
+            >>> tube = reach(loop, Box([-1.0], [2.0]), 2, Template.box(1), LinearBounds())
+            >>> proof = tube.proof(2)
+            >>> bool((proof.recheck() == proof.bounds).all())
+            True
+            >>> bool((proof.recheck(-3 * proof.slopes) >= [0.72, 0.36]).all())
+            True
+        """
+        require_double_precision(certificate=floats_of(self))
+        chosen = np.asarray(self.slopes if slopes is None else slopes)
+        if chosen.shape != self.slopes.shape or not np.isfinite(chosen).all():
+            raise ValueError(
+                f"slopes must be finite and have shape {self.slopes.shape} (steps, units), "
+                f"but {chosen.shape} arrived, {np.isfinite(chosen).sum()} of them finite"
+            )
+        directions = np.broadcast_to(self.directions, (self.k, *self.directions.shape))
+        box = self.X0.bounding_box()
+        *_, last = unrolled(self.loop, self.X0, box, directions, self.start, chosen)
+        return np.where(np.isnan(last.offsets), np.inf, last.offsets)
+
+
+@pytree
+class CellCertificate(AbstractProof):
+    """Proof of the offsets of one step, `directions x[t] <= bounds`, over cells of `X0`.
+
+    The cells are what halving the box around the initial set again and again leaves, so that they
+    cover it whatever they are. Of each, forms are made of nothing but the loop; what proves more of
+    some cells is kept.
+
+    Attributes:
+        loop: the closed loop.
+        X0: the initial set.
+        directions: `(f, n_x)`, of the facets.
+        axes: `(nodes,)`, along which coordinate each part is halved, the initial set first and each
+            half with all of its own before the next; -1 where it is a cell.
+        k: how many steps after the initial set.
+        start: the time of the initial set.
+        proofs: for each cell what proves more than forms: the proof of this step, behind those of
+            steps before that no certificate has; nothing where forms prove all, and nothing at all
+            if that is so of all cells.
+        ways: along how many ways of its decisions a loop that jumps was followed over a cell.
+    """
+
+    loop: ClosedLoop
+    X0: AbstractSet
+    directions: Float[Array | np.ndarray, "f n_x"]
+    axes: Int[Array | np.ndarray, " nodes"]
+    k: int = static()
+    start: int = static()
+    proofs: tuple[tuple[AbstractProof, ...], ...] = ()
+    ways: int = static(default=1)
+
+    def __repr__(self) -> str:
+        return (
+            f"CellCertificate(facets={len(self.bounds)}, cells={self.cells}, steps={self.k}, "
+            f"ended: {told(self.ends)})"
+        )
+
+    @property
+    def cells(self) -> int:
+        """How many there are."""
+        return int(np.sum(np.asarray(self.axes) < 0))
+
+    def recheck(self, axes: Int[np.ndarray, " nodes"] | None = None) -> Float[np.ndarray, " f"]:
+        """Prove the offsets anew, cell by cell, or by forms over other cells.
+
+        Infinite where numbers overflow.
+
+        Raises:
+            ValueError: the axes are no tree: its cells would leave something out.
+
+        Example:
+            >>> import jax.numpy as jnp
+            >>> from reachjax import Box, ClosedLoop, Network, NonlinearPlant, Template, reach
+            >>> plant = NonlinearPlant(lambda x, u: x + 0.1 * jnp.sin(x) + u, states=1, inputs=1)
+            >>> loop = ClosedLoop(plant, Network(lambda x: -jnp.tanh(x), inputs=1, outputs=1))
+            >>> proof = reach(loop, Box([0.0], [1.0]), 2, Template.box(1)).proof(2)
+            >>> bool((proof.recheck() == proof.bounds).all())
+            True
+            >>> bool((proof.recheck([-1]) >= proof.bounds).all())  # one cell
+            True
+        """
+        require_double_precision(certificate=floats_of(self))
+        given = np.asarray(self.axes if axes is None else axes).tolist()
+        directions = np.broadcast_to(self.directions, (self.k, *self.directions.shape))
+        cells, proofs = from_tree(jax.device_put(self.X0), given), self.proofs
+        if axes is not None or not proofs:
+            proofs = ((),) * len(cells)
+        found = []
+        for cell, own in zip(cells, proofs, strict=True):
+            given = self.loop, cell.part, cell.box, directions, self.start
+            *_, last = unrolled(*given, most=self.ways)
+            bounds = np.where(np.isnan(last.offsets), np.inf, last.offsets)
+            found.append(np.fmin(bounds, own[-1].recheck()) if own else bounds)
+        return np.max(found, axis=0)

@@ -1,0 +1,1 @@
+"""What is proved or refuted of a loop: specifications, winning sets, invariance."""

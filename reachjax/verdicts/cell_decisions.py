@@ -1,0 +1,253 @@
+"""Verdicts by cells: each cell of an initial set is proved, or halved, or left undecided.
+
+Cells are bounded by forms, whose remainders fall with the third power of their widths: many in one
+compiled call once there are as many. Those that are left over are bounded one by one
+(`cell_tasks`). What a smooth loop's forms leave out, a half lowers eightfold for the price of a
+form, so its cells get programs only where they are not halved any more. Halves are taken along the
+coordinate that moves the inputs of units most. Of a cell nothing is kept but its box and its
+margins.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import Any
+
+import jax
+import numpy as np
+
+from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.methods.cell_tree import CellTree, Node
+from reachjax.methods.searches import AbstractSearch, Bar, Question
+from reachjax.methods.witnesses import Simulations
+from reachjax.numerics.budget import Budget, Interrupted
+from reachjax.numerics.flags import lenient
+from reachjax.sets import AbstractSet
+from reachjax.verdicts.cell_tasks import CellTask, outcome_of
+from reachjax.verdicts.findings import Findings
+from reachjax.verdicts.sieve import TOGETHER, Ends, Margins, Outcome, Sieve, Unbounded, no_margins
+from reachjax.verdicts.soundness import require_unbroken_cells
+from reachjax.verdicts.verdict import DecidedCell, Verdict, VerdictStatus
+
+PROGRAMS = 50
+"""Linear programs that a bound may take in a cell: halving it is the other way."""
+
+SHOTS, FEWER = 64, 8
+"""How many trajectories are simulated from a cell that is not proved; and from each of many."""
+
+TRIED = 8
+"""After so many cells of a size of which none was proved, one in so many is tried."""
+
+
+def decided_by_cells(
+    task: CellTask,
+    X0: AbstractSet,
+    cells: CellTree,
+    simulations: Simulations | None,
+    budget: Budget,
+    executor: Executor | None = None,
+    progress: Bar | None = None,
+) -> Verdict:
+    """The verdict on all cells.
+
+    Args:
+        task: what is decided.
+        X0: the initial set.
+        cells: of it, to begin with.
+        simulations: trajectories from the set.
+        budget: of the call.
+        executor: runs the cells; None: here.
+        progress: wraps the iteration over cells.
+    """
+    search = _Decisions(task, X0, cells, budget)
+    if simulations is not None:
+        search.findings.simulate(simulations.runs)
+    try:
+        search.run(executor, progress)
+        return search.verdict()
+    except KeyboardInterrupt:
+        message = (
+            "interrupted: this exception's `found` is the verdict so far, whose `cells` that "
+            "are not undecided need not be decided again"
+        )
+        raise Interrupted(message, search.verdict(interrupted=True)) from None
+
+
+@lenient
+def sifted(task: CellTask, cells: Sequence[Ends], budget: Budget) -> list[Outcome | None]:
+    """What forms of many cells say in one compiled call; None where they pay better one by one."""
+    with jax.enable_x64(True):
+        sieve = Sieve(task.loop, task.horizon, task.start, task.required)
+        return [*sieve.sifted(cells)] if sieve.pays(cells, budget) else [None] * len(cells)
+
+
+class _Decisions(AbstractSearch):
+    """What is known of all cells so far.
+
+    Attributes:
+        findings: what trajectories show.
+    """
+
+    ahead = 4
+
+    def __init__(self, task: CellTask, X0: AbstractSet, cells: CellTree, budget: Budget):
+        self._task = task._replace(nodes=min(PROGRAMS, task.nodes))
+        self._X0, self._cells, self._budget = X0, cells, budget
+        self._loop = jax.device_put(task.loop)
+        self._scenarios = Scenarios.of(self._loop, X0, task.horizon, task.start)
+        self.findings = Findings(self._loop, X0, task.horizon, task.start, task.required)
+        self._tried: dict[int, deque[int]] = {}
+        # of a smooth loop programs are the last remedy, of an affine one the next
+        self._first = self._task._replace(nodes=0) if task.loop.curved else self._task
+        self._open, self._last = deque(cells.leaves), deque[Node]()
+        self._left_over = deque[tuple[Node, Margins | None]]()
+        self._shot = 0
+        self._lost: tuple[Unbounded, list[float]] | None = None
+        self._bounded = False
+
+    @property
+    def ended(self) -> bool:
+        """Whether a counterexample is found."""
+        return self.findings.example is not None
+
+    def question(self, asked: int, workers: int) -> Question | None:
+        """Forms of many cells, of one, or what programs say of one that is not halved any more."""
+        while (self._open or self._left_over) and not self._budget.overdue:
+            many = len(self._open) >= TOGETHER and not self._task.loop.jumps
+            if not self._left_over and many and not self._budget.late:
+                some = [self._open.popleft() for _ in range(TOGETHER)]
+                given = self._task, [node.ends for node in some], self._budget
+                return Question(some, sifted, given)
+            node, known = (
+                self._left_over.popleft()
+                if self._left_over
+                else (
+                    self._open.popleft(),
+                    None,
+                )
+            )
+            bounded = known is not None and not self._first.by_programs
+            axis = None if bounded else self._hopeless(node)
+            if axis is None:
+                return self._about(node, self._first, known)
+            self._halve(node, axis)
+        if self._last and not (self._open or self._left_over or self._budget.late):
+            return self._about(self._last.popleft(), self._task)
+        return None
+
+    def _about(self, node: Node, task: CellTask, known: Margins | None = None) -> Question:
+        return Question([node], outcome_of, (task, jax.device_get(node.part), self._budget, known))
+
+    def answered(self, question: Question, answer: Any) -> int:
+        """How many cells are decided, as far as a bar is concerned."""
+        if question.function is sifted:
+            for node, outcome in zip(question.nodes, answer, strict=True):
+                if outcome is not None and outcome.proved:
+                    self._judge(node, outcome)
+                else:
+                    self._left_over.append((node, outcome and outcome.margins))
+        else:
+            (node,), (task, *_) = question.nodes, question.given
+            self._judge(node, answer, task is self._first)
+        waiting = len(self._open) + len(self._left_over) + len(self._last)
+        return self._cells.count - waiting
+
+    def _judge(self, node: Node, outcome: Outcome, first: bool = True) -> None:
+        """Keep what is found of a cell, or halve it, as long as there may be more.
+
+        Where there may not, it is left to programs, if it had none at first.
+        """
+        if outcome.unbounded is not None:
+            self._lost = outcome.unbounded, node.widths.tolist()
+        self._bounded = self._bounded or outcome.unbounded is None
+        node.found = outcome
+        depth = self._cells.halvings(node)
+        if outcome.proved:
+            self._tried.pop(depth, None)
+            return
+        axis = outcome.axis if outcome.axis >= 0 else self._cells.longest(node)
+        self._tried.setdefault(depth, deque()).append(axis)
+        self._shoot(node)
+        if self.ended:
+            return
+        if first and self._may_halve(node, axis):
+            self._halve(node, axis)
+        elif first and self._first is not self._task and self._task.by_programs:
+            self._last.append(node)
+
+    def _may_halve(self, node: Node, axis: int) -> bool:
+        return not self._budget.late and self._cells.can_halve(node, axis)
+
+    def _halve(self, node: Node, axis: int) -> None:
+        halves = self._cells.halved(node, axis)
+        self._cells.replace(node, halves, axis)
+        node.found = None
+        self._open.extend(halves)
+
+    def _hopeless(self, node: Node) -> int | None:
+        """Along which axis to halve a cell at once, if none of its size was proved lately."""
+        tried = self._tried.get(self._cells.halvings(node), deque())
+        if len(tried) < TRIED or not self._may_halve(node, tried[-1]):
+            return None
+        if len(tried) % TRIED == 0:  # this one is tried, and counted when it is judged
+            tried.append(tried[-1])
+            return None
+        tried.append(tried[-1])
+        return tried[-1]
+
+    def _shoot(self, node: Node) -> None:
+        """Simulate a few trajectories from a cell: corners and points."""
+        self._shot += 1
+        rng = np.random.default_rng(self._shot)
+        lower, upper = node.ends
+        shots = SHOTS if self._cells.count < SHOTS else FEWER
+        ends = rng.uniform(size=(shots, len(lower)))
+        ends[: shots // 2] = ends[: shots // 2] > 0.5
+        states = np.clip(lower + ends * (upper - lower), lower, upper)
+        states = states[np.asarray(self._X0.contains(states))]
+        if len(states):
+            task, drawn = self._task, self._scenarios.drawn(states, self._shot)
+            after = self._scenarios.runs(task.loop, drawn, task.horizon, task.start)
+            self.findings.simulate(Runs(drawn, after))
+
+    def verdict(self, interrupted: bool = False) -> Verdict:
+        """The verdict from all cells that were looked at.
+
+        Args:
+            interrupted: whether somebody stopped that.
+
+        Raises:
+            UnboundedError: there is no cell over which all units have bounds.
+            UnsoundError: a trajectory breaks what is proved.
+        """
+        task, example = self._task, self.findings.example
+        if self._lost and not (self._bounded or example or interrupted):
+            unbounded, widths = self._lost
+            raise unbounded.error.after(self._cells.count, widths)
+        blank = Outcome(False, no_margins(task.required, task.horizon))
+        found = [(node, node.found or blank) for node in self._cells.leaves]
+        cells = tuple(self._decided(node, outcome) for node, outcome in found)
+        known = task.horizon, task.start, task.required, cells
+        require_unbroken_cells(self._loop, self._X0, *known, example)
+        proved = bool(found) and all(outcome.proved for _, outcome in found)
+        for item in task.required:
+            margins = np.array([outcome.margins[item.name][item.time] for _, outcome in found])
+            least = -np.inf if np.isnan(margins).any() else float(margins.min(initial=np.inf))
+            if proved:
+                self.findings.prove(item, least, True)
+            else:
+                self.findings.bound(item, least)
+        decisions = tuple(decision for _, outcome in found for decision in outcome.open)
+        return self.findings.verdict(cells=cells, decisions=decisions)
+
+    def _decided(self, node: Node, outcome: Outcome) -> DecidedCell:
+        """What is said of a cell; a counterexample from a proved one would be a contradiction."""
+        status = VerdictStatus.PROVED if outcome.proved else VerdictStatus.UNKNOWN
+        example = self.findings.example
+        if example is not None and not outcome.proved:
+            first = example.states[0]
+            if np.all((node.lower <= first) & (first <= node.upper)):
+                status = VerdictStatus.REFUTED
+        return DecidedCell(*node.ends, status, outcome.margin)

@@ -1,0 +1,197 @@
+"""Counterexamples: trajectories that surely break a requirement, rounding accounted for."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.loops.batches import PARTS
+from reachjax.loops.closed_loop import Scenario
+from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.loops.units import AbstractUnit
+from reachjax.numerics.host import in_numpy
+from reachjax.numerics.rounding import TINY, gamma
+from reachjax.programs.bounds import successor_box
+from reachjax.sets import AbstractSet, Box, Ellipsoid
+from reachjax.sets.balance import balanced
+from reachjax.verdicts.specification import Requirement
+from reachjax.verdicts.verdict import Counterexample
+
+SUSPECTS = 5
+"""So many of the worst trajectories of each requirement are examined with their rounding."""
+
+TOLERATED = 16
+"""A simulated state may be beside the enclosure of its step by so many widths of that: rounding of
+compiled code is within it, but for what libraries of functions leave out."""
+
+
+class Suspect(NamedTuple):
+    """A simulated trajectory that seems to break a requirement.
+
+    Attributes:
+        room: how far it is on the right side: not at all.
+        item: the requirement.
+        scenario: `(s,)`, what it is a function of.
+        states: `(h + 1, n_x)`.
+    """
+
+    room: float
+    item: Requirement
+    scenario: np.ndarray
+    states: np.ndarray
+
+
+def suspects(item: Requirement, rooms: np.ndarray, runs: Runs) -> list[Suspect]:
+    """The worst of some runs, of which these are the rooms `(c,)`."""
+    worst = np.argsort(rooms)[:SUSPECTS]
+    return [Suspect(float(rooms[k]), item, *runs.some(k)) for k in worst if rooms[k] <= 0]
+
+
+def counterexample(
+    loop: ClosedLoop, X0: AbstractSet, found: Iterable[Suspect], start: int
+) -> Counterexample | None:
+    """The worst suspect whose scenario surely is one and breaks its requirement; None if none."""
+    ordered = sorted(found, key=lambda suspect: suspect.room)
+    if not ordered:
+        return None
+    scenarios = Scenarios.of(loop, X0, len(ordered[0].states) - 1, start)
+    on_host = in_numpy(loop)
+    for room, item, scenario, states in ordered:
+        drawn = loop.split(scenario)
+        if not scenarios.surely_contains(scenario):
+            continue
+        part = broken_at(on_host, item, drawn, start)
+        if part is not None:
+            _, w, v = drawn
+            noises = [None] * (len(states) - 1) if v is None else v
+            inputs = [
+                on_host.input(x, start + t, v=noise)
+                for t, (x, noise) in enumerate(zip(states[:-1], noises, strict=True))
+            ]
+            parts = item.name, item.time, -room, states, np.stack(inputs)
+            plant: Any = on_host.plant
+            instant = (item.time - 1 + part) * float(plant.period) if plant.continuous else None
+            closest = closest_decision(on_host, states[: item.time + 1], drawn, start)
+            more = {"instant": instant, "decision": closest}
+            return Counterexample(*parts, disturbances=w, noises=v, **more)
+    return None
+
+
+def closest_decision(
+    loop: ClosedLoop, states: Float[np.ndarray, "t n_x"], scenario: Scenario, start: int
+) -> float | None:
+    """How far from zero what is compared on a trajectory is at least; None if nothing jumps."""
+    (_, w, v), found = scenario, list[float]()
+
+    def apply(unit: Any, *y: Any) -> Any:
+        if isinstance(unit, AbstractUnit) and unit.jumps:
+            found.append(unit.distance(*y))
+        return unit(*y)
+
+    if loop.jumps:
+        for t, x in enumerate(states[:-1]):
+            push, noise = (None if part is None else part[t] for part in (w, v))
+            loop.step(x, start + t, apply, push, noise)
+    return min(found, default=None)
+
+
+def broken_at(loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int) -> float | None:
+    """Where the exact trajectory of a scenario surely breaks a requirement, rounding accounted for.
+
+    Returns:
+        The part of the period before, 1 at the sample; None where that is not known.
+    """
+    reached = enclosures(loop, scenario, item.time, start)
+    if most_room(item, reached[-1]) < 0:
+        return 1.0
+    if not item.throughout:
+        return None
+    plant: Any = loop.plant
+    t, before = item.time - 1, reached[-2]
+    drawn = [None if each is None else each[t] for each in scenario[1:]]
+    for part in PARTS:
+        shorter = in_numpy(loop.replace(plant=plant.replace(period=part * plant.period)))
+        held = start + t, *drawn
+        if most_room(item, successor_box(shorter, before, *held)) < 0:
+            return part
+    return None
+
+
+def enclosures(loop: ClosedLoop, scenario: Scenario, steps: int, start: int) -> list[Box]:
+    """Boxes around the states of the exact trajectory of a scenario, rounding accounted for."""
+    loop, (x0, w, v) = in_numpy(loop), scenario
+    found = [Box(x0, x0)]
+    for t in range(steps):
+        drawn = (None if part is None else part[t] for part in (w, v))
+        found.append(successor_box(loop, found[-1], start + t, *drawn))
+    return found
+
+
+def deviates(
+    loop: ClosedLoop, scenario: Scenario, states: Float[np.ndarray, "t n_x"], start: int
+) -> bool:
+    """Whether a simulated trajectory leaves the enclosure of a step by more than rounding.
+
+    Each step is enclosed from the state that was simulated, so that nothing adds up. Then what was
+    simulated is another loop than what is bounded.
+    """
+    loop, (_, w, v) = in_numpy(loop), scenario
+    for t, (x, following) in enumerate(itertools.pairwise(states)):
+        drawn = (None if part is None else part[t] for part in (w, v))
+        reached = successor_box(loop, Box(x, x), start + t, *drawn)
+        lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
+        with np.errstate(over="ignore", invalid="ignore"):
+            beyond = np.maximum(lower - following, following - upper)
+            slack = TOLERATED * (upper - lower + np.spacing(abs(following)))
+        if np.any(beyond > slack):
+            return True
+    return False
+
+
+def most_room(item: Requirement, reached: Box) -> float:
+    """How far a state of a box may be on the right side of a requirement, at most.
+
+    Negative where every state of it surely breaks the requirement. Of an ellipsoid only the sign is
+    known: infinite, or the least negative number.
+    """
+    lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
+    if item.ball is not None:
+        broken = _surely_beyond if item.inside else _surely_within
+        return -TINY if broken(item.ball, reached) else np.inf
+    C, d = balanced(*(np.asarray(part) for part in item.region.facets), inner=not item.inside)
+    ends = np.where(C > 0, lower, upper), np.where(C > 0, upper, lower)
+    with np.errstate(over="ignore", invalid="ignore"):
+        least, most = (np.sum(C * end, axis=1) for end in ends)
+        size = np.sum(abs(C) * np.maximum(abs(lower), abs(upper)), axis=1)
+        underflow = TINY * ((C != 0) @ ((lower != 0) | (upper != 0)))
+        error = gamma(len(lower)) * size + underflow
+        lengths = np.linalg.norm(C, axis=1)
+        if item.inside:  # the comparison decides, whatever becomes of the quotient
+            broken = bool(np.any(least - error > d))
+            room = float(np.min((d - (least - error)) / lengths))
+        else:
+            broken = bool(np.all(most + error <= d))
+            room = float(np.max((most + error - d) / lengths))
+    if broken:
+        return min(room, -TINY)
+    return np.inf if np.isnan(room) else max(room, 0.0)
+
+
+def _surely_within(ball: Ellipsoid, box: Box) -> bool:
+    """Whether a box lies in an ellipsoid, in exact arithmetic: its corners do."""
+    return all(map(ball.surely_contains, np.asarray(box.corners())))
+
+
+def _surely_beyond(ball: Ellipsoid, box: Box) -> bool:
+    """Whether a box and an ellipsoid surely have no point in common: a tangent is between them."""
+    normal = np.asarray(ball.normal_towards(box))
+    least = np.where(normal > 0, np.asarray(box.lower), np.asarray(box.upper))
+    size = np.sum(abs(normal * least)) + TINY * len(normal)
+    with np.errstate(over="ignore", invalid="ignore"):
+        near = np.sum(normal * least) - gamma(len(normal)) * size - TINY * len(normal)
+    return bool(near > float(ball.support(normal[None])[0]))

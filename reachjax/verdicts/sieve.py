@@ -1,0 +1,278 @@
+"""Which of many cells affine forms decide, all in one compiled call.
+
+What one cell takes in numpy, ten take together, but only once the call is compiled: that is done
+beside cells that are bounded one by one, once there were so many of these that it pays. Cells that
+are left over are for whoever can do more: linear programs, or halving them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.loops.units import UnboundedError
+from reachjax.numerics.budget import Budget
+from reachjax.numerics.compilations import CompiledBeside
+from reachjax.numerics.host import in_numpy
+from reachjax.numerics.rounding import gamma
+from reachjax.programs.followed import OpenDecision
+from reachjax.programs.unrolled import ByForms, along_ways, unrolled, unrolled_from_boxes
+from reachjax.sets import AbstractSet, Box
+from reachjax.sets.balance import balanced
+from reachjax.verdicts.specification import Requirement
+
+TOGETHER = 32
+"""So many cells are a call: fewer are filled up, so that one shape is compiled."""
+
+SIFT = CompiledBeside(unrolled_from_boxes)
+
+Margins = dict[str, Float[np.ndarray, " h+1"]]
+
+Ends = tuple[Float[np.ndarray, " n_x"], Float[np.ndarray, " n_x"]]
+"""Lower and upper corners of a cell."""
+
+
+def no_margins(required: Iterable[Requirement], horizon: int) -> Margins:
+    """Margins of requirements of which nothing is known."""
+    return {item.name: np.full(horizon + 1, np.nan) for item in required}
+
+
+def smallest(margins: Margins) -> float:
+    """The smallest that is known; minus infinity where none is."""
+    known = [np.nanmin(row) for row in margins.values() if not np.isnan(row).all()]
+    return float(min(known, default=-np.inf))
+
+
+class Unbounded(NamedTuple):
+    """An `UnboundedError` as other processes can send it.
+
+    Attributes:
+        given: what it was made of.
+    """
+
+    given: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, error: UnboundedError) -> Unbounded:
+        """The record of an error."""
+        return cls((*error.given, error.line))
+
+    @property
+    def error(self) -> UnboundedError:
+        """The error, to be raised."""
+        return UnboundedError(*self.given)
+
+
+class Outcome(NamedTuple):
+    """What is found of a cell.
+
+    Attributes:
+        proved: whether all requirements hold from every state of it.
+        margins: of those that were looked at; NaN of the others.
+        refuted: whether one of them fails from every state of it.
+        axis: along which it should be halved; -1 where nothing says that.
+        unbounded: the unit that has no bounds over it, if there is one.
+        open: decisions that may go either way from it, as far as that was looked at.
+    """
+
+    proved: bool
+    margins: Margins
+    refuted: bool = False
+    axis: int = -1
+    unbounded: Unbounded | None = None
+    open: tuple[OpenDecision, ...] = ()
+
+    @property
+    def margin(self) -> float:
+        """The smallest known margin."""
+        return smallest(self.margins)
+
+
+class _Rows(NamedTuple):
+    """Directions whose upper bounds decide a requirement, and the limits of these.
+
+    To be inside, all of `C x <= d`; to be outside, one of `-C x < -d`. The other way round, by
+    limits that are rounded the other way, it surely fails.
+
+    Attributes:
+        item: the requirement.
+        first: the number of its first direction among those of its time.
+        directions: `(2 k, n_x)`, those that prove it, then those that refute it.
+        limits: `(2 k,)`.
+        units: `(k,)`, what a distance of 1 in the units of the state changes the first by.
+    """
+
+    item: Requirement
+    first: int
+    directions: Float[np.ndarray, "2k n_x"]
+    limits: Float[np.ndarray, " 2k"]
+    units: Float[np.ndarray, " k"]
+
+    @classmethod
+    def of(cls, item: Requirement, first: int) -> _Rows:
+        """The rows of a requirement."""
+        C, d, norms = (np.asarray(part) for part in item.region.facets_in_units(item.inside))
+        facets = (np.asarray(part) for part in item.looser.facets)
+        D, e = balanced(*facets, inner=not item.inside)
+        sign = 1.0 if item.inside else -1.0
+        directions, limits = (
+            np.concatenate([sign * proving, -sign * refuting])
+            for proving, refuting in ((C, D), (d, e))
+        )
+        return cls(item, first, directions, limits, norms)
+
+    @property
+    def end(self) -> int:
+        """The number of the first direction after its own."""
+        return self.first + len(self.limits)
+
+    def judged(self, uppers: Float[np.ndarray, " m"]) -> tuple[bool, bool, float]:
+        """Whether it surely holds, or surely fails, and its margin, given bounds at its time."""
+        found, k = uppers[self.first : self.end], len(self.units)
+        room = (self.limits - found)[:k] / self.units
+        known = np.isfinite(found)
+        if self.item.inside:
+            holds = known[:k].all() and (found[:k] <= self.limits[:k]).all()
+            fails = (known & (found < self.limits))[k:].any()
+            margin = room.min(initial=np.inf)
+        else:
+            holds = (known & (found < self.limits))[:k].any()
+            fails = known[k:].all() and (found[k:] <= self.limits[k:]).all()
+            margin = np.fmax.reduce(room)
+        return bool(holds), bool(fails), float(np.nan_to_num(margin, nan=-np.inf))
+
+
+class Sieve:
+    """Affine forms over many cells, and what they decide.
+
+    Args:
+        loop: the closed loop.
+        horizon: the number of steps.
+        start: the time of the cells.
+        required: the requirements.
+    """
+
+    def __init__(self, loop: ClosedLoop, horizon: int, start: int, required: Sequence[Requirement]):
+        self._loop, self._on_host, self._start = jax.device_put(loop), in_numpy(loop), start
+        ends = np.zeros(horizon + 1, dtype=int)
+        self._rows: list[_Rows] = []
+        for item in required:
+            self._rows.append(_Rows.of(item, int(ends[item.time])))
+            ends[item.time] = self._rows[-1].end
+        directions = np.zeros((horizon + 1, int(ends.max()), loop.states))
+        whole = np.zeros(directions.shape[:2], dtype=bool)
+        for rows in self._rows:
+            directions[rows.item.time, rows.first : rows.end] = rows.directions
+            whole[rows.item.time, rows.first : rows.end] = rows.item.throughout
+        self._directions, self._later = directions, jnp.asarray(directions[1:])
+        self._whole = jnp.asarray(whole[1:]) if whole.any() else None
+
+    def pays(self, cells: Sequence[Ends], budget: Budget) -> bool:
+        """Whether the compiled call is there, and faster than what these cells take one by one.
+
+        Args:
+            cells: that may be bounded so, or else will be one by one.
+            budget: of the whole call.
+        """
+        steps = max(len(self._directions) - 1, 1)
+        return SIFT.pays(
+            *self._given(cells),
+            seconds=lambda: self._measured(cells[0]),
+            evaluations=TOGETHER * steps,
+            left=budget.left,
+            t=self._start,
+        )
+
+    def _measured(self, cell: Ends) -> float | None:
+        """The seconds that a call takes one by one; None where this cell has no bounds."""
+        box, began = in_numpy(Box(*cell)), time.perf_counter()
+        try:
+            between = self._whole is not None
+            given = self._on_host, box, box, self._directions[1:], self._start
+            list(unrolled(*given, between=between))
+        except UnboundedError:
+            return None
+        return TOGETHER * (time.perf_counter() - began)
+
+    def _given(self, cells: Sequence[Ends]) -> tuple[Any, ...]:
+        """The arguments of the compiled call."""
+        filled = [*cells, *[cells[-1]] * (TOGETHER - len(cells))]
+        lower, upper = (np.stack(ends) for ends in zip(*filled, strict=True))
+        return self._loop, lower, upper, self._later, self._whole
+
+    def sifted(self, cells: Sequence[Ends]) -> list[Outcome]:
+        """What is found of each cell, at most `TOGETHER` of them."""
+        _, lower, upper, *_ = given = self._given(cells)
+        bounds = SIFT(*given, t=self._start)
+        first = _at_first(self._directions[0], lower, upper)
+        bounds = np.concatenate([first[:, None], bounds], axis=1)
+        with np.errstate(invalid="ignore"):
+            return [self._judged(uppers) for uppers in bounds[: len(cells)]]
+
+    def followed(self, part: AbstractSet, box: Box, most: int, budget: Budget) -> Outcome:
+        """What is found of one cell along all ways of its decisions, on the host.
+
+        It ends with the first step at which a requirement is not proved.
+
+        Args:
+            part: the cell.
+            box: around it.
+            most: along how many ways.
+            budget: of the whole call.
+
+        Raises:
+            UnboundedError: a unit has no bounds over it.
+        """
+        items, horizon = [rows.item for rows in self._rows], len(self._directions) - 1
+        margins, still_open = no_margins(items, horizon), dict[OpenDecision, None]()
+        first = ByForms(_at_first(self._directions[0], box.lower[None], box.upper[None])[0], (), ())
+        between = self._whole is not None
+        whole = np.asarray(self._whole) if between else np.zeros(self._later.shape[:2], bool)
+        given = self._on_host, part, box, self._directions[1:], self._start
+        later = along_ways(*given, between=between, most=most)
+        for k, each in enumerate(itertools.chain([[first]], later)):
+            still_open |= dict.fromkeys(decision for one in each for decision in one.open)
+            uppers = [one.offsets for one in each]
+            if between and k:
+                both = zip((one.between for one in each), uppers, strict=True)
+                uppers = [np.where(whole[k - 1], *pair) for pair in both]
+            uppers = [upper for upper in uppers if not np.isneginf(upper).all()]  # no states
+            for rows in self._rows:
+                if rows.item.time == k:
+                    found = [rows.judged(upper) for upper in uppers]
+                    least = min((margin for *_, margin in found), default=np.inf)
+                    margins[rows.item.name][k] = least
+                    if not all(holds for holds, *_ in found):
+                        return Outcome(False, margins, open=tuple(still_open))
+            if budget.overdue:
+                return Outcome(False, margins, open=tuple(still_open))
+        return Outcome(True, margins)
+
+    def _judged(self, uppers: Float[np.ndarray, "h+1 m"]) -> Outcome:
+        """What bounds say of one cell."""
+        items, proved, refuted = [rows.item for rows in self._rows], True, False
+        margins = no_margins(items, len(uppers) - 1)
+        for rows in self._rows:
+            item = rows.item
+            holds, fails, margin = rows.judged(uppers[item.time])
+            margins[item.name][item.time] = margin
+            proved, refuted = proved and holds, refuted or fails
+        return Outcome(proved, margins, refuted)
+
+
+def _at_first(
+    rows: Float[np.ndarray, "m n"], lower: Float[np.ndarray, "c n"], upper: Float[np.ndarray, "c n"]
+) -> Float[np.ndarray, "c m"]:
+    """What rows attain on boxes: exactly, if each is a coordinate, else rounded up."""
+    largest = np.maximum(rows * lower[:, None], rows * upper[:, None])
+    whole = np.isin(rows, (-1.0, 0.0, 1.0)).all(axis=1) & (np.count_nonzero(rows, axis=1) < 2)
+    error = gamma(2 * rows.shape[1]) * abs(largest).sum(axis=2)
+    return largest.sum(axis=2) + np.where(whole, 0.0, error)

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from scipy.optimize import linprog
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.units import AbstractUnit
+from reachjax.loops.units import AbstractUnit, Step
 from reachjax.numerics.rounding import TINY
 from reachjax.programs.affine import AffineForms, joined
 from reachjax.programs.affine_steps import UnitForms, step_forms
@@ -215,6 +215,7 @@ def _advanced(
         _ForkError: another decision is open.
     """
     here, still_open = way, list[OpenDecision]()
+    compared = list[tuple[AffineForms, Step, dict[int, bool]]]()
 
     def ranges(
         unit: AbstractUnit | None, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
@@ -232,13 +233,23 @@ def _advanced(
         if not unit.jumps:
             return lower, upper
         layer = len(found)
+        held = dict[int, bool]()
+        if isinstance(unit, Step):
+            compared.append((y, unit, held))
         for (at, entry), (above, size) in signs.items():
             if at != layer:
                 continue
             still_open.append(OpenDecision(given["t"], unit.line, size))
             if (upper[entry] <= -TINY) if above else (lower[entry] >= TINY):
                 raise NoStatesError
-            here = here.on_a_side(y[entry : entry + 1], above)
+            here, held[entry] = here.on_a_side(y[entry : entry + 1], above), above
+        for other, before, known in compared:
+            if isinstance(unit, Step) and other is y:  # of one number `>` is no more than `>=`
+                first, last = before.at_zero, unit.at_zero
+                held.update(
+                    (k, v) for k, v in known.items() if (first <= last if v else first >= last)
+                )
+        for entry, above in held.items():
             if above:
                 lower[entry] = max(lower[entry], TINY)
                 upper[entry] = max(lower[entry], upper[entry])

@@ -314,6 +314,10 @@ def _largest(
     cost, limits = -(objective[:, used] / scale[:, None]), (-1.0, 1.0)
     if not (np.isfinite(G).all() and np.isfinite(c).all() and np.isfinite(cost).all()):
         return None
+    if not len(used):  # facts are of rounding alone
+        return least * np.eye(1, len(c), int(c.argmin())) + np.zeros((count, len(c))), np.sign(
+            objective
+        )
     if least:
         G = np.concatenate([G, -np.ones((len(G), 1))], axis=1)
         given: Any = np.r_[np.zeros(len(used)), -1.0], -G, c

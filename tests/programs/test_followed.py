@@ -41,7 +41,7 @@ def after_relayed(x):
 
 def after_waving(x):
     cases = {"above": x[0] + 1, "below": -1.0}
-    taken = ["above"] * (x[0] >= x[1]) + ["below"] * (x[0] <= x[1])
+    taken = ["above"] * int(x[0] >= x[1]) + ["below"] * int(x[0] <= x[1])
     return [(x[0] + H * np.sin(x[1]), x[1] - H * cases[each]) for each in taken]
 
 
@@ -68,7 +68,7 @@ def trajectories(law):
     ends = np.linspace(-0.5, 0.5, 9)
     grid = [*itertools.product(ends, ends)]
     beside = [(np.nextafter(a, 1), b) for a, b in grid if a < 0.5]
-    drawn = np.random.default_rng(0).uniform(-0.5, 0.5, size=(300, 2))
+    drawn = np.random.default_rng(0).uniform(-0.5, 0.5, size=(4000, 2))
     states, found = [*grid, *beside, *map(tuple, drawn)], []
     for _ in range(STEPS):
         states = [after for x in states for after in law(np.array(x))]
@@ -96,7 +96,7 @@ def test_all_ways_together_are_as_wide_as_what_is_simulated(name):
     box = jax.device_get(BOX)
     given = loop_of(plant), box, box, DIRECTIONS
     wide = [each.offsets for each in unrolled(*given)]
-    followed = [each.offsets for each in unrolled(*given, most=200)]
+    followed = [each.offsets for each in unrolled(*given, most=100)]
     for states, one, all_of_them in zip(trajectories(law), wide, followed, strict=True):
         most = (states @ ROWS.T).max(axis=0)
         assert np.all(all_of_them <= one + 1e-12)

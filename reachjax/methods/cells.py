@@ -210,14 +210,15 @@ class _Search(AbstractSearch):
         self._generations = max(GENERATIONS, 2 * wide)
         self._deepest = 2 * math.ceil(math.log2(method.most))
         self._longest = self._slowest = 0.0
-        known = is_concrete(problem.loop, problem.X0, problem.directions)
         # derivatives are those of forms that hold each decision that is open
-        self.ways = WAYS if known and self._loop.jumps else 1
+        known = is_concrete(problem.loop, problem.X0, problem.directions)
+        self._follows = known and self._loop.jumps
+        self._asks, self._price = method.inner.adds_to_forms(loop), 0.0
+        self.ways = WAYS if self._follows and not self._asks else 1
         self._wanted_bounds: np.ndarray | None = None
         root.found = self._by_forms(root)
         self._all = self._left = affordable(self._loop, problem.horizon, problem.budget)
         self._form = MULTIPLICATIONS / affordable(self._loop, problem.horizon, Budget())
-        self._asks, self._price = method.inner.adds_to_forms(loop), 0.0
         self._stuck = False
         self._planned, self._wanted, self._halvings, self._looked = False, 1, 0, -1
         self.end = SolverStatus.UNKNOWN_GAP
@@ -358,6 +359,11 @@ class _Search(AbstractSearch):
         before, after = (self._beyond(found.offsets) for found in (node.found, tried))
         self._planned = True
         self._asks = bool(after.sum() <= (1 - CLOSED) * before.sum())
+        if self._follows and not self._asks:  # what is left open is left so by decisions
+            self.ways = WAYS
+            followed = self._by_forms(node)
+            self._left -= followed.effort
+            node.found = followed if followed.is_bounded else node.found
         if self._asks:
             most = self._left / (2 + self._price)
             seconds = 2 * self._longest + self._slowest

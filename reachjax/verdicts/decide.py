@@ -21,7 +21,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.loops.units import UnboundedError
 from reachjax.methods.cell_tree import CellTree
-from reachjax.methods.cells import affordable
+from reachjax.methods.cells import WAYS, affordable
 from reachjax.methods.ladder import WORK, Ladder, StepBounds
 from reachjax.methods.propagation import (
     Progress,
@@ -202,7 +202,8 @@ def _by_remedies(
 
     by_cells, most = None, 1
     if loop.curved:
-        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / 2))
+        each = 2 * WAYS if loop.jumps else 2
+        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / each))
     if most > 1:
         with contextlib.suppress(UnboundedError):  # of halves there may be bounds
             climb(0)

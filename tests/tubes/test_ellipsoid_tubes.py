@@ -12,8 +12,8 @@ import pytest
 import reachjax as rj
 from reachjax.programs.presolve import presolved
 from reachjax.proofs.proposal import ANSWERS, Proposal
-from reachjax.solvers import GivenShape, least_volume
-from reachjax.solvers.least_volume import flat, form_of
+from reachjax.solvers import GivenShape, ellipsoids
+from reachjax.solvers.ellipsoids import flat, form_of
 from tests.closed_loops import one_step, recursion
 from tests.differences import error_in_all_parts
 from tests.quick_cases import some
@@ -220,7 +220,7 @@ class Held(rj.AbstractSolver):
 )
 @pytest.mark.costly
 def test_the_gradient_of_what_is_reported_is_the_central_difference(answering, shape, monkeypatch):
-    monkeypatch.setattr(least_volume, "ATTEMPTS", 1)  # others would begin where the first one ended
+    monkeypatch.setattr(ellipsoids, "ATTEMPTS", 1)  # others would begin where the first one ended
     args, template = case(2, 0, hidden=(4, 3)), rj.EllipsoidTemplate(shape)
     f = final(template, 1, solver=Held(answering))
     assert f(*args) > final(template, 1)(*args) + 1e-3

@@ -28,9 +28,6 @@ KEPT = (
     "leaky, traced 951",
     "relu, round 1051",
     "linear, octagonal 301",
-    "argmax; forms",
-    "friction; forms",
-    "sampled; forms",
 )
 """Cases of which nothing is compiled: what is said of them is kept beside the tests."""
 

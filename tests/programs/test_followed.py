@@ -95,6 +95,7 @@ def test_all_ways_together_are_as_wide_as_what_is_simulated(name):
     plant, law = LAWS[name]
     box = jax.device_get(BOX)
     given = loop_of(plant), box, box, DIRECTIONS
+    most, room = np.zeros(0), np.zeros(0)
     wide = [each.offsets for each in unrolled(*given)]
     followed = [each.offsets for each in unrolled(*given, most=100)]
     for states, one, all_of_them in zip(trajectories(law), wide, followed, strict=True):

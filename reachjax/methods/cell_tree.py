@@ -58,6 +58,11 @@ class Node:
         return Box(self.lower, self.upper)
 
     @property
+    def is_box(self) -> bool:
+        """Whether it is a box, and no part of another set."""
+        return isinstance(self.part, Box)
+
+    @property
     def part(self) -> AbstractSet:
         """The part of the set."""
         return self.box if self._part is None else self._part

@@ -25,6 +25,7 @@ from reachjax.numerics.rounding import gamma
 from reachjax.programs.unrolled import unrolled, unrolled_from_boxes
 from reachjax.sets import Box
 from reachjax.sets.balance import balanced
+from reachjax.verdicts.grounds import Leaves
 from reachjax.verdicts.specification import Requirement
 
 TOGETHER = 32
@@ -78,6 +79,7 @@ class Outcome(NamedTuple):
         refuted: whether one of them fails from every state of it.
         axis: along which it should be halved; -1 where nothing says that.
         unbounded: the unit that has no bounds over it, if there is one.
+        leaves: of requirements that forms alone do not prove.
     """
 
     proved: bool
@@ -85,6 +87,7 @@ class Outcome(NamedTuple):
     refuted: bool = False
     axis: int = -1
     unbounded: Unbounded | None = None
+    leaves: tuple[Leaves, ...] = ()
 
     @property
     def margin(self) -> float:

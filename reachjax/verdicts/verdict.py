@@ -13,21 +13,26 @@ from __future__ import annotations
 import dataclasses
 import enum
 import html
+import json
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
+from reachjax.numerics.archives import writable
 from reachjax.numerics.checks import Numbers, require_kind, same_size
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.seals import Seal
 from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.proofs.proposal import AS_ASKED, SolverStatus
-from reachjax.sets import Box, PolyhedralSet
+from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
 from reachjax.sets.pictures import draw_boxes
 from reachjax.tubes.displays import display, picture, table
+from reachjax.tubes.saving import keep
+from reachjax.verdicts.grounds import Asked, Grounds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,6 +60,9 @@ class Counterexample:
         noises: `(horizon, n_x)`; None of a loop without.
         instant: when, in the plant's units of time, of a differential equation: it may be in
             between the sample at `time` and the one before.
+        lower: `(time + 1, n_x)`, the exact trajectory at samples is above, rounding accounted for,
+        upper: `(time + 1, n_x)`, and below. In between samples the last row is of `instant`.
+        region: the set that states must be in, or be out of.
     """
 
     requirement: str
@@ -65,6 +73,46 @@ class Counterexample:
     disturbances: Float[np.ndarray, "h n_w"] | None = None
     noises: Float[np.ndarray, "h n_x"] | None = None
     instant: float | None = None
+    lower: Float[np.ndarray, "t n_x"] | None = None
+    upper: Float[np.ndarray, "t n_x"] | None = None
+    region: AbstractSet | None = None
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the trajectory as JSON, which anybody can check.
+
+        Numbers are those of the computer, to the last bit, as Python and others read decimals.
+
+        Args:
+            path: of the file; one that is there is replaced.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        count, required = self.time, _as_numbers(self.region, self.requirement)
+        parts = {
+            "initial_state": self.states[0],
+            "inputs": self.inputs[:count],
+            "disturbances": None if self.disturbances is None else self.disturbances[:count],
+            "noises": None if self.noises is None else self.noises[:count],
+            "states": self.states[: count + 1],
+            "lower": self.lower,
+            "upper": self.upper,
+        }
+        told = {name: None if part is None else part.tolist() for name, part in parts.items()}
+        said = {"requirement": self.requirement, "sample": count, "instant": self.instant}
+        content = said | {"violation": self.violation, "required": required} | told
+        writable("path", path).write_text(json.dumps(content, indent=1, allow_nan=False))
+
+
+def _as_numbers(region: AbstractSet | None, requirement: str) -> dict[str, Any]:
+    """A set as a user would write it, and whether states must be in it."""
+    found: dict[str, Any] = {"inside": not requirement.startswith("avoid")}
+    if isinstance(region, Ellipsoid):
+        found |= {"center": region.center.tolist(), "shape": region.shape.tolist()}
+    elif region is not None:
+        A, b = map(np.asarray, region.facets)
+        found |= {"normals": A.tolist(), "offsets": b.tolist()}
+    return found
 
 
 class DecidedCell(NamedTuple):
@@ -122,6 +170,33 @@ class Recurrence:
     proved: bool
 
 
+class KeptVerdict(NamedTuple):
+    """What a file keeps of a verdict.
+
+    Attributes:
+        asked: what it is about.
+        status: proved, refuted or unknown.
+        counterexample: the trajectory, when refuted.
+        grounds: what proves it anew.
+    """
+
+    asked: Asked
+    status: VerdictStatus
+    counterexample: Counterexample | None
+    grounds: Grounds | None
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict, of whose margins nothing is known before they are proved anew."""
+        times = self.asked.horizon + 1
+        margins = {item.name: np.full(times, np.nan) for item in self.asked.required}
+        for item in self.asked.required:
+            margins[item.name][item.time] = -np.inf
+        simulated = {name: np.full(times, np.nan) for name in margins}
+        given = self.status, margins, simulated, self.counterexample
+        return Verdict(*given, asked=self.asked, grounds=self.grounds)
+
+
 @dataclasses.dataclass(frozen=True)
 class Verdict:
     """What is known of a specification, part by part.
@@ -140,6 +215,8 @@ class Verdict:
             by its name and its time.
         cells: of a decision by cells, what is known of each, see `plot_cells`.
         recurrence: of a statement for all time, what it rests on, or what came nearest to that.
+        asked: of a verdict without a tube, what it is about.
+        grounds: of one that is proved without a tube, what proves it anew.
     """
 
     status: VerdictStatus
@@ -150,6 +227,8 @@ class Verdict:
     certificates: Mapping[tuple[str, int], AbstractProof] = dataclasses.field(default_factory=dict)
     cells: tuple[DecidedCell, ...] = ()
     recurrence: Recurrence | None = None
+    asked: Asked | None = None
+    grounds: Grounds | None = None
 
     @property
     def proved(self) -> bool:
@@ -170,6 +249,35 @@ class Verdict:
     def unsolved(self) -> int:
         """How many of the bounds that it rests on are not as tight as was asked for."""
         return sum(count for status, count in self.ends.items() if status not in AS_ASKED)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Keep a verdict of `decide` in a file, from which `reachjax.load` reads it.
+
+        With what it rests on, so that `reachjax.load(path, recheck=True)` proves it anew without a
+        search. A loop with a function that a user wrote cannot be kept: it is left out, and has to
+        be given again to `load`.
+
+        Args:
+            path: of the file; one that is there is replaced.
+
+        Raises:
+            OSError: it cannot be written.
+            ValueError: it is the verdict of a tube, which is to be saved instead, or of a loop of
+                numbers that are traced.
+
+        Example:
+            >>> import pathlib, tempfile
+            >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, decide, load
+            >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+            >>> path = pathlib.Path(tempfile.mkdtemp()) / "stable.verdict"
+            >>> decide(loop, Box([1.0], [2.0]), 3, goal=Box([0.0], [0.5])).save(path)
+            >>> load(path, recheck=True).status.name
+            'PROVED'
+        """
+        if self.asked is None:
+            raise ValueError("the verdict of a tube is kept with it: save the tube")
+        kept = KeptVerdict(self.asked, self.status, self.counterexample, self.grounds)
+        keep(writable("path", path), kept, self.asked.loop)
 
     def __bool__(self) -> bool:
         raise TypeError("a verdict has three values: use verdict.proved, .refuted or .unknown")

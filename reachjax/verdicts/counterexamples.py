@@ -13,6 +13,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.batches import PARTS
 from reachjax.loops.closed_loop import Scenario
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
@@ -83,8 +84,28 @@ def counterexample(
             plant: Any = on_host.plant
             instant = (item.time - 1 + part) * float(plant.period) if plant.continuous else None
             enclosed = {"lower": lower, "upper": upper, "region": item.ball or item.region}
-            return Counterexample(*parts, disturbances=w, noises=v, instant=instant, **enclosed)
+            closest = closest_decision(on_host, states[: item.time + 1], drawn, start)
+            more = {"instant": instant, "decision": closest} | enclosed
+            return Counterexample(*parts, disturbances=w, noises=v, **more)
     return None
+
+
+def closest_decision(
+    loop: ClosedLoop, states: Float[np.ndarray, "t n_x"], scenario: Scenario, start: int
+) -> float | None:
+    """How far from zero what is compared on a trajectory is at least; None if nothing jumps."""
+    (_, w, v), found = scenario, list[float]()
+
+    def apply(unit: Any, *y: Any) -> Any:
+        if isinstance(unit, AbstractUnit) and unit.jumps:
+            found.append(unit.distance(*y))
+        return unit(*y)
+
+    if loop.jumps:
+        for t, x in enumerate(states[:-1]):
+            push, noise = (None if part is None else part[t] for part in (w, v))
+            loop.step(x, start + t, apply, push, noise)
+    return min(found, default=None)
 
 
 def broken_at(

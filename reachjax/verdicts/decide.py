@@ -23,7 +23,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.loops.units import UnboundedError
 from reachjax.methods.cell_tree import CellTree
-from reachjax.methods.cells import affordable
+from reachjax.methods.cells import WAYS, affordable
 from reachjax.methods.ladder import WORK, Ladder, StepBounds
 from reachjax.methods.propagation import (
     Progress,
@@ -45,6 +45,7 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
+from reachjax.programs.followed import OpenDecision, open_decisions
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.proposal import SolverStatus
@@ -284,7 +285,8 @@ def _by_remedies(
 
     by_cells, most = None, 1
     if loop.curved:
-        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / 2))
+        each = 2 * WAYS if loop.jumps else 2
+        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / each))
     if most > 1:
         with contextlib.suppress(UnboundedError):  # of halves there may be bounds
             climb(0)
@@ -340,6 +342,7 @@ class _Decision:
         self._climbs = list[ClimbRecord]()
         self._asked = Asked(loop, X0, horizon, start, tuple(required))
         self._ends: dict[tuple[str, int], np.ndarray] = {}
+        self._decisions: tuple[OpenDecision, ...] = ()
         self.simulations = simulations
         if simulations is not None:
             self._findings.simulate(simulations.runs)
@@ -359,7 +362,8 @@ class _Decision:
         ends = Counter(SolverStatus(int(code)) for codes in self._ends.values() for code in codes)
         climbs = tuple(each.climb for each in self._climbs if each.climb is not None)
         more = {"asked": self._asked, "grounds": Grounds(climbs=(climbs,))}
-        return self._findings.verdict(dict(ends), certificates=self._certificates, **more)
+        more |= {"certificates": self._certificates, "decisions": self._decisions}
+        return self._findings.verdict(dict(ends), **more)
 
     def _require_unbroken(self) -> None:
         """Raise an error if a trajectory, as JAX runs it, breaks what is proved."""
@@ -387,9 +391,11 @@ class _Decision:
         """
         last = max(time for _, time in self._findings.open)
         self._climbs.append(ClimbRecord())
+        self._decisions = ()
         for k in range(1, last + 1):
             ladder.advance(tighten)
             self._climbs[-1].advanced(ladder.horizon.tightened)
+            self._decisions += open_decisions(ladder.horizon.steps[-1], self._start + k - 1)
             if self._budget.overdue:
                 return
             for key, item in list(self._findings.open.items()):

@@ -17,7 +17,7 @@ import mpmath
 import numpy as np
 
 import reachjax as rj
-from tests.campaign.functions import by_cases, masses
+from tests.campaign.functions import by_cases, masses, switched, switched_waves
 from tests.campaign.oracle import WIDE, Region, exact
 from tests.input_polytopes import exact_multipliers
 
@@ -133,6 +133,7 @@ class Kind:
         horizon: the number of steps.
         columns: what old columns of forms are merged into, from a box; 0 where that is not tried.
         period: of a plant in continuous time, of which `step` is the field; 0 in discrete time.
+        jumps: whether decisions of the plant are tied in the middle of the initial box.
     """
 
     name: str
@@ -150,6 +151,7 @@ class Kind:
     horizon: int = 2
     columns: int = 0
     period: float = 0.0
+    jumps: bool = False
 
     @property
     def loop(self) -> tuple:
@@ -158,6 +160,7 @@ class Kind:
 
 
 BOXES, ROUND = ("box", "varying", "polytope"), ("ellipsoid", "box")
+EDGED = ("box", "flat", "point")
 OCTAGONAL, PAIRS = rj.Template.octagonal, rj.Template.regular
 
 KINDS = (
@@ -185,6 +188,8 @@ KINDS = (
     Kind("products, sampled", products, "relu", disturbed=("box",), period=0.125),
     Kind("quotients, sampled", quotients, "sigmoid", period=0.0625, noisy=True),
     Kind("unicycle, sampled", unicycle, "relu", states=3, hidden=(4,), period=0.125),
+    Kind("switched", switched, "relu", initial=EDGED, template=OCTAGONAL, jumps=True),
+    Kind("switched waves", switched_waves, "tanh", initial=EDGED, jumps=True),
     Kind("tanh, to balls", affine, "tanh", template=lambda n: rj.EllipsoidTemplate(), horizon=1),
 )
 
@@ -386,6 +391,10 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
         p["A"] = np.eye(n) + rng.normal(size=(n, n)) * 10 ** rng.uniform(-2, 0)
         p["B"] = rng.normal(size=(n, n_u))
         p["E"] = rng.normal(size=(n, n_w))
+    region = str(rng.choice(kind.initial))
+    X0 = _initial(region, n, rng)
+    if kind.jumps:
+        p["at"] = np.array(X0.center[:1])
     W = _disturbances(kind, n_w, rng) if kind.disturbed else None
     noise = rj.Box(*_ends(rng, n, 0.02)) if kind.noisy else None
     inputs, allowed = _inputs(kind, rng)
@@ -404,8 +413,6 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
         if kind.period:
             plant = rj.SampledPlant(f, n, n_u, kind.period, disturbances=drawn_from, held=True)
     loop = rj.ClosedLoop(plant, net, allowed, disturbance=W, noise=noise)
-    region = str(rng.choice(kind.initial))
-    X0 = _initial(region, n, rng)
     gap = float(rng.choice([1e-4, 1e-2, 0.1]))
     relaxation: Any = rj.BranchAndCut(nodes=int(rng.choice([0, 3, 40])))
     if rng.random() < 0.25:

@@ -316,8 +316,8 @@ def _ball_map(ball: RoundSet) -> tuple[Array, Array, Array]:
 
 def _ends(cut: PolyhedralSet, directions: Rows) -> Ends:
     """Least and largest values of directions on the cut, rounded outwards."""
-    if isinstance(cut, Box):
-        values = directions @ Ball.between(cut.lower, cut.upper)
+    if cut.intervals is not None:
+        values = directions @ Ball.between(*cut.intervals)
         return values.lower, values.upper
     A, b = (np.asarray(part) for part in cut.facets)
     lower, upper = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)

@@ -82,6 +82,8 @@ from reachjax.sets import (
     PolyhedralSet,
     Polytope,
     Template,
+    VnnLib,
+    read_vnnlib,
 )
 from reachjax.sets.pictures import plot_set
 from reachjax.solvers import (
@@ -100,13 +102,13 @@ from reachjax.training import (
     unsolved,
     volume_penalty,
 )
-from reachjax.tubes.loading import load
 from reachjax.tubes.partitions import PartitionedTube, plot_tube, reach_partitioned
 from reachjax.tubes.reach import ReachTube, reach, reach_step
 from reachjax.tubes.repeats import DisagreementError
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.verdicts.decide import decide
 from reachjax.verdicts.largest import LargestSet, largest_set
+from reachjax.verdicts.loading import load
 from reachjax.verdicts.soundness import UnsoundError
 from reachjax.verdicts.specification import shortfall
 from reachjax.verdicts.verdict import (
@@ -115,10 +117,11 @@ from reachjax.verdicts.verdict import (
     Recurrence,
     Verdict,
     VerdictStatus,
+    WinningSet,
+    plot_cells,
 )
 from reachjax.verdicts.verify import verify
 from reachjax.verdicts.winning import winning_set
-from reachjax.verdicts.winning_sets import WinningSet, plot_cells
 
 __version__ = "0.1.0"
 
@@ -215,6 +218,7 @@ __all__ = [
     "UnsoundError",
     "Verdict",
     "VerdictStatus",
+    "VnnLib",
     "WinningSet",
     "XLogX",
     "change_of_basis",
@@ -233,6 +237,7 @@ __all__ = [
     "reach",
     "reach_partitioned",
     "reach_step",
+    "read_vnnlib",
     "runge_kutta",
     "shortfall",
     "skip_failures",

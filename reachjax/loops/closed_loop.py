@@ -203,6 +203,11 @@ class ClosedLoop(Replaceable):
         return self.plant.bends or any(layer.unit.curved for layer in self.unit_layers)
 
     @property
+    def jumps(self) -> bool:
+        """Whether a decision changes at once what follows."""
+        return any(layer.unit.jumps for layer in self.unit_layers)
+
+    @property
     def units(self) -> int:
         """The number of units of one step."""
         return sum(layer.size for layer in self.unit_layers)

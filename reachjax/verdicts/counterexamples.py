@@ -13,6 +13,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.batches import PARTS
 from reachjax.loops.closed_loop import Scenario
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
@@ -64,8 +65,15 @@ def counterexample(
         drawn = loop.split(scenario)
         if not scenarios.surely_contains(scenario):
             continue
-        part = broken_at(on_host, item, drawn, start)
-        if part is not None:
+        reached = enclosures(on_host, drawn, item.time, start)
+        found_at = broken_at(on_host, item, drawn, start, reached)
+        if found_at is not None:
+            part, last = found_at
+            boxes = [*reached[:-1], last]
+            lower, upper = (
+                np.stack([np.asarray(getattr(box, end)) for box in boxes])
+                for end in ("lower", "upper")
+            )
             _, w, v = drawn
             noises = [None] * (len(states) - 1) if v is None else v
             inputs = [
@@ -75,19 +83,49 @@ def counterexample(
             parts = item.name, item.time, -room, states, np.stack(inputs)
             plant: Any = on_host.plant
             instant = (item.time - 1 + part) * float(plant.period) if plant.continuous else None
-            return Counterexample(*parts, disturbances=w, noises=v, instant=instant)
+            enclosed = {"lower": lower, "upper": upper, "region": item.ball or item.region}
+            closest = closest_decision(on_host, states[: item.time + 1], drawn, start)
+            more = {"instant": instant, "decision": closest} | enclosed
+            return Counterexample(*parts, disturbances=w, noises=v, **more)
     return None
 
 
-def broken_at(loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int) -> float | None:
+def closest_decision(
+    loop: ClosedLoop, states: Float[np.ndarray, "t n_x"], scenario: Scenario, start: int
+) -> float | None:
+    """How far from zero what is compared on a trajectory is at least; None if nothing jumps."""
+    (_, w, v), found = scenario, list[float]()
+
+    def apply(unit: Any, *y: Any) -> Any:
+        if isinstance(unit, AbstractUnit) and unit.jumps:
+            found.append(unit.distance(*y))
+        return unit(*y)
+
+    if loop.jumps:
+        for t, x in enumerate(states[:-1]):
+            push, noise = (None if part is None else part[t] for part in (w, v))
+            loop.step(x, start + t, apply, push, noise)
+    return min(found, default=None)
+
+
+def broken_at(
+    loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int, reached: list[Box]
+) -> tuple[float, Box] | None:
     """Where the exact trajectory of a scenario surely breaks a requirement, rounding accounted for.
 
+    Args:
+        loop: of numpy arrays.
+        item: the requirement.
+        scenario: of the trajectory.
+        start: the time of its initial state.
+        reached: boxes around its states, up to the time of the requirement.
+
     Returns:
-        The part of the period before, 1 at the sample; None where that is not known.
+        The part of the period before, 1 at the sample, and a box around the state there; None where
+        that is not known.
     """
-    reached = enclosures(loop, scenario, item.time, start)
     if most_room(item, reached[-1]) < 0:
-        return 1.0
+        return 1.0, reached[-1]
     if not item.throughout:
         return None
     plant: Any = loop.plant
@@ -95,9 +133,9 @@ def broken_at(loop: ClosedLoop, item: Requirement, scenario: Scenario, start: in
     drawn = [None if each is None else each[t] for each in scenario[1:]]
     for part in PARTS:
         shorter = in_numpy(loop.replace(plant=plant.shortened(part)))
-        held = start + t, *drawn
-        if most_room(item, successor_box(shorter, before, *held)) < 0:
-            return part
+        there = successor_box(shorter, before, start + t, *drawn)
+        if most_room(item, there) < 0:
+            return part, there
     return None
 
 

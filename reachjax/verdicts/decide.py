@@ -23,7 +23,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.loops.units import UnboundedError
 from reachjax.methods.cell_tree import CellTree
-from reachjax.methods.cells import affordable
+from reachjax.methods.cells import WAYS, affordable
 from reachjax.methods.ladder import WORK, Ladder, StepBounds
 from reachjax.methods.propagation import (
     Progress,
@@ -45,14 +45,16 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
+from reachjax.programs.followed import OpenDecision, open_decisions
 from reachjax.programs.relaxations import BranchAndCut
-from reachjax.proofs.branches import BranchCertificate
+from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet
 from reachjax.verdicts.cell_decisions import decided_by_cells
 from reachjax.verdicts.cell_tasks import CellTask
 from reachjax.verdicts.closing import closed
 from reachjax.verdicts.findings import Findings
+from reachjax.verdicts.grounds import Asked, ClimbRecord, Grounds
 from reachjax.verdicts.soundness import compiled_runs, require_unbroken, worst_of
 from reachjax.verdicts.specification import (
     AvoidSets,
@@ -240,8 +242,10 @@ class _Asked(NamedTuple):
         loop, start, relaxation = self.loop, self.start, self.relaxation
         if cells is not None:
             parts = CellTree.over(X0, cells)
+            counts = () if isinstance(cells, int | np.integer) else tuple(map(int, cells))
             task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
-            return decided_by_cells(task, X0, parts, simulations, budget, executor, progress)
+            given = task, X0, parts, simulations, budget, executor, progress
+            return decided_by_cells(*given, counts=counts)
         decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
         try:
             return _by_remedies(decision, loop, X0, horizon, start, required, relaxation, budget)
@@ -281,7 +285,8 @@ def _by_remedies(
 
     by_cells, most = None, 1
     if loop.curved:
-        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / 2))
+        each = 2 * WAYS if loop.jumps else 2
+        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / each))
     if most > 1:
         with contextlib.suppress(UnboundedError):  # of halves there may be bounds
             climb(0)
@@ -334,7 +339,10 @@ class _Decision:
         self._middle = self._scenarios.middle(np.asarray(boxed(X0, "X0").center))
         self._findings = Findings(loop, X0, horizon, start, required)
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
+        self._climbs = list[ClimbRecord]()
+        self._asked = Asked(loop, X0, horizon, start, tuple(required))
         self._ends: dict[tuple[str, int], np.ndarray] = {}
+        self._decisions: tuple[OpenDecision, ...] = ()
         self.simulations = simulations
         if simulations is not None:
             self._findings.simulate(simulations.runs)
@@ -352,7 +360,10 @@ class _Decision:
         """
         self._require_unbroken()
         ends = Counter(SolverStatus(int(code)) for codes in self._ends.values() for code in codes)
-        return self._findings.verdict(dict(ends), certificates=self._certificates)
+        climbs = tuple(each.climb for each in self._climbs if each.climb is not None)
+        more = {"asked": self._asked, "grounds": Grounds(climbs=(climbs,))}
+        more |= {"certificates": self._certificates, "decisions": self._decisions}
+        return self._findings.verdict(dict(ends), **more)
 
     def _require_unbroken(self) -> None:
         """Raise an error if a trajectory, as JAX runs it, breaks what is proved."""
@@ -379,8 +390,12 @@ class _Decision:
             tighten: whether the ranges of units are bounded by linear programs.
         """
         last = max(time for _, time in self._findings.open)
+        self._climbs.append(ClimbRecord())
+        self._decisions = ()
         for k in range(1, last + 1):
             ladder.advance(tighten)
+            self._climbs[-1].advanced(ladder.horizon.tightened)
+            self._decisions += open_decisions(ladder.horizon.steps[-1], self._start + k - 1)
             if self._budget.overdue:
                 return
             for key, item in list(self._findings.open.items()):
@@ -401,6 +416,8 @@ class _Decision:
         self._findings.prove(item, margin, holds)
         self._ends[key] = climbed.codes
         if holds:
+            by_forms = np.all(climbed.rungs == Rung.AFFINE_FORM)
+            self._climbs[-1].proved(item, None if by_forms else climbed.branches)
             self._certificates[key] = _certificate(climbed, target.simulated, one_of_several)
         if not np.all(right):
             worst, middle = climbed.worst[climbed.attained > 0], self._middle

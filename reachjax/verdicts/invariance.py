@@ -23,7 +23,7 @@ from reachjax.methods.witnesses import initial_states
 from reachjax.numerics.budget import Budget, Interrupted
 from reachjax.numerics.host import in_numpy
 from reachjax.programs.relaxations import BranchAndCut
-from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
+from reachjax.sets import AbstractSet, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope
 from reachjax.tubes.reach import ReachTube
 from reachjax.verdicts.counterexamples import SUSPECTS, counterexample, suspects
@@ -181,7 +181,10 @@ def _require_unbroken(
 
 def _flat(safe: Region | None) -> PolyhedralSet | None:
     """A set of facets in which all that is looked for must lie."""
-    return inner_polytope(safe, "safe") if isinstance(safe, Ellipsoid) else safe
+    if safe is None:
+        return None
+    flat, ball = safe.parts
+    return flat if ball is None else inner_polytope(ball, "safe")
 
 
 def recurrence(
@@ -205,10 +208,11 @@ def recurrence(
         None if nothing comes near.
     """
     nearest = None
-    if isinstance(X0, PolyhedralSet):
+    flat, ball = X0.parts
+    if flat is not None and ball is None:
         for k in range(1, tubes[0].horizon + 1):
-            proved, margin = within([tube.sets[k] for tube in tubes], X0)
-            found = Recurrence(k, k, X0, margin, proved)
+            proved, margin = within([tube.sets[k] for tube in tubes], flat)
+            found = Recurrence(k, k, flat, margin, proved)
             if proved:
                 return found
             nearest = _nearer(nearest, found)

@@ -68,9 +68,10 @@ class Shape(NamedTuple):
     @classmethod
     def of(cls, X: Kind) -> Shape:
         """The shape of a set."""
-        if isinstance(X, Box):
-            return cls(np.asarray(X.center), np.asarray(X.widths) / 2)
-        return cls(np.asarray(X.center), np.linalg.cholesky(np.asarray(X.shape)))
+        _, ball = X.parts
+        if ball is None:
+            return cls(np.asarray(X.center), np.asarray(X.bounding_box().widths) / 2)
+        return cls(np.asarray(X.center), np.linalg.cholesky(np.asarray(ball.shape)))
 
     @property
     def sides(self) -> list[int]:

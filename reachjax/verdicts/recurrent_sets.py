@@ -136,8 +136,9 @@ def _safe_part(region: PolyhedralSet, safe: PolyhedralSet | None) -> PolyhedralS
     """A set without what is not safe; None if nothing of it is, or too little to draw states."""
     if safe is None or within([region], safe)[0]:
         return region
-    if isinstance(region, Box) and isinstance(safe, Box):
-        return None if region.misses(safe) else region.cut(safe)
+    if region.intervals is not None and safe.intervals is not None:
+        around = Box(*safe.intervals)
+        return None if region.misses(around) else region.cut(around)
     (A, b), (C, d) = region.facets, safe.facets
     part = Polytope(jnp.concatenate([A, C]), jnp.concatenate([b, d]))
     try:

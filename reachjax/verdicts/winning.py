@@ -43,8 +43,7 @@ from reachjax.verdicts.findings import rooms_of
 from reachjax.verdicts.sieve import TOGETHER, Ends, Outcome, Sieve
 from reachjax.verdicts.soundness import require_unbroken_cells
 from reachjax.verdicts.specification import AvoidSets, Region, Timed, period_of, requirements
-from reachjax.verdicts.verdict import DecidedCell, VerdictStatus
-from reachjax.verdicts.winning_sets import WinningSet
+from reachjax.verdicts.verdict import DecidedCell, VerdictStatus, WinningSet
 
 LAST_PROGRAMS = 10
 """Linear programs that a bound may take in a cell that is not halved any more."""

@@ -17,7 +17,7 @@ import mpmath
 import numpy as np
 
 import reachjax as rj
-from tests.campaign.functions import by_cases, masses
+from tests.campaign.functions import by_cases, masses, switched, switched_waves
 from tests.campaign.oracle import WIDE, Region, exact
 from tests.input_polytopes import exact_multipliers
 
@@ -92,6 +92,13 @@ def products(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
     return m.stack([x[0] + x[1] / 8, x[1] + bent + a[2] * u[0]])
 
 
+def coupled(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
+    """Products of factors of unlike sizes, of the state and of the input, pushed."""
+    a, push = p["a"], 0 if w is None else w[0]
+    bent = a[0] * (4096 * x[0]) * (m.sin(x[1]) / 4096) - a[1] * x[1] * u[0]
+    return m.stack([x[0] + x[1] / 8, x[1] + bent + a[2] * u[0] + push])
+
+
 def quotients(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
     """Every other function: quotients, roots, logarithms, exponentials."""
     a = p["a"]
@@ -124,7 +131,9 @@ class Kind:
         facets: of a polytope of inputs; 0 for a box.
         skips: whether the network is traced, with a connection that skips it.
         horizon: the number of steps.
+        columns: what old columns of forms are merged into, from a box; 0 where that is not tried.
         period: of a plant in continuous time, of which `step` is the field; 0 in discrete time.
+        jumps: whether decisions of the plant are tied in the middle of the initial box.
     """
 
     name: str
@@ -140,7 +149,9 @@ class Kind:
     facets: int = 0
     skips: bool = False
     horizon: int = 2
+    columns: int = 0
     period: float = 0.0
+    jumps: bool = False
 
     @property
     def loop(self) -> tuple:
@@ -149,6 +160,7 @@ class Kind:
 
 
 BOXES, ROUND = ("box", "varying", "polytope"), ("ellipsoid", "box")
+EDGED = ("box", "flat", "point")
 OCTAGONAL, PAIRS = rj.Template.octagonal, rj.Template.regular
 
 KINDS = (
@@ -160,6 +172,10 @@ KINDS = (
     Kind("sine", sine, "tanh", hidden=(3, 3), horizon=3, initial=("box", "ellipsoid", "polytope")),
     Kind("products", products, "relu", template=OCTAGONAL),
     Kind("quotients", quotients, "sigmoid"),
+    Kind(
+        "products, disturbed", coupled, "tanh", disturbed=("box",), noisy=True, horizon=4, columns=8
+    ),
+    Kind("long", sine, "tanh", disturbed=("box",), noisy=True, horizon=24, columns=16),
     Kind("unicycle", unicycle, "relu", states=3, hidden=(4,)),
     Kind("leaky, traced", affine, "leaky", skips=True, hidden=(4,), horizon=3),
     Kind("hard, products", products, "hard", skips=True),
@@ -172,6 +188,8 @@ KINDS = (
     Kind("products, sampled", products, "relu", disturbed=("box",), period=0.125),
     Kind("quotients, sampled", quotients, "sigmoid", period=0.0625, noisy=True),
     Kind("unicycle, sampled", unicycle, "relu", states=3, hidden=(4,), period=0.125),
+    Kind("switched", switched, "relu", initial=EDGED, template=OCTAGONAL, jumps=True),
+    Kind("switched waves", switched_waves, "tanh", initial=EDGED, jumps=True),
     Kind("tanh, to balls", affine, "tanh", template=lambda n: rj.EllipsoidTemplate(), horizon=1),
 )
 
@@ -373,6 +391,10 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
         p["A"] = np.eye(n) + rng.normal(size=(n, n)) * 10 ** rng.uniform(-2, 0)
         p["B"] = rng.normal(size=(n, n_u))
         p["E"] = rng.normal(size=(n, n_w))
+    region = str(rng.choice(kind.initial))
+    X0 = _initial(region, n, rng)
+    if kind.jumps:
+        p["at"] = np.array(X0.center[:1])
     W = _disturbances(kind, n_w, rng) if kind.disturbed else None
     noise = rj.Box(*_ends(rng, n, 0.02)) if kind.noisy else None
     inputs, allowed = _inputs(kind, rng)
@@ -391,8 +413,6 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
         if kind.period:
             plant = rj.SampledPlant(f, n, n_u, kind.period, disturbances=drawn_from, held=True)
     loop = rj.ClosedLoop(plant, net, allowed, disturbance=W, noise=noise)
-    region = str(rng.choice(kind.initial))
-    X0 = _initial(region, n, rng)
     gap = float(rng.choice([1e-4, 1e-2, 0.1]))
     relaxation: Any = rj.BranchAndCut(nodes=int(rng.choice([0, 3, 40])))
     if rng.random() < 0.25:

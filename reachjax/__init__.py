@@ -42,8 +42,10 @@ from reachjax.loops import (
     Switched,
     Tanh,
     XLogX,
+    delayed,
     one_of,
     runge_kutta,
+    with_inputs,
     zero_order_hold,
 )
 from reachjax.methods.affine_forms import AffineForms
@@ -80,6 +82,8 @@ from reachjax.sets import (
     PolyhedralSet,
     Polytope,
     Template,
+    VnnLib,
+    read_vnnlib,
 )
 from reachjax.sets.pictures import plot_set
 from reachjax.solvers import (
@@ -98,13 +102,13 @@ from reachjax.training import (
     unsolved,
     volume_penalty,
 )
-from reachjax.tubes.loading import load
 from reachjax.tubes.partitions import PartitionedTube, plot_tube, reach_partitioned
 from reachjax.tubes.reach import ReachTube, reach, reach_step
 from reachjax.tubes.repeats import DisagreementError
 from reachjax.tubes.sizes import log_volume, log_widths, volume
 from reachjax.verdicts.decide import decide
 from reachjax.verdicts.largest import LargestSet, largest_set
+from reachjax.verdicts.loading import load
 from reachjax.verdicts.soundness import UnsoundError
 from reachjax.verdicts.specification import shortfall
 from reachjax.verdicts.verdict import (
@@ -113,10 +117,11 @@ from reachjax.verdicts.verdict import (
     Recurrence,
     Verdict,
     VerdictStatus,
+    WinningSet,
+    plot_cells,
 )
 from reachjax.verdicts.verify import verify
 from reachjax.verdicts.winning import winning_set
-from reachjax.verdicts.winning_sets import WinningSet, plot_cells
 
 __version__ = "0.1.0"
 
@@ -213,10 +218,12 @@ __all__ = [
     "UnsoundError",
     "Verdict",
     "VerdictStatus",
+    "VnnLib",
     "WinningSet",
     "XLogX",
     "change_of_basis",
     "decide",
+    "delayed",
     "failures",
     "keep_compilations",
     "largest_set",
@@ -230,6 +237,7 @@ __all__ = [
     "reach",
     "reach_partitioned",
     "reach_step",
+    "read_vnnlib",
     "runge_kutta",
     "shortfall",
     "skip_failures",
@@ -239,5 +247,6 @@ __all__ = [
     "volume",
     "volume_penalty",
     "winning_set",
+    "with_inputs",
     "zero_order_hold",
 ]

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from reachjax.loops.units import AtUnit, Constraint, Disturbance, evaluate
 from reachjax.numerics.checks import within_time_axis
 from reachjax.numerics.rounding import Ball, gamma, namespace
-from reachjax.sets import AbstractSet, Box, Ellipsoid
+from reachjax.sets import AbstractSet
 
 EDGES = 16
 """The edges of the polygon around a disc."""
@@ -80,8 +80,7 @@ def framed(W: AbstractSet, t: int | Array = 0) -> Frame:
         assert ball is not None
         center, spread = _settled(ball, ball.center, ball.from_ball())
         return Frame(center, spread, none, nothing, touching(W.dimension))
-    box = W if isinstance(W, Box) else W.bounding_box()
-    around = Ball.between(*_ends(box, t))
+    around = Ball.between(*_ends(W if W.intervals is not None else W.bounding_box(), t))
     A, b = flat.facets if flat.needs_programs else (none, nothing)
     if ball is not None and W.dimension > 1:  # else the box is the set
         planes = touching(W.dimension) @ jnp.linalg.inv(jax.lax.stop_gradient(ball.from_ball()))
@@ -90,12 +89,14 @@ def framed(W: AbstractSet, t: int | Array = 0) -> Frame:
     return Frame(center, spread, A, b, none)
 
 
-def _ends(box: Box, t: int | Array) -> tuple[Numbers, Numbers]:
+def _ends(box: AbstractSet, t: int | Array) -> tuple[Numbers, Numbers]:
     """The ends of a box at one time, numpy arrays if the box has them."""
+    assert box.intervals is not None
+    lower, upper = box.intervals
     if box.steps is None:
-        return box.lower, box.upper
+        return lower, upper
     within_time_axis("Box", t, box.steps)
-    return box.lower[t], box.upper[t]
+    return lower[t], upper[t]
 
 
 def _settled(W: AbstractSet, *parts: Any) -> Any:
@@ -127,9 +128,9 @@ def middle(W: AbstractSet, t: int | Array = 0) -> Numbers:
     """What is drawn where one value is asked for: the middle, of a polytope about a point of it."""
     flat, ball = W.parts
     if flat is None:
-        assert isinstance(ball, Ellipsoid)
+        assert ball is not None
         return ball.center
-    if isinstance(W, Box):
+    if W.intervals is not None:
         lower, upper = _ends(W, t)
         return lower + (upper - lower) / 2
     box = W.bounding_box()

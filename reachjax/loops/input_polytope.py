@@ -99,8 +99,8 @@ def input_set(
     Raises:
         TypeError: it is of another kind.
     """
-    if isinstance(value, Polytope):
-        return InputPolytope.of(value)
-    kinds: Any = (Box, InputPolytope)  # a converter is not asked about None, the default
+    if isinstance(value, InputPolytope):
+        return value
+    kinds: Any = (Box, Polytope)  # a converter is not asked about None, the default
     require_kind(name, value, kinds, "a Box or a Polytope")
-    return value
+    return InputPolytope.of(value) if value.needs_programs else value  # type: ignore[return-value]

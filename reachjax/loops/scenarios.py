@@ -20,7 +20,7 @@ from reachjax.loops.batches import trajectories
 from reachjax.loops.closed_loop import ClosedLoop, Scenario, split
 from reachjax.loops.draws import framed
 from reachjax.numerics.pytrees import Replaceable, pytree, static
-from reachjax.sets import AbstractSet, Box
+from reachjax.sets import AbstractSet
 
 POOL = 500
 """So many points of a set of disturbances, and as many extreme ones, scenarios are made of."""
@@ -89,8 +89,8 @@ class Draws(Replaceable):
 
     def clipped(self, points: Float[np.ndarray, "c h n"]) -> Float[np.ndarray, "c h n"]:
         """Points of boxes brought inside; others on the way from the middle, into the ellipsoid."""
-        if isinstance(self.sets, Box):
-            return np.clip(points, np.asarray(self.sets.lower), np.asarray(self.sets.upper))
+        if self.sets.intervals is not None:
+            return np.clip(points, *map(np.asarray, self.sets.intervals))
         _, ball = self.at_start.parts
         if ball is None:
             return points
@@ -125,7 +125,7 @@ class Draws(Replaceable):
 
     def _pools(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Extreme points and any points of the set; of boxes, as parts of their sides."""
-        if isinstance(self.sets, Box):
+        if self.sets.intervals is not None:
             rng, n = np.random.default_rng([seed, 2]), self.middles.shape[1]
             return rng.integers(2, size=(POOL, n)).astype(float), rng.uniform(size=(POOL, n))
         W, key, middle = self.at_start, jax.random.key(seed), np.asarray(self.middles)[0]
@@ -138,9 +138,9 @@ class Draws(Replaceable):
         return (extreme if len(extreme) else inner), inner
 
     def _placed(self, points: np.ndarray, k: int) -> np.ndarray:
-        if not isinstance(self.sets, Box):
+        if self.sets.intervals is None:
             return points
-        lower, upper = self.sets.lower[k], self.sets.upper[k]
+        lower, upper = (ends[k] for ends in self.sets.intervals)
         return np.clip(lower + points * (upper - lower), lower, upper)
 
 
@@ -149,8 +149,9 @@ def _middle(W: AbstractSet) -> Float[np.ndarray, " n"]:
     flat, ball = W.parts
     if flat is None:
         return np.asarray(ball.center) if ball is not None else np.zeros(W.dimension)
-    if isinstance(W, Box):
-        return np.asarray(W.lower + W.widths / 2)
+    if W.intervals is not None:
+        lower, upper = W.intervals
+        return np.asarray(lower + (upper - lower) / 2)
     points = W.sample(jax.random.key(0), POOL) if ball is not None else flat.vertices()
     return np.asarray(points).mean(axis=0)
 
@@ -189,6 +190,8 @@ class Scenarios(Replaceable):
 
     def split(self, scenarios: Rows) -> Scenario:
         """The parts of scenarios, of as many steps as they have."""
+        if not self._draws:  # all of them is the initial state
+            return Scenario(scenarios, None, None)
         return split(scenarios, self.X0.dimension, *self._sizes)
 
     def joined(self, states: Any, *drawn: Any) -> Any:
@@ -257,8 +260,8 @@ class Scenarios(Replaceable):
         for draws, points in zip((self.disturbances, self.noises), drawn, strict=True):
             if draws is None:
                 continue
-            if isinstance(draws.sets, Box):  # comparisons are exact
-                lower, upper = np.asarray(draws.sets.lower), np.asarray(draws.sets.upper)
+            if draws.sets.intervals is not None:  # comparisons are exact
+                lower, upper = map(np.asarray, draws.sets.intervals)
                 if not np.all((lower <= points) & (points <= upper)):
                     return False
             elif not all(map(draws.at_start.surely_contains, points)):

@@ -20,9 +20,8 @@ from reachjax.loops.scenarios import Scenarios
 from reachjax.loops.units import SmoothUnit
 from reachjax.methods.ladder import WORK, Ladder, StepBounds, Target
 from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
-from reachjax.methods.recursion import setting_of
+from reachjax.methods.recursion import facets_by_products, setting_of
 from reachjax.methods.steps import Step, overflow
-from reachjax.methods.successors import facets_by_products
 from reachjax.methods.witnesses import Simulated
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, owned
@@ -32,8 +31,8 @@ from reachjax.programs.moving import Moving, moving
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.by_products import Certificate
+from reachjax.proofs.gradients import Replay, replayed
 from reachjax.proofs.proposal import SolverStatus
-from reachjax.proofs.replayed import Replay, replayed
 from reachjax.sets import Box, Polytope
 from reachjax.solvers import AbstractSolver, Auto
 

@@ -58,6 +58,11 @@ class Node:
         return Box(self.lower, self.upper)
 
     @property
+    def is_box(self) -> bool:
+        """Whether it is a box, and no part of another set."""
+        return isinstance(self.part, Box)
+
+    @property
     def part(self) -> AbstractSet:
         """The part of the set."""
         return self.box if self._part is None else self._part
@@ -118,7 +123,7 @@ class CellTree:
     def __init__(self, X: AbstractSet, roots: Sequence[Node], most: int | None = None):
         self._X, self.roots, self.most = X, roots, most
         self.count = len(roots)
-        box = X if isinstance(X, Box) else boxed(X, "X0")
+        box = boxed(X, "X0")
         sides = np.asarray(box.upper) - np.asarray(box.lower)
         self.sides = np.where(sides > 0, sides, 1.0)
 
@@ -177,7 +182,7 @@ class CellTree:
 
     def halved(self, node: Node, axis: int) -> list[Node]:
         """The halves of a cell that the set reaches, which do not stand in its place yet."""
-        if not isinstance(self._X, Box):
+        if self._X.intervals is None:
             return [Node.of(cell, node) for cell in halves_along(self._X, node.box, axis)]
         along = np.arange(len(node.lower)) == axis
         middle = (node.lower + node.upper) / 2

@@ -27,9 +27,8 @@ from jaxtyping import Array, Float, Int
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.loops.units import UnboundedError
-from reachjax.methods.affine_forms import AffineForms
+from reachjax.methods.affine_forms import AffineForms, moving_cell, moving_offsets
 from reachjax.methods.cell_tree import CellTree, Node
-from reachjax.methods.gradients import moving_cell, moving_offsets
 from reachjax.methods.ladder import LEAST_RANGE, ROUNDED, WORK
 from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
 from reachjax.methods.searches import AbstractSearch, Question

@@ -5,7 +5,7 @@ Everything here is numpy on the host. It proposes leaves; what they prove, `proo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -165,10 +165,17 @@ class Ladder:
         if proof.ranges is None:
             self.advance()
             return
-        known = iter(proof.ranges)
+        self.repeat_ranges(map(np.asarray, proof.ranges))
+
+    def repeat_ranges(self, ranges: Iterable[Float[np.ndarray, "k m"]]) -> None:
+        """One step more, with these multipliers for the ranges of its units, in their order.
+
+        They are sound whatever they are: those that do not fit count as none.
+        """
+        known = iter(ranges)
 
         def multipliers(forms: AffineForms) -> tuple[np.ndarray, np.ndarray] | None:
-            given, facts = np.asarray(next(known, np.zeros((0, 0)))), self.horizon.facts
+            given, facts = next(known, np.zeros((0, 0))), self.horizon.facts
             if given.shape != (len(forms.rows), len(facts.rows)):
                 return None
             unknown = np.full((len(given), facts.columns.shape[1]), np.nan)

@@ -131,13 +131,13 @@ class Problem:
         Raises:
             TypeError: it has none, or more than these.
         """
-        if not isinstance(self.template, Template):
+        if (facets := self.template.alone) is None:
             raise TypeError(
                 "LinearBounds() bounds facets, as branches and cells do, but the template is of "
                 f"kind {type(self.template).__name__}: give a Template, or for ellipsoids another "
                 "relaxation, such as CuttingPlanes() or LocalBounds()"
             )
-        return self.template
+        return facets
 
     def require_numbers(self) -> None:
         """Raise an error where a method needs numbers.

@@ -32,7 +32,7 @@ from reachjax.numerics.checks import (
 from reachjax.numerics.derivatives import first_order
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut, LinearBounds
 from reachjax.proofs.certificates import AbstractProof
-from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
+from reachjax.sets import AbstractSet, AbstractTemplate
 from reachjax.sets.unusable import ThinSetError, UnusableSetError
 from reachjax.solvers import AbstractSolver, Auto
 
@@ -70,7 +70,7 @@ def _(
 def _(
     relaxation: BranchAndCut, problem: Problem, window: int | None, solver: AbstractSolver
 ) -> AbstractMethod:
-    if window is not None or not isinstance(problem.template, Template):
+    if window is not None or problem.template.alone is None:
         return Recursion(relaxation, window, solver)
     branching = Branching(relaxation, solver)
     if problem.loop.curved and relaxation.cells > 1 and problem.X0.parts[1] is None:
@@ -263,7 +263,7 @@ def known_numbers(call: str, loop: ClosedLoop, X: AbstractSet, name: str) -> tup
             f"loop or {name} holds traced numbers, and a verdict is decided on known ones: call "
             f"{call} outside of jax.jit"
         )
-    if isinstance(X, Box) and X.steps is not None:
+    if X.steps is not None:
         raise ValueError(f"{name} must be one box, but a time-varying one arrived")
     return owned(fixed)
 

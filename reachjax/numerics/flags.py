@@ -15,8 +15,16 @@ from typing import Any, TypeVar
 
 import jax
 
-SIZES = "dimension", "steps", "states", "inputs", "count"
+COUNTS = "dimension", "steps", "states", "inputs", "count", "units", "unit_inputs"
 """Properties that count something."""
+
+LOOKED_UP = "parts", "intervals", "alone", "summary", "is_disturbed", "curved", "at"
+"""What says something of an object, or is a part of it, and computes nothing."""
+
+STAGES = "measured", "projected", "pushed", "moved"
+"""Stages of a step, which runs them in the scope that it opened."""
+
+PLAIN = {*COUNTS, *LOOKED_UP, *STAGES}
 
 Called = TypeVar("Called", bound=Callable[..., Any])
 
@@ -50,14 +58,14 @@ def lenient(function: Called) -> Called:
 def made_lenient(cls: type) -> None:
     """Let the public methods and properties that a class defines be `lenient`.
 
-    Sizes need no scope: no numbers meet in them.
+    Those need no scope in which no numbers meet, or that run in that of another one.
     """
     for name, value in list(vars(cls).items()):
-        if name.startswith("_") and name not in ("__call__", "__post_init__"):
+        if name in PLAIN or (name.startswith("_") and name not in ("__call__", "__post_init__")):
             continue
         if isinstance(value, FunctionType):
             setattr(cls, name, lenient(value))
         elif isinstance(value, classmethod):
             setattr(cls, name, classmethod(lenient(value.__func__)))
-        elif isinstance(value, property) and value.fget is not None and name not in SIZES:
+        elif isinstance(value, property) and value.fget is not None:
             setattr(cls, name, property(lenient(value.fget), doc=value.__doc__))

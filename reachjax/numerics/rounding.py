@@ -5,11 +5,18 @@ enlarge `rad` by what rounding can add: a sum of `k` products of floating-point 
 at most `gamma(k) |W| |x|` in whatever order it is formed (Higham, Accuracy and Stability of
 Numerical Algorithms, section 3.1; Rump, Fast and parallel interval arithmetic, BIT 1999). The same
 arithmetic therefore serves two purposes: intervals of values, and rounding errors of coefficients.
+
+Rounding is a layer: in a scope `rounding(False)` what it may add is `NOTHING`, a zero with which
+sums and products are not computed at all. The same formulas then give what would hold in exact
+arithmetic, in a fraction of the operations: enough for penalties and first looks, and no bound.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, Self
 
 import jax
@@ -24,6 +31,96 @@ UNIT = 2.0**-53
 
 TINY = float(np.finfo(float).tiny)
 """The smallest positive number that XLA tells from zero: what underflow takes from a product."""
+
+_COUNTED: ContextVar[bool] = ContextVar("counted", default=True)
+
+
+@jax.tree_util.register_static
+class Nothing:
+    """The zero that rounding adds where it is not counted: what is added to it stays as it is."""
+
+    __array_ufunc__ = None  # arrays of numpy leave arithmetic to this class
+
+    def __add__(self, other: Any) -> Any:
+        return WHOLE if type(other) is int and other == 1 else other
+
+    __radd__ = __add__
+
+    def __rsub__(self, other: Any) -> Any:
+        return other + self
+
+    def __mul__(self, other: Any) -> Nothing:
+        return self
+
+    __rmul__ = __truediv__ = __matmul__ = __rmatmul__ = __getitem__ = __mul__
+
+    def __abs__(self) -> Nothing:
+        return self
+
+    def __repr__(self) -> str:
+        return "NOTHING"
+
+
+class Whole:
+    """The factor `1 + NOTHING`: what is multiplied by it stays as it is."""
+
+    __array_ufunc__ = None
+
+    def __mul__(self, other: Any) -> Any:
+        return other
+
+    __rmul__ = __mul__
+
+    def __add__(self, other: Any) -> Any:
+        return 1.0 + other
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> Any:
+        return 1.0 - other
+
+
+NOTHING, WHOLE = Nothing(), Whole()
+
+
+@contextmanager
+def rounding(counted: bool) -> Iterator[None]:
+    """A scope in which errors of rounding are counted, or are not: then nothing in it is a bound.
+
+    Example:
+        >>> with rounding(False):
+        ...     2.0 * (1 + gamma(3)) + gamma(3) * 5.0
+        2.0
+    """
+    token = _COUNTED.set(counted)
+    try:
+        yield
+    finally:
+        _COUNTED.reset(token)
+
+
+def is_counted() -> bool:
+    """Whether errors of rounding are counted."""
+    return _COUNTED.get()
+
+
+def counting(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with errors of rounding counted, wherever it is called.
+
+    What is traced is kept, and used where they are counted.
+    """
+
+    @functools.wraps(function)
+    def counted(*given: Any, **named: Any) -> Any:
+        with rounding(True):
+            return function(*given, **named)
+
+    return counted
+
+
+def errors(size: Callable[[], Any]) -> Any:
+    """What rounding may add, of which no derivative is taken; nothing where it is not counted."""
+    return constant(size()) if is_counted() else NOTHING
 
 
 def namespace(*numbers: Any) -> Any:
@@ -46,12 +143,34 @@ def larger(one: Any, other: Any) -> Any:
 
     `jnp.maximum` halves its derivative where both are equal, which takes long to compile.
     """
-    return namespace(one, other).where(one < other, other, one)
+    return select(one < other, other, one)
 
 
 def smaller(one: Any, other: Any) -> Any:
     """The smaller of two numbers each, as `larger`."""
-    return namespace(one, other).where(one > other, other, one)
+    return select(one > other, other, one)
+
+
+def select(which: Any, one: Any, other: Any) -> Any:
+    """The one number where something is so, and the other one elsewhere.
+
+    As `where`, which is a call of its own for compilers.
+    """
+    if namespace(which, one, other) is np:
+        return np.where(which, one, other)
+    shape = np.broadcast_shapes(*(np.shape(each) for each in (which, one, other)))
+    kind = jnp.result_type(one, other)
+    cases = (_filled(each, shape, kind) for each in (one, other))
+    return jax.lax.select(_filled(which, shape, bool), *cases)
+
+
+def _filled(number: Any, shape: tuple[int, ...], kind: Any) -> Any:
+    """An array of JAX of a shape."""
+    if np.shape(number) == shape and getattr(number, "dtype", None) == kind:
+        return number if isinstance(number, jax.Array) else jnp.asarray(number)
+    if np.ndim(number) == 0 and not isinstance(number, jax.Array):
+        return jax.lax.full(shape, number, kind)
+    return jnp.broadcast_to(jnp.asarray(number, kind), shape)
 
 
 def settled(parts: Any) -> Any:
@@ -68,11 +187,13 @@ def constant(numbers: Any) -> Any:
     return jax.lax.stop_gradient(numbers) if namespace(numbers) is not np else numbers
 
 
-def gamma(operations: int) -> float:
+def gamma(operations: int) -> Any:
     """Relative error bound of `operations` rounded operations, with eight to spare.
 
     Recordings of functions use these up where a constant is rounded, as that of `x / 3`.
     """
+    if not is_counted():
+        return NOTHING
     count = (operations + 8) * UNIT
     return count / (1.0 - count)
 
@@ -155,9 +276,11 @@ class Ball(AbstractNumber):
         A compiler may evaluate an expression in several places and round it differently in each,
         so the radius holds for every rounding of the midpoint.
         """
-        xp, mid = namespace(lower, upper), lower + (upper - lower) / 2
+        mid = lower + (upper - lower) / 2
+        if not is_counted():
+            return cls(mid, (upper - lower) / 2)
         rad = (upper - lower) / 2 * (1 + gamma(4)) + gamma(4) * abs(mid)
-        return cls(mid, xp.where(lower == upper, 0.0, rad))
+        return cls(mid, select(lower == upper, 0.0, rad))
 
     def lift(self, other) -> Ball:
         """`other` as a ball of this kind; plain numbers are taken to be exact."""

@@ -16,6 +16,9 @@ Radii bound rounding errors alone: by how much a number is off the exact affine 
 that it stands for. Behind many layers they grow like the product of their `|W|`, and over many
 steps beyond all bounds; so those of a state become columns of their own before the next step.
 
+Where rounding is not counted (`rounding.rounding`) forms have no radii of their own, and say what
+would hold in exact arithmetic, which is no bound.
+
 All of it is written over numpy and `jax.numpy` alike (`rounding.namespace`). In numpy, columns are
 appended as they are needed. In compiled code every unit and state has its place, so shapes are
 fixed.
@@ -33,8 +36,17 @@ from jaxtyping import Array, Float
 
 from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.pytrees import pytree
-from reachjax.numerics.rounding import Ball, gamma, larger, namespace
-from reachjax.programs.initial import Ends, InitialColumns, constant, met
+from reachjax.numerics.rounding import (
+    NOTHING,
+    Ball,
+    errors,
+    gamma,
+    is_counted,
+    larger,
+    namespace,
+    select,
+)
+from reachjax.programs.initial import Ends, InitialColumns, met
 
 Place = int | Array | None
 """Where new columns begin; None to append those that are needed (numpy)."""
@@ -47,11 +59,11 @@ class AffineForms(AbstractNumber):
     Attributes:
         rows: `(k, 2 + n)`, centre of the form, middle of the interval, coefficients of the columns.
         radii: `(k, 2)`, by how much the form may be off, and of the interval. Derivatives take the
-            first for a constant.
+            first for a constant. It is missing, `(k, 1)`, where rounding is not counted.
     """
 
     rows: Float[Array | np.ndarray, "k n+2"]
-    radii: Float[Array | np.ndarray, "k 2"]
+    radii: Float[Array | np.ndarray, "k radii"]
 
     def __len__(self) -> int:
         return self.rows.shape[0]
@@ -65,11 +77,16 @@ class AffineForms(AbstractNumber):
             size: how many columns there will be; None for these alone.
         """
         xp, (n, w) = namespace(start.center), start.spread.shape
-        middle, zero = start.center[:, None], xp.zeros((n, 1))
+        middle, exact = start.center[:, None], NOTHING if not is_counted() else xp.zeros(n)
         empty = xp.zeros((n, (size or start.count) - w))
         rows = xp.concatenate([middle, middle, start.spread, empty], axis=1)
-        forms = cls(rows, xp.concatenate([zero, zero + xp.inf], axis=1))
+        forms = cls(rows, radii_of(exact, xp.full(n, xp.inf)))
         return forms.within(Ball.between(*forms.ends(start, cut=True)))
+
+    @property
+    def off(self) -> Any:
+        """By how much each form may be off `(k,)`; nothing where rounding is not counted."""
+        return self.radii[:, 0] if self.radii.shape[1] == 2 else NOTHING
 
     @property
     def columns(self) -> Float[Array | np.ndarray, "k n"]:
@@ -80,13 +97,12 @@ class AffineForms(AbstractNumber):
         """The same forms with other intervals."""
         xp = namespace(self.rows)
         parts = self.rows[:, :1], interval.mid[:, None], self.rows[:, 2:]
-        radii = xp.stack([self.radii[:, 0], interval.rad], axis=1)
-        return AffineForms(xp.concatenate(parts, axis=1), radii)
+        return AffineForms(xp.concatenate(parts, axis=1), radii_of(self.off, interval.rad))
 
     def __rmatmul__(self, matrix) -> AffineForms:
         """`matrix @ self` for an exact matrix."""
         matrix, count = namespace(self.rows).asarray(matrix), matrix.shape[1]
-        error = gamma(count) * abs(constant(self.rows)).sum(axis=1)
+        error = errors(lambda: gamma(count) * abs(self.rows).sum(axis=1))
         radii = abs(matrix) @ (self.radii + error[:, None])
         return AffineForms(matrix @ self.rows, radii * (1 + gamma(count + self.rows.shape[1])))
 
@@ -99,7 +115,7 @@ class AffineForms(AbstractNumber):
             changed = self.rows[:, :2] + xp.asarray(other)[..., None]
             rows = xp.concatenate([changed, self.rows[:, 2:]], axis=1)
             radii = self.radii
-        error = gamma(1) * abs(constant(changed)).sum(axis=1)
+        error = errors(lambda: gamma(1) * abs(changed).sum(axis=1))
         return AffineForms(rows, (radii + error[:, None]) * (1 + gamma(rows.shape[1] + 4)))
 
     def __neg__(self) -> AffineForms:
@@ -109,7 +125,7 @@ class AffineForms(AbstractNumber):
         """Each number times an exact one, or all times one."""
         xp = namespace(self.rows)
         factor = xp.broadcast_to(xp.asarray(factor, float), (len(self.rows),))
-        error = gamma(1) * abs(constant(self.rows)).sum(axis=1)
+        error = errors(lambda: gamma(1) * abs(self.rows).sum(axis=1))
         radii = abs(factor)[:, None] * (self.radii + error[:, None])
         return AffineForms(factor[:, None] * self.rows, radii * (1 + gamma(self.rows.shape[1] + 4)))
 
@@ -131,15 +147,16 @@ class AffineForms(AbstractNumber):
         own, n = start.count, self.rows.shape[1]
         center = self.rows[:, 0]
         lower, upper = start.bounds(self.rows[:, 2 : 2 + own], cut)
-        largest = abs(constant(center)) + constant(larger(-lower, upper))
+        error = errors(lambda: gamma(8) * (abs(center) + larger(-lower, upper)))
         rest = abs(self.rows[:, 2 + own :]).sum(axis=1) * (1 + gamma(n))
-        slack = rest + (self.radii[:, 0] + gamma(8) * largest) * (1 + gamma(n))
+        slack = rest + (self.off + error) * (1 + gamma(n))
         return center + lower - slack, center + upper + slack
 
     def ends_by_interval(self) -> Ends:
         """Lower and upper bounds `(k,)` by intervals alone."""
         middle = self.rows[:, 1]
-        reach = self.radii[:, 1] * (1 + gamma(2)) + gamma(2) * abs(constant(middle))
+        error = errors(lambda: gamma(2) * abs(middle))
+        reach = self.radii[:, -1] * (1 + gamma(2)) + error
         return middle - reach, middle + reach
 
     def widened(self, by) -> AffineForms:
@@ -163,7 +180,8 @@ class AffineForms(AbstractNumber):
         """
         k, n = self.rows.shape
         if place is not None:
-            rows = jax.lax.dynamic_update_slice(self.rows, jnp.diag(by), (0, 2 + place))
+            own = select(np.eye(k, dtype=bool), by[:, None], 0.0)
+            rows = jax.lax.dynamic_update_slice(self.rows, own, (0, 2 + place))
             return AffineForms(rows, self.radii), place + jnp.arange(k)
         needed = by != 0
         where, count = np.flatnonzero(needed), int(needed.sum())
@@ -172,6 +190,13 @@ class AffineForms(AbstractNumber):
         rows[where, n + np.arange(count)] = by[where]
         places = np.where(needed, n - 3 + np.cumsum(needed), -1)
         return AffineForms(rows, self.radii), places
+
+
+def radii_of(off: Any, interval: Any) -> Any:
+    """The radii of forms and of intervals beside each other, or of these alone."""
+    if off is NOTHING:
+        return interval[:, None]
+    return namespace(off, interval).stack([off, interval], axis=1)
 
 
 def joined(parts: Sequence[AffineForms]) -> AffineForms:

@@ -24,8 +24,18 @@ from reachjax.loops.closed_loop import UnitLayer
 from reachjax.loops.flows.flow import AbstractFlow
 from reachjax.loops.tracing.limits import Limits
 from reachjax.loops.units import AbstractUnit, Bilinear, Quadratic, SmoothUnit, UnboundedError
-from reachjax.numerics.rounding import TINY, Ball, gamma, namespace
-from reachjax.programs.affine import AffineForms, Place, joined
+from reachjax.numerics.rounding import (
+    NOTHING,
+    TINY,
+    Ball,
+    errors,
+    gamma,
+    is_counted,
+    namespace,
+    rounding,
+    select,
+)
+from reachjax.programs.affine import AffineForms, Place, joined, radii_of
 from reachjax.programs.flows import Between, flowed_forms
 from reachjax.programs.initial import Ends, InitialColumns, constant, met, settled
 from reachjax.sets import Box
@@ -115,8 +125,11 @@ def _count(layers: Sequence[UnitLayer]) -> int:
 
 
 def step_columns(loop: ClosedLoop) -> tuple[int, int]:
-    """How many columns a step adds, and how many it needs in between."""
-    kept, between = loop.units + loop.states, 0
+    """How many columns a step adds, and how many it needs in between.
+
+    Those of the states' radii are among them where rounding is counted.
+    """
+    kept, between = loop.units + (loop.states if is_counted() else 0), 0
     parts = (loop.controller_layers, loop.plant.inputs), (loop.plant_layers, loop.states)
     for layers, outputs in parts:
         if merges(layers, outputs):
@@ -169,6 +182,8 @@ def step_forms(
         ends = _cut(unit, y, start)
         if ranges is not None:
             ends = ranges(unit, y, ends, found)
+        if not is_counted():  # or compilers compute them again for each of their uses
+            ends = settled(ends)
         if isinstance(unit, Bilinear):
             z, forms = _bilinear(unit, y, ends, free, start)
         elif isinstance(unit, SmoothUnit):
@@ -180,6 +195,8 @@ def step_forms(
         else:
             here = slice(done, done + len(y))
             z, forms = _unit(unit, y, ends, free, None if slopes is None else slopes[here])
+        if not is_counted():
+            z = settled(z)
         if place is None and unit.curved:
             _require_bounds(forms, int(t))
         done = done + len(z)
@@ -211,7 +228,8 @@ def step_forms(
     successor = part(loop.plant_layers, plant.states, plant.propagate, state, u, t, apply, *w)
     if place is None:
         successor = successor.padded(width)
-    successor = _spilled(successor, free)
+    if successor.off is not NOTHING:
+        successor = _spilled(successor, free)
     ends = successor.ends(start)
     if known is not None:
         ends = met(ends, (known.lower, known.upper))
@@ -288,12 +306,14 @@ def _smooth(
     xp, (lower, upper), w = namespace(y.rows), ends, start.spread.shape[1]
     values, center, rows = Ball.between(*unit.interval(lower, upper)), y.rows[:, 0], y.rows[:, 2:]
     own = start.norms(rows[:, :w])
-    rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(rows.shape[1])) + y.radii[:, 0]
+    rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(rows.shape[1])) + y.off
     model = unit.quadratic(lower, upper, line)
     lost = abs(model.curvature) * (2 * own + rest) * rest
     better = model.gap + lost <= line.gap
-    model = Quadratic(*(xp.where(better, *pair) for pair in zip(model, line, strict=True)))
-    lost = xp.where(better, lost, 0.0)
+    model = Quadratic(*(select(better, *pair) for pair in zip(model, line, strict=True)))
+    lost = select(better, lost, 0.0)
+    if not is_counted():
+        model, lost, own, rest, values = settled((model, lost, own, rest, values))
     off = center - model.center
     middle = model.offset + (model.slope + model.curvature * off) * off
     slope = model.slope + 2 * model.curvature * off
@@ -303,12 +323,15 @@ def _smooth(
     bent = linear[:, w : start.count] + curvature[:, None] * products
     constants = xp.stack([middle + curvature * level, values.mid], axis=1)
     rows = xp.concatenate([constants, linear[:, :w], bent, linear[:, start.count :]], axis=1)
-    size = abs(model.offset) + (abs(model.slope) + 2 * abs(curvature * off)) * abs(off)
-    size = size + abs(slope) * (own + rest) + abs(curvature) * own**2 + abs(slope * center)
-    error = constant(gamma(rows.shape[1] + 32) * size)
-    radius = constant(abs(slope) * y.radii[:, 0] * (1 + gamma(4))) + error
+
+    def size() -> Any:
+        size = abs(model.offset) + (abs(model.slope) + 2 * abs(curvature * off)) * abs(off)
+        size = size + abs(slope) * (own + rest) + abs(curvature) * own**2 + abs(slope * center)
+        return gamma(rows.shape[1] + 32) * size
+
+    radius = constant(abs(slope) * y.off * (1 + gamma(4)) + errors(size))
     gap = settled((model.gap + lost) * (1 + gamma(16)))
-    z = AffineForms(rows, xp.stack([radius, values.rad], axis=1))
+    z = AffineForms(rows, radii_of(radius, values.rad))
     z, places = z.with_own(gap, place)
     offset = middle - slope * center
     return z, UnitForms(unit, y, lower, upper, slope, offset, gap, places, z)
@@ -331,32 +354,36 @@ def _bilinear(
     count, values = unit.terms, Ball.between(*unit.interval(lower, upper))
     center, rows, size = y.rows[:, 0], y.rows[:, 2:], y.rows.shape[1]
     planes, offset, gap = unit.planes(lower, upper)
-    rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(size)) + y.radii[:, 0]
+    rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(size)) + y.off
     own, half = start.norms(rows[:, :w]), len(center) // 2
-    (S, S_other), (R, R_other), (r, r_other) = map(unit.halves, (own, rest, y.radii[:, 0]))
+    (S, S_other), (R, R_other) = map(unit.halves, (own, rest))
+    r, r_other = (y.off, y.off) if y.off is NOTHING else unit.halves(y.off)
     one, other = rows[:half], rows[half:]
     lost = start.mixed_norms(one, other) + S * r_other + S_other * r + R * R_other
-    lost = lost + constant(gamma(w + 8) * (S * R_other + S_other * R))
+    lost = lost + errors(lambda: gamma(w + 8) * (S * R_other + S_other * R))
     lost = lost * (1 + gamma(size + 16))
     better = lost <= gap
-    slope = xp.where(xp.concatenate([better, better]), unit.derivative(center), planes)
-    offset = _folded(xp.where(better, -(center[:half] * center[half:]), offset), count)
+    slope = select(xp.concatenate([better, better]), unit.derivative(center), planes)
+    offset = _folded(select(better, -(center[:half] * center[half:]), offset), count)
     slope, offset = settled((slope, offset))
-    gap = settled(_folded(xp.where(better, lost, gap), count) * (1 + gamma(count + 8)))
+    gap = settled(_folded(select(better, lost, gap), count) * (1 + gamma(count + 8)))
     level, products = (
-        _folded(xp.where(better.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0), count)
+        _folded(select(better.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0), count)
         for part in start.multiplied(one[:, :w], other[:, :w])
     )
     linear = _folded(slope[:, None] * rows, 2 * count)
     middle = _folded(slope * center, 2 * count) + offset + level
     parts = linear[:, :w], linear[:, w : start.count] + products, linear[:, start.count :]
     form = xp.concatenate([xp.stack([middle, values.mid], axis=1), *parts], axis=1)
-    sizes = _folded(abs(slope) * (abs(center) + own + rest), 2 * count)
-    sizes = sizes + _folded(abs(slope[:half] * slope[half:]) + S * S_other, count)
-    flushed = (size + 8) * (w + 1) * TINY * (1 + _folded(abs(center) + own + rest, 2 * count))
-    error = gamma(size + 2 * count + 16) * sizes + count * flushed
-    radius = _folded(abs(slope) * y.radii[:, 0], 2 * count) * (1 + gamma(2 * count + 4))
-    z = AffineForms(form, xp.stack([constant(radius + error), values.rad], axis=1))
+
+    def lose() -> Any:
+        sizes = _folded(abs(slope) * (abs(center) + own + rest), 2 * count)
+        sizes = sizes + _folded(abs(slope[:half] * slope[half:]) + S * S_other, count)
+        flushed = (size + 8) * (w + 1) * TINY * (1 + _folded(abs(center) + own + rest, 2 * count))
+        error = gamma(size + 2 * count + 16) * sizes + count * flushed
+        return error + _folded(abs(slope) * y.off, 2 * count) * (1 + gamma(2 * count + 4))
+
+    z = AffineForms(form, radii_of(errors(lose), values.rad))
     z, places = z.with_own(gap, place)
     return z, UnitForms(unit, y, lower, upper, xp.zeros_like(gap), offset, gap, places, z)
 
@@ -373,27 +400,30 @@ def _unit(
 ) -> tuple[AffineForms, UnitForms]:
     """What a layer of units makes of its inputs, whose bounds are known."""
     xp, (lower, upper) = namespace(y.rows), ends
-    if slope is None:
-        slope = unit.lines(lower, upper).above.slope
-    rest, values = (
-        Ball.between(*ends)
-        for ends in (unit.remainder(slope, lower, upper), unit.interval(lower, upper))
-    )
+    with rounding(True):  # it is little that these count, and said in many ways
+        if slope is None:
+            slope = unit.lines(lower, upper).above.slope
+        rest, values = (
+            Ball.between(*ends)
+            for ends in (unit.remainder(slope, lower, upper), unit.interval(lower, upper))
+        )
     slope, offset, gap = settled((slope, rest.mid, rest.rad))
-    left = xp.zeros_like(gap)
+    left = NOTHING if not is_counted() else xp.zeros_like(gap)
     rows = slope[:, None] * y.rows
     constants = xp.stack([rows[:, 0] + offset, values.mid], axis=1)
-    if not unit.separable:  # what rounding alone leaves of a value needs no column
+    if not unit.separable and is_counted():  # what rounding alone leaves of a value is no column
         small = gap <= SPILL * abs(y.columns).max(axis=1, initial=0.0)
-        left, gap = xp.where(small, gap, 0.0), xp.where(small, 0.0, gap)
-    # products with 0 and 1 are exact
-    size = abs(constant(rows)).sum(axis=1) + abs(constant(offset))
-    rounded = (slope != 0) & (abs(slope) != 1) | (offset != 0)
-    radius = abs(slope) * y.radii[:, 0] + xp.where(rounded, gamma(4) * size, 0.0)
+        left, gap = select(small, gap, 0.0), select(small, 0.0, gap)
+
+    def size() -> Any:  # products with 0 and 1 are exact
+        size = abs(constant(rows)).sum(axis=1) + abs(constant(offset))
+        rounded = (slope != 0) & (abs(slope) != 1) | (offset != 0)
+        return select(rounded, gamma(4) * size, 0.0)
+
+    radius = abs(slope) * y.off + errors(size)
     radius = constant(radius + left) * (1 + gamma(rows.shape[1]))
-    z = AffineForms(
-        xp.concatenate([constants, rows[:, 2:]], axis=1), xp.stack([radius, values.rad], axis=1)
-    )
+    columns = xp.concatenate([constants, rows[:, 2:]], axis=1)
+    z = AffineForms(columns, radii_of(radius, values.rad))
     z, places = z.with_own(gap, place)
     return z, UnitForms(unit, y, lower, upper, slope, offset, gap, places, z)
 
@@ -418,7 +448,7 @@ def _spilled(forms: AffineForms, place: Place) -> AffineForms:
     Such a column is what a number is off by: what it is beside must be the same everywhere.
     """
     forms, xp = settled(forms), namespace(forms.rows)
-    radius, own = forms.radii[:, 0], xp.ones(len(forms.rows), bool)
+    radius, own = forms.off, xp.ones(len(forms.rows), bool)
     if place is None:
         own = radius > SPILL * abs(forms.columns).sum(axis=1)
     left = xp.stack([xp.where(own, 0.0, radius), forms.radii[:, 1]], axis=1)

@@ -212,8 +212,8 @@ def _change_of_basis(loop: ClosedLoop, t: int) -> ChangeOfBasis:
     one = columns(size - 1, 1, size).mid
     # the paper keeps x^{l+1} = z + u_low and x^{l+2} = u_high - z in place of the last outputs
     S = jnp.eye(size)
-    if isinstance(loop.input_box, Box):
-        box, m = loop.input_box.at(t), loop.plant.inputs
+    if loop.input_box is not None:
+        box, m = loop.input_box.at(t), loop.plant.inputs  # type: ignore[union-attr]
         lower, upper = slice(size - 1 - 2 * m, size - 1 - m), slice(size - 1 - m, size - 1)
         S = S.at[lower, -1].set(-box.lower)
         S = S.at[upper, upper].set(-jnp.eye(m)).at[upper, -1].set(box.upper)

@@ -132,9 +132,9 @@ class Horizon:
     @property
     def facts(self) -> AffineForms:
         """Rows `(m, n)` that are never negative: those of the initial set, then those of units."""
-        widths = (part.columns.shape[1] for part in (self.state, *self._facts))
+        widths = [part.rows.shape[1] - 2 for part in (self.state, *self._facts)]
         width = self._width = max(self._width, *widths)
-        if len(self._facts) != 1 or self._facts[0].columns.shape[1] != width:
+        if len(widths) != 2 or widths[1] != width:
             none = AffineForms(np.zeros((0, width + 2)), np.zeros((0, 2)))
             self._facts = [joined([none, *(part.padded(width) for part in self._facts)])]
         return self._facts[0]
@@ -142,7 +142,7 @@ class Horizon:
     @property
     def width(self) -> int:
         """How many columns there are."""
-        return self.facts.columns.shape[1]
+        return self.facts.rows.shape[1] - 2
 
     @property
     def zero(self) -> Int[np.ndarray, "p 2"]:
@@ -168,7 +168,7 @@ class Horizon:
             if unit is None:
                 self.states.append(y)
                 return ends
-            self._width = max(self._width, y.columns.shape[1])
+            self._width = max(self._width, y.rows.shape[1] - 2)
             if unit.curved:  # its range is that of its form, but for little
                 return ends
             switching = np.flatnonzero(unit.open(*ends))
@@ -332,7 +332,7 @@ class Horizon:
         self._stated = len(found)
 
     def _add_units(self, layer: UnitForms, switching: np.ndarray, before: int) -> None:
-        width = layer.outputs.columns.shape[1]
+        width = layer.outputs.rows.shape[1] - 2
         # a layer that is not separable states its facts as a whole
         stated = switching if layer.unit.separable else np.arange(len(layer.places))
         y, z = layer.inputs[stated].padded(width), layer.outputs[stated]
@@ -390,7 +390,7 @@ def upper_bounds(
     start: InitialColumns,
 ) -> Float[np.ndarray, " k"]:
     """Upper bounds of forms, by multipliers of facts that are of the right signs; NaN is none."""
-    width = max(forms.columns.shape[1], facts.columns.shape[1])
+    width = max(forms.rows.shape[1], facts.rows.shape[1]) - 2
     with np.errstate(all="ignore"):
         used = np.flatnonzero(np.any(multipliers != 0, axis=0))  # few are, of wide networks
         weighed = forms.padded(width) + multipliers[:, used] @ facts[used].padded(width)

@@ -29,7 +29,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.numerics.pytrees import Replaceable, pytree, static
-from reachjax.numerics.rounding import Ball, constant, gamma, larger, namespace, settled, smaller
+from reachjax.numerics.rounding import (
+    Ball,
+    constant,
+    counting,
+    errors,
+    gamma,
+    is_counted,
+    larger,
+    namespace,
+    select,
+    settled,
+    smaller,
+)
 from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
 from reachjax.sets.linear_programs import support
 
@@ -92,20 +104,23 @@ class InitialColumns(Replaceable):
     def squared(self, rows: Rows) -> tuple[Any, Rows]:
         """`(r . w)^2` for each row: its constant, and its coefficients of the products."""
         i, j = self.pairs
-        products = rows[:, i] * rows[:, j] * np.where(i == j, 0.5, 2.0)
+        products = taken(rows, i) * taken(rows, j) * np.where(i == j, 0.5, 2.0)
         return (rows**2).sum(axis=1) / 2, products
 
     def multiplied(self, one: Rows, other: Rows) -> tuple[Any, Rows]:
         """`(r . w) (s . w)` for each pair of rows, as `squared`."""
         i, j = self.pairs
-        mixed = one[:, i] * other[:, j] + one[:, j] * other[:, i]
+        mixed = taken(one, i) * taken(other, j) + taken(one, j) * taken(other, i)
         products = mixed * np.where(i == j, 0.25, 1.0)
         return (one * other).sum(axis=1) / 2, products
 
     def curved_ends(self, rows: Rows) -> Ends:
         """Bounds of each row over all columns, products among them, by the formulas above."""
-        n, error = self.spread.shape[1], gamma(4 * rows.shape[1] + 16)
-        size = abs(rows).sum(axis=1)
+        n, counted = self.spread.shape[1], is_counted()
+        if not self.round and not counted:  # the norm is no better
+            both = _highest(namespace(rows).concatenate([rows, -rows]), self.pairs)
+            return -both[len(rows) :], both[: len(rows)]
+        error = errors(lambda: gamma(4 * rows.shape[1] + 16) * abs(rows).sum(axis=1))
         rest = abs(rows[:, n:]).sum(axis=1)
         below, above = self.ends(rows[:, :n])
         if not self.round:
@@ -114,7 +129,7 @@ class InitialColumns(Replaceable):
             below = larger(below - rest, -both[len(rows) :])
         else:
             below, above = below - rest, above + rest
-        return below - constant(error * size), above + constant(error * size)
+        return below - error, above + error
 
     def bounds(self, rows: Rows, cut: bool = False) -> Ends:
         """Bounds of each row over all columns, the better of all that are known.
@@ -124,6 +139,8 @@ class InitialColumns(Replaceable):
             cut: whether what cuts the initial set is looked at as well.
         """
         w = self.spread.shape[1]
+        if self.curved and not is_counted() and (self.cut is None or not cut):
+            return self.curved_ends(rows)  # the norm is no better
         lower, upper = self.cut_ends(rows[:, :w]) if cut else self.ends(rows[:, :w])
         if not self.curved:
             return lower, upper
@@ -206,6 +223,7 @@ def met(one: Ends, other: Ends) -> Ends:
 
 
 @jax.jit
+@counting
 def _slopes(start: InitialColumns, rows: Float[Array, "k n"]) -> Float[Array, "k n"]:
     """Derivatives of the upper bound of each row over all columns."""
     return jax.grad(lambda rows: start.bounds(rows)[1].sum())(rows)
@@ -248,18 +266,29 @@ def _highest(rows: Rows, pairs: tuple[np.ndarray, np.ndarray]) -> Any:
     """
     xp, n = namespace(rows), int(pairs[1].max(initial=-1)) + 1
     i, j = pairs
-    linear, signs = abs(rows[:, :n]), xp.where(rows[:, :n] < 0, -1.0, 1.0)
+    linear, signs = abs(rows[:, :n]), select(rows[:, :n] < 0, -1.0, 1.0)
     products, mixed = rows[:, n:], i != j
-    against = (products * signs[:, i] * signs[:, j] < 0) & mixed
-    spare = xp.where(against, abs(products), 0.0)
+    against = (products * taken(signs, i) * taken(signs, j) < 0) & mixed
+    spare = select(against, abs(products), 0.0)
     spare = xp.concatenate([spare, xp.zeros((len(rows), 1))], axis=1)
-    for other, number in _rounds(n):
-        linear = linear - smaller(spare[:, number], smaller(linear, linear[:, other]))
-    q = products[:, np.flatnonzero(~mixed)]
+    for other, number in _rounds(n) if n > 1 else ():
+        least = smaller(linear, taken(linear, other))
+        linear = linear - smaller(taken(spare, number), least)
+    q = taken(products, np.flatnonzero(~mixed))
     inside = (q < 0) & (linear < -4 * q)
-    depth = xp.where(inside, -q, 1.0)
-    alone = xp.where(inside, linear**2 / (8 * depth) + depth, linear + q)
-    return abs(products[:, np.flatnonzero(mixed)]).sum(axis=1) + alone.sum(axis=1)
+    depth = select(inside, -q, 1.0)
+    alone = select(inside, linear * linear / (8 * depth) + depth, linear + q)
+    return abs(taken(products, np.flatnonzero(mixed))).sum(axis=1) + alone.sum(axis=1)
+
+
+def taken(rows: Rows, columns: np.ndarray) -> Rows:
+    """Some columns of rows."""
+    if namespace(rows) is np:
+        return rows[:, columns]
+    if not is_counted():  # the derivative is a product, too, and no loop
+        return rows @ (np.arange(rows.shape[1])[:, None] == columns).astype(float)
+    whole = columns.astype(np.uint32)  # none is counted from the end, as compilers would see to
+    return rows.at[:, whole].get(mode="promise_in_bounds")
 
 
 def _of_box(box: Box, cut: PolyhedralSet | None) -> InitialColumns:
@@ -278,6 +307,7 @@ def _of_ball(ball: Ellipsoid, cut: PolyhedralSet | None) -> InitialColumns:
 
 
 @jax.jit
+@counting
 def _ball_map(ball: Ellipsoid) -> tuple[Array, Array, Array]:
     spread = ball.from_ball()
     return settled((ball.center, spread, jax.numpy.linalg.inv(spread)))

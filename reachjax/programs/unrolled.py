@@ -17,12 +17,15 @@ from jaxtyping import Array, Bool, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.tracing.functions import Compiled
+from reachjax.loops.units.smooth import EXTREMES
 from reachjax.numerics.host import in_numpy
+from reachjax.numerics.rounding import rounding
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
 from reachjax.programs.flows import Between
 from reachjax.programs.followed import NoStatesError, OpenDecision, Way, ways
 from reachjax.programs.initial import InitialColumns, constant
+from reachjax.programs.merging import merged_columns
 from reachjax.sets import AbstractSet, Box
 
 
@@ -166,7 +169,15 @@ def _together(each: Sequence[ByForms]) -> ByForms:
     return ByForms(uppers, each[0].slopes, corners, drawn, between, decisions, len(each))
 
 
-@partial(Compiled, static_argnames=("t", "between"))
+FOUND = jax.checkpoint_policies.save_only_these_names(EXTREMES)
+"""What is kept for derivatives, as it has none itself."""
+
+COLUMNS, MEMORY = 96, 12
+"""Where many cells are bounded so many columns are kept, or those of so many steps, where these are
+more: old ones are merged."""
+
+
+@partial(Compiled, static_argnames=("t", "between", "counted", "columns"))
 def unrolled_at_once(
     loop: ClosedLoop,
     X0: AbstractSet,
@@ -174,31 +185,62 @@ def unrolled_at_once(
     directions: Float[Array, "N m n_x"],
     t: int = 0,
     between: bool = False,
+    counted: bool = True,
+    columns: int | None = None,
 ) -> ByForms:
     """Bounds for all steps at once, compiled and differentiable, without a call to the host.
 
-    A polytope counts as the box around it. Arguments are those of `unrolled`.
+    A polytope counts as the box around it.
+
+    Args:
+        loop: the closed loop.
+        X0: the initial set.
+        box: around it.
+        directions: one row a facet, for each step.
+        t: the time of the initial set.
+        between: whether bounds at all times are asked for, of a differential equation.
+        counted: whether rounding is: what is found without it is no bound, and takes a fraction of
+            the time. Of differential equations it always is.
+        columns: how many are kept of all steps before, into which old ones are merged; None for all
+            that there are.
     """
+    with rounding(counted or loop.plant.continuous):
+        return _at_once(loop, X0, box, directions, t, between, columns)
+
+
+def _at_once(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[Array, "N m n_x"],
+    t: int,
+    between: bool,
+    columns: int | None,
+) -> ByForms:
+    """Bounds for all steps, as one scan."""
     start = InitialColumns.of(X0, box, loop.curved)
     (more, scratch), steps = step_columns(loop), len(directions)
-    first, end = start.count, start.count + steps * more
+    kept = (steps - 1) * more if columns is None else max(columns, 4 * loop.states)
+    merges, first = kept < (steps - 1) * more, start.count
+    end = first + (kept + more if merges else steps * more)
 
     # a derivative computes a step again: storing what it needs of it is most of what is compiled
-    @partial(jax.checkpoint, prevent_cse=False)
+    @partial(jax.checkpoint, prevent_cse=False, policy=FOUND)
     def advance(state: AffineForms, step: tuple[Array, Array]) -> tuple[AffineForms, ByForms]:
         k, rows = step
-        place = first + k * more
+        place = first + (kept if merges else k * more)
         spans = [] if between else None
         state, units, _ = step_forms(
             loop, state, t + k, start, place=place, scratch=end, spans=spans
         )
-        return state, _bounds(rows, state, units, start, spans)
+        found = _bounds(rows, state, units, start, spans)
+        return merged_columns(state, first, kept, end) if merges else state, found
 
     state = AffineForms.beginning(start, end + scratch)
     return jax.lax.scan(advance, state, (jnp.arange(steps), directions))[1]
 
 
-@partial(Compiled, static_argnames="t")
+@partial(Compiled, static_argnames=("t", "columns"))
 def unrolled_from_boxes(
     loop: ClosedLoop,
     lower: Float[Array, "c n_x"],
@@ -206,6 +248,7 @@ def unrolled_from_boxes(
     directions: Float[Array, "N m n_x"],
     whole: Bool[Array, "N m"] | None = None,
     t: int = 0,
+    columns: int | None = None,
 ) -> Float[Array, "c N m"]:
     """Upper bounds of directions after 1, ..., N steps from each of many boxes, in one call.
 
@@ -216,11 +259,15 @@ def unrolled_from_boxes(
         directions: one row a facet, for each step.
         whole: which of them are bounded at all times since the sample before; None for none.
         t: the time of the boxes.
+        columns: as of `unrolled_at_once`; None for as many as a dozen steps add.
     """
+    most = columns or max(COLUMNS, MEMORY * step_columns(loop)[0])
 
     def one(lower: Float[Array, " n_x"], upper: Float[Array, " n_x"]) -> Float[Array, "N m"]:
         box = Box(lower, upper)
-        found = unrolled_at_once(loop, box, box, directions, t, between=whole is not None)
+        found = unrolled_at_once(
+            loop, box, box, directions, t, between=whole is not None, columns=most
+        )
         return found.offsets if whole is None else jnp.where(whole, found.between, found.offsets)
 
     return jax.vmap(one)(lower, upper)

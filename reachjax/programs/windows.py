@@ -30,10 +30,9 @@ from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.basis import Rows, columns, loop_rows, picking
 from reachjax.programs.bounds import LoopBounds, loop_bounds
-from reachjax.programs.facts import FactLayout, Kind, StepFacts
 from reachjax.programs.lmi import Origin, Program
 from reachjax.programs.preactivations import bounds_over, known_inputs
-from reachjax.programs.relaxations import AbstractRelaxation
+from reachjax.programs.relaxations import AbstractRelaxation, FactLayout, Kind, StepFacts
 from reachjax.sets import AbstractSet, Box, Ellipsoid
 
 CONSTANT = 1e-9

@@ -15,14 +15,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from reachjax.programs.lmi import Program
-from reachjax.programs.pencils import AbstractInequality
+from reachjax.programs.presolve import AbstractInequality
 
 
 class SolverStatus(enum.IntEnum):
     """How the search for a bound ended. "Almost solved" is not solved, and "solved" is not proof.
 
     The first six are ends of solvers of programs, the others of searches by forms, linear programs,
-    splits and cells: there `SOLVED` means that no more is left open than was asked for.
+    splits and cells: there `SOLVED` means that no more is left open than was asked for. What is
+    proved anew from a file is `RECHECKED`: how a search ended cannot be proved.
     """
 
     SOLVED = 0
@@ -37,6 +38,7 @@ class SolverStatus(enum.IntEnum):
     STALLED = 9
     INTERRUPTED = 10
     UNKNOWN_GAP = 11
+    RECHECKED = 12
 
     @property
     def advice(self) -> str:
@@ -47,10 +49,10 @@ class SolverStatus(enum.IntEnum):
 OF_SOLVERS = tuple(SolverStatus)[: SolverStatus.FAILED + 1]
 """The ends that a solver of programs may report."""
 
-AS_ASKED = (SolverStatus.SOLVED, SolverStatus.AFFINE_FORM)
+AS_ASKED = (SolverStatus.SOLVED, SolverStatus.AFFINE_FORM, SolverStatus.RECHECKED)
 """The ends after which a bound is as tight as the method that was asked for makes it."""
 
-ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE)
+ANSWERS = (SolverStatus.SOLVED, SolverStatus.INACCURATE, SolverStatus.RECHECKED)
 """The ends after which there is a proposal."""
 
 CLAIMING = (*ANSWERS, SolverStatus.LIMIT)
@@ -82,6 +84,8 @@ _ADVICE = {
     "loose; call again to go on",
     SolverStatus.UNKNOWN_GAP: "no trajectory could be simulated, so that what is left open is not "
     "known: the bound is sound; give a set X0 that states can be drawn from",
+    SolverStatus.RECHECKED: "proved anew from a file: the bound is sound, and its gap is what the "
+    "witness leaves; how the search for it ended is not known, and was not believed",
 }
 
 

@@ -69,7 +69,7 @@ def judged_offsets(program: Program, proposal: Proposal) -> Judged:
     """The rechecked offsets, never below what the relaxation itself gives.
 
     The derivative is the program's where multipliers and moments bear the claim out, whatever the
-    solver calls it: that is what is held. Elsewhere it is that of what is proved (`slopes`).
+    solver calls it: that is what is held. Elsewhere it is that of what is proved (`gradients`).
 
     Args:
         program: of finite numbers.

@@ -5,6 +5,7 @@ from reachjax.sets.ellipsoid import Ellipsoid
 from reachjax.sets.intersection import Intersection
 from reachjax.sets.polytope import Polytope
 from reachjax.sets.templates import AbstractTemplate, EllipsoidTemplate, MixedTemplate, Template
+from reachjax.sets.vnnlib import VnnLib, read_vnnlib
 
 __all__ = [
     "AbstractSet",
@@ -18,4 +19,6 @@ __all__ = [
     "PolyhedralSet",
     "Polytope",
     "Template",
+    "VnnLib",
+    "read_vnnlib",
 ]

@@ -82,6 +82,11 @@ class AbstractSet(Replaceable, abc.ABC):
         return None
 
     @property
+    def intervals(self) -> tuple[Float[Array, "*time n"], Float[Array, "*time n"]] | None:
+        """The ends of its coordinates, if the set is all that lies between; None of others."""
+        return None
+
+    @property
     @abc.abstractmethod
     def parts(self) -> tuple[PolyhedralSet | None, RoundSet | None]:
         """What its facets bound, and the ellipsoid that bounds it; None of what it has not."""
@@ -442,6 +447,11 @@ class Box(PolyhedralSet):
     def center(self) -> Float[Array, " n"]:
         """The midpoint of the box."""
         return (self.lower + self.upper) / 2
+
+    @property
+    def intervals(self) -> tuple[Float[Array, "*time n"], Float[Array, "*time n"]]:
+        """The bounds, of all times where there are several."""
+        return self.lower, self.upper
 
     @property
     def widths(self) -> Float[Array, " n"]:

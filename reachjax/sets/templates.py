@@ -59,6 +59,12 @@ class AbstractTemplate(Replaceable, abc.ABC):
         """The templates of the two parts that the sets have; None of what they have not."""
 
     @property
+    def alone(self) -> Template | None:
+        """The template, if its sets are bounded by facets and nothing else; None of others."""
+        facets, ellipsoid = self.parts
+        return facets if ellipsoid is None else None
+
+    @property
     def steps(self) -> int | None:
         """The number of steps it is given for; None if all sets look alike."""
         return None
@@ -232,7 +238,7 @@ class EllipsoidTemplate(AbstractTemplate):
         shape: `(n, n)`, symmetric and positive definite, up to a factor. Only the size is then
             sought, around the successor of the centre; the sets are larger, and their derivatives
             exact. None for the ellipsoid of minimum volume, whose derivative is that of a point
-            close to it (see `reachjax.solvers.least_volume`), and whose thinnest half-axis is at
+            close to it (see `reachjax.solvers.ellipsoids`), and whose thinnest half-axis is at
             least some 1e-8 of the others: around a flat set there is no least one.
 
     Raises:

@@ -5,11 +5,10 @@ from reachjax.solvers.base import AbstractSolver
 from reachjax.solvers.clarabel import Clarabel
 from reachjax.solvers.conic import SCS, CvxpySolver
 from reachjax.solvers.cutting_planes import Rounds
-from reachjax.solvers.ellipsoids import GivenShape
+from reachjax.solvers.ellipsoids import GivenShape, LeastVolume
 from reachjax.solvers.facets import Facets
 from reachjax.solvers.goals import AbstractGoal, proved
 from reachjax.solvers.interior_point import InteriorPoint
-from reachjax.solvers.least_volume import LeastVolume
 
 __all__ = [
     "SCS",

@@ -9,7 +9,7 @@ import numpy as np
 from reachjax.numerics.budget import clock
 from reachjax.numerics.checks import whole_number
 from reachjax.programs.lmi import Program
-from reachjax.programs.pencils import AbstractInequality
+from reachjax.programs.presolve import AbstractInequality
 from reachjax.proofs.proposal import ANSWERS, Proposal, SolverStatus
 from reachjax.solvers.base import AbstractSolver, proposed
 from reachjax.solvers.clarabel import Clarabel

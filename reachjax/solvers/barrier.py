@@ -21,8 +21,7 @@ import scipy.sparse as sp
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
 from reachjax.numerics.budget import ENDLESS, PACE, Budget, TimeOverError, clock
-from reachjax.programs.pencils import Pencil
-from reachjax.programs.presolve import CHUNK, THINNEST
+from reachjax.programs.presolve import CHUNK, THINNEST, Pencil
 from reachjax.solvers.primal_dual import DAMPING
 
 FROM_AFAR = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 1e-5)

@@ -28,7 +28,7 @@ from numpy import ndarray
 from reachjax.numerics.budget import TimeOverError, clock
 from reachjax.numerics.checks import described
 from reachjax.programs.lmi import Program
-from reachjax.programs.pencils import AbstractInequality, Pencil
+from reachjax.programs.presolve import AbstractInequality, Pencil
 from reachjax.proofs.proposal import CLAIMING, OF_SOLVERS, Proposal, SolverStatus
 
 RESCALINGS = (1.0, 8.0, 0.125, 64.0, 1.0)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from reachjax.numerics.budget import MOST_BYTES, clock, require_memory
 from reachjax.programs.lmi import Program
-from reachjax.programs.pencils import AbstractInequality, Pencil
+from reachjax.programs.presolve import AbstractInequality, Pencil
 from reachjax.proofs.proposal import CLAIMING, Proposal, SolverStatus
 from reachjax.solvers.base import RESCALINGS, Found, proposed_by, require_positive
 from reachjax.solvers.conic import LEAST, AbstractConicSolver, require_panic, unit_columns

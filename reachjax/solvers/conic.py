@@ -16,8 +16,7 @@ from jaxtyping import Float
 
 from reachjax.numerics.budget import clock
 from reachjax.programs.lmi import Program
-from reachjax.programs.pencils import AbstractInequality, Pencil
-from reachjax.programs.presolve import THINNEST
+from reachjax.programs.presolve import THINNEST, AbstractInequality, Pencil
 from reachjax.proofs.proposal import Proposal, SolverStatus
 from reachjax.solvers.base import (
     RESCALINGS,

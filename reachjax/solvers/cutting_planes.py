@@ -18,10 +18,9 @@ from jaxtyping import Bool, Float, Int
 
 from reachjax.loops.units import Mark
 from reachjax.numerics.budget import ENDLESS, Budget
-from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Program
 from reachjax.programs.presolve import presolved
-from reachjax.programs.relaxations import CuttingPlanes, LocalBounds, Products
+from reachjax.programs.relaxations import CuttingPlanes, FactLayout, LocalBounds, Products
 
 VIOLATED = 1e-6
 """Products more negative than this are, rows of facts and the basis being of unit size."""

@@ -13,14 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.lmi import Program, Slopes, inequality_slopes
-from reachjax.programs.pencils import Pencil, Shape
-from reachjax.programs.presolve import Generators, NormalProgram, presolved
+from reachjax.programs.presolve import Generators, NormalProgram, Pencil, Shape, presolved
 from reachjax.programs.relaxations import Products
 from reachjax.proofs.by_products import Certificate
+from reachjax.proofs.gradients import held_offsets
 from reachjax.proofs.proposal import Proposal, SolverStatus
 from reachjax.proofs.recheck import clipped, interval_offsets, sound_offsets
 from reachjax.proofs.reported import Judged, judged_offsets
-from reachjax.proofs.slopes import held_offsets
 from reachjax.sets import Polytope
 from reachjax.solvers.base import AbstractSolver, proposed
 from reachjax.solvers.cutting_planes import NONE, CutPool, Rounds, Shown, idle, in_rounds, joint

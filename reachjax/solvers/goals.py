@@ -8,14 +8,14 @@ steps.
 **With an optimum.** Offsets and sizes are optimal values, so the envelope theorem gives their
 derivative: hold multipliers and moments fixed and differentiate the Lagrangian (`programs.lmi`).
 The ellipsoid of least volume is an optimal *point*: what is reported is the point on the central
-path nearby, which moves as the implicit function theorem says (`least_volume`). What the recheck
+path nearby, which moves as the implicit function theorem says (`ellipsoids`). What the recheck
 adds to an optimum is not differentiated.
 
 **Without an optimum.** The derivative is that of the bound that is reported, whatever the status:
 where multipliers and moments do not bear out an optimum, of what the multipliers prove, these being
-held, and where they prove nothing of use, of the interval bound (`proofs.slopes`). It is NaN where
-there is no bound at all. What a solver proposes (multipliers, moments, its own offsets) has no
-derivative: asking for one gives NaN.
+held, and where they prove nothing of use, of the interval bound (`proofs.gradients`). It is NaN
+where there is no bound at all. What a solver proposes (multipliers, moments, its own offsets) has
+no derivative: asking for one gives NaN.
 
 **Accuracy.** The derivative is as good as the solver: with the default solvers, which go on to
 1e-9, the tests hold it to 1e-3 of fourth-order differences, over one step and over five. At 1e-6
@@ -43,7 +43,7 @@ from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.host import all_finite, on_host, shapes_of
 from reachjax.programs.lmi import Program, Slopes
-from reachjax.programs.pencils import AbstractInequality
+from reachjax.programs.presolve import AbstractInequality
 from reachjax.programs.relaxations import LocalBounds, Products
 from reachjax.proofs.certificates import AbstractCertificate
 from reachjax.proofs.proposal import Proposal
@@ -56,7 +56,7 @@ from reachjax.solvers.cutting_planes import NONE, CutPool, Rounds, Shown, idle, 
 class AbstractGoal(AbstractInequality):
     """What is sought of a program. A pytree; what gets a program gets numpy arrays, on the host.
 
-    It says what a solver sees (`programs.pencils`), what is proved with what that proposes, and how
+    It says what solvers see (`programs.presolve`), what is proved with what they propose, and how
     that moves with the program's rows.
     """
 

@@ -10,8 +10,7 @@ from reachjax.numerics.budget import require_memory
 from reachjax.numerics.checks import whole_number
 from reachjax.numerics.host import all_finite
 from reachjax.programs.lmi import Program
-from reachjax.programs.pencils import AbstractInequality, Pencil
-from reachjax.programs.presolve import THINNEST
+from reachjax.programs.presolve import THINNEST, AbstractInequality, Pencil
 from reachjax.proofs.proposal import Proposal, SolverStatus
 from reachjax.solvers.barrier import FROM_AFAR, WEIGHTS, Barrier
 from reachjax.solvers.base import AbstractSolver, Attempt, Found, proposed_by, require_positive

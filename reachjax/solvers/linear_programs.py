@@ -104,11 +104,33 @@ class AbstractPrograms(abc.ABC):
     def forget(self) -> None:
         """Let what is solved next depend on nothing that was solved before."""
 
+    def _own(self, rows: Float[np.ndarray, "r n"]) -> tuple[Float[np.ndarray, "r v"], float]:
+        """Rows over the columns that matter, and how large their coefficients are."""
+        given = np.zeros((len(rows), self._width))
+        given[:, : rows.shape[1]] = rows
+        rows = given[:, self._columns]
+        return rows, abs(rows).max(initial=0.0) or 1.0
+
     def _placed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
         """Values of the columns that matter among those of all."""
         found = np.zeros(self._width)
         found[self._columns] = values
         return found
+
+
+def _of_unit_size(
+    facts: AffineForms, columns: Int[np.ndarray, " v"]
+) -> tuple[Float[np.ndarray, "m v"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Rows and constants of facts over some columns, divided by their sizes, and these.
+
+    Facts that are no numbers are none: their rows are zero.
+    """
+    constants, rows = facts.rows[:, 0], facts.columns[:, columns]
+    size = np.maximum(abs(rows).max(axis=1, initial=0.0), abs(constants))
+    known = np.isfinite(size)
+    rows, constants = np.where(known[:, None], rows, 0.0), np.where(known, constants, 0.0)
+    size = np.where((size > 0) & known, size, 1.0)
+    return rows / size[:, None], constants / size, size
 
 
 class LinearPrograms(AbstractPrograms):
@@ -144,15 +166,11 @@ class LinearPrograms(AbstractPrograms):
         """Add the columns and the facts that are new."""
         self._add_columns(len(columns) - len(self._columns), 1.0)
         self._columns, self._width, old = columns, facts.columns.shape[1], len(self._rows)
-        constants, rows = facts.rows[old:, 0], facts.columns[old:, columns]
-        size = np.maximum(abs(rows).max(axis=1, initial=0.0), abs(constants))
-        known = np.isfinite(size)
-        rows, constants = np.where(known[:, None], rows, 0.0), np.where(known, constants, 0.0)
-        size = np.where((size > 0) & known, size, 1.0)
+        rows, constants, size = _of_unit_size(facts[old:], columns)
         self._rows = np.append(self._rows, self._count + np.arange(len(rows)))
         self._size = np.append(self._size, size)
-        self._constant = np.append(self._constant, constants / size)
-        self._add_rows(-constants / size, rows / size[:, None], 0.0)
+        self._constant = np.append(self._constant, constants)
+        self._add_rows(-constants, rows, 0.0)
 
     def largest(
         self,
@@ -167,10 +185,7 @@ class LinearPrograms(AbstractPrograms):
         if not (np.isfinite(rows).all() and np.isfinite(constants).all()):
             return None
         self._hold({int(fact) for fact in zero})
-        given = np.zeros((len(rows), self._width))
-        given[:, : rows.shape[1]] = rows
-        rows = given[:, self._columns]
-        size = abs(rows).max(initial=0.0) or 1.0
+        rows, size = self._own(rows)
         width = len(self._columns) + 1
         objective = np.zeros(width)
         extra = 0
@@ -298,12 +313,7 @@ class ConicPrograms(AbstractPrograms):
     def grow(self, facts: AffineForms, columns: Int[np.ndarray, " v"]) -> None:
         """Add the columns and the facts that are new."""
         self._columns, self._width = columns, facts.columns.shape[1]
-        rows, constants = facts.columns[:, columns], facts.rows[:, 0]
-        size = np.maximum(abs(rows).max(axis=1, initial=0.0), abs(constants))
-        known = np.isfinite(size)
-        rows, constants = np.where(known[:, None], rows, 0.0), np.where(known, constants, 0.0)
-        self._size = np.where((size > 0) & known, size, 1.0)
-        self._facts, self._constants = rows / self._size[:, None], constants / self._size
+        self._facts, self._constants, self._size = _of_unit_size(facts, columns)
 
     def largest(
         self,
@@ -315,10 +325,7 @@ class ConicPrograms(AbstractPrograms):
         basis: Any = None,
     ) -> Vertex | None:
         """The largest value of a row, or of the least of several; None where there is no answer."""
-        given = np.zeros((len(rows), self._width))
-        given[:, : rows.shape[1]] = rows
-        rows, n = given[:, self._columns], len(self._columns)
-        size = abs(rows).max(initial=0.0) or 1.0
+        (rows, size), n = self._own(rows), len(self._columns)
         held = np.array(sorted({int(fact) for fact in zero}), dtype=int)
         others = np.setdiff1d(np.arange(len(self._facts)), held)
         # the last variable is the least of the rows

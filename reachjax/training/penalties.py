@@ -15,24 +15,26 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.methods.problem import AbstractMethod
-from reachjax.methods.propagation import require_kinds
+from reachjax.methods.problem import AbstractMethod, Problem
+from reachjax.methods.propagation import Options, check_problem, require_kinds
 from reachjax.numerics.checks import described, is_concrete, whole_number
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import unlogged
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds, LocalBounds
-from reachjax.sets import AbstractSet, AbstractTemplate, Box, Template
+from reachjax.sets import AbstractSet, AbstractTemplate, Box
 from reachjax.sets.cells import grid_ends
 from reachjax.tubes.reach import ReachTube, reach
 from reachjax.tubes.sizes import log_volume
+from reachjax.tubes.sketches import Sketch, sketched
 from reachjax.verdicts.specification import (
     AvoidSets,
     Region,
+    Requirement,
     Timed,
     check_margin,
+    missing,
     period_of,
     requirements,
-    shortfall,
 )
 
 
@@ -86,7 +88,7 @@ def volume_penalty(
     if not callable(measure):
         raise TypeError(f"measure must be a function of a set, but {described(measure)} arrived")
 
-    def size(tube: ReachTube) -> Float[Array, ""]:
+    def size(tube: ReachTube | Sketch) -> Float[Array, ""]:
         sizes = [measure(region) for region in tube.sets[1:]]
         if sizes[0] is None or jnp.shape(sizes[0]) != ():
             arrived = "None" if sizes[0] is None else f"an array of shape {jnp.shape(sizes[0])}"
@@ -147,18 +149,19 @@ def specification_penalty(
         0.1
     """
     check_margin(margin)
+    required: list[Requirement] = []
     if isinstance(loop, ClosedLoop):  # mistakes are named before anything is solved
         steps = whole_number("horizon", horizon, 1)
-        requirements(loop.states, steps, goal, avoid, safe, period_of(loop))
+        required = requirements(loop.states, steps, goal, avoid, safe, period_of(loop))
 
-    def missing(tube: ReachTube) -> Float[Array, ""]:
-        return shortfall(tube, goal, avoid, safe, margin=margin)
+    def missed(tube: ReachTube | Sketch) -> Float[Array, ""]:
+        return missing(required, tube, margin)
 
-    return _penalised(missing, loop, X0, horizon, template, cells, options)
+    return _penalised(missed, loop, X0, horizon, template, cells, options)
 
 
 def _penalised(
-    penalty: Callable[[ReachTube], Float[Array, ""]],
+    penalty: Callable[[ReachTube | Sketch], Float[Array, ""]],
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
@@ -169,15 +172,20 @@ def _penalised(
     """The penalty of a tube, or its mean over those from the cells of an initial set."""
     require_kinds(loop=loop, X0=X0, template=template)
     options = _completed(loop, X0, template, options)
+    by_forms = isinstance(options["relaxation"], LinearBounds) and not loop.plant.continuous
 
     def of(X0: AbstractSet) -> Float[Array, ""]:
-        return penalty(reach(loop, X0, horizon, template, **options))
+        problem = Problem(loop, X0, template, horizon, options.get("start", 0))
+        if not by_forms or is_concrete(problem.parts):
+            return penalty(reach(loop, X0, horizon, template, **options))
+        check_problem(problem, Options(**{k: v for k, v in options.items() if k != "start"}))
+        return penalty(sketched(problem))
 
     if cells is None:
         return of(X0)
-    if not isinstance(X0, Box):
+    if X0.intervals is None:
         raise TypeError(f"cells are of an X0 of type Box, but {described(X0)} arrived")
-    lower, upper = grid_ends(X0, cells)
+    lower, upper = grid_ends(X0.bounding_box(), cells)
     if options["window"] is None:  # on the host, one by one
         each = [of(Box(*ends)) for ends in zip(lower, upper, strict=True)]
         return sum(each, start=jnp.zeros(())) / len(each)
@@ -188,7 +196,7 @@ def _completed(
     loop: ClosedLoop, X0: AbstractSet, template: AbstractTemplate, options: dict[str, Any]
 ) -> dict[str, Any]:
     """The options that are given, and what they leave open."""
-    by_programs = not isinstance(template, Template) or "solver" in options or "window" in options
+    by_programs = template.alone is None or "solver" in options or "window" in options
     relaxation = options.get("relaxation", LocalBounds() if by_programs else LinearBounds())
     of_numbers = is_concrete(jax.lax.stop_gradient((loop, X0, template)))
     relaxation, window = _in_penalties(relaxation, of_numbers)

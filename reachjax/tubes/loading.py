@@ -1,96 +1,22 @@
-"""Tubes from files, sealed again, and rechecked where what they rest on may have changed."""
+"""Tubes as files have them, sealed again, and rechecked."""
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
 
-from reachjax.loops import ClosedLoop
 from reachjax.methods.problem import Problem
 from reachjax.methods.propagation import Options, check_problem
 from reachjax.methods.searches import Bar
-from reachjax.numerics.archives import UnreadableError, existing_file
-from reachjax.numerics.checks import (
-    owned,
-    require_bar,
-    require_double_precision,
-    require_kind,
-    wrapped,
-)
-from reachjax.numerics.flags import lenient
-from reachjax.numerics.logs import logged
-from reachjax.numerics.storage import read
+from reachjax.numerics.checks import require_kind, wrapped
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
 from reachjax.tubes.rechecks import Recheck, require_partition
 from reachjax.tubes.saving import Kept
 
-MISSING = (
-    "was written without its loop, whose functions cannot be stored: give the loop again, "
-    "load(path, loop=...)"
-)
 
-
-@logged
-@lenient
-def load(
-    path: str | os.PathLike[str],
-    loop: ClosedLoop | None = None,
-    *,
-    recheck: bool = False,
-    progress: Bar | None = None,
-) -> ReachTube | PartitionedTube:
-    """A tube from the file that `tube.save(path)` wrote.
-
-    Args:
-        path: of the file.
-        loop: needed if the loop has functions that a user wrote, which no file can keep. It must be
-            the one that was left out, in every equation that JAX traces of it and in every number.
-        recheck: whether everything that the tube says of its loop is proved anew, which takes about
-            as long as it took to compute, or less. The file is believed in nothing: of the loop,
-            the initial set, template and start that it has, all else follows.
-        progress: wraps the iteration over steps that are rechecked, such as `tqdm.tqdm`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        RuntimeError: JAX's 64-bit floats are off.
-        TypeError: an argument is of another kind.
-        DisagreementError: a recheck does not prove what the file says.
-        UnreadableError: the file is none of reachjax, of another version, broken or changed, or a
-            loop is needed.
-        ValueError: the loop is another one, or the progress bar leaves out steps.
-
-    Example:
-        >>> import pathlib, tempfile
-        >>> from reachjax import MLP, AffinePlant, Box, Template, reach
-        >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "tube.reach"
-        >>> reach(loop, Box([1.0], [2.0]), 3, Template.box(1)).save(path)
-        >>> load(path, recheck=True)
-        ReachTube(horizon=3, facets=2, states=1)
-    """
-    require_double_precision()
-    require_bar(progress)
-    if loop is not None:
-        require_kind("loop", loop, ClosedLoop, "a ClosedLoop")
-    found = existing_file("path", path)
-    kept = read(found, owned(loop), MISSING)
-    try:
-        tube = _sealed(kept)
-    except Exception as error:  # whoever wrote it may have written anything
-        message = f"{path} must hold a tube, but something else arrived: {error}"
-        raise UnreadableError(message) from error
-    if loop is not None and not kept.is_of(loop):
-        raise ValueError(
-            f"loop must be that of the tube in {path}, with the same equations and numbers, but "
-            "another one arrived (or another version of JAX, which writes its equations otherwise)"
-        )
-    return _rechecked(tube, progress) if recheck else tube
-
-
-def _rechecked(tube: ReachTube | PartitionedTube, progress: Bar | None) -> Any:
+def rechecked(tube: ReachTube | PartitionedTube, progress: Bar | None) -> Any:
     """The tube as it is proved anew.
 
     Raises:
@@ -110,13 +36,12 @@ def _rechecked(tube: ReachTube | PartitionedTube, progress: Bar | None) -> Any:
     return found[0]
 
 
-def _sealed(kept: Any) -> ReachTube | PartitionedTube:
+def sealed(kept: Kept) -> ReachTube | PartitionedTube:
     """The tube that was read, its parts being what a tube has, with the seal of what was read.
 
     Raises:
         Exception: of any kind: they are something else.
     """
-    require_kind("it", kept, Kept, "a tube with the seal of its loop")
     if isinstance(kept.tube, PartitionedTube):
         parts = tuple(map(_whole, kept.tube.tubes))
         if not parts:

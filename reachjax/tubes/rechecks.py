@@ -8,6 +8,7 @@ another machine, is raised to what is proved; one that is larger by more is a di
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cached_property
 from typing import Any
 
@@ -16,8 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.scenarios import Scenarios
+from reachjax.numerics.rounding import namespace
 from reachjax.numerics.seals import seal_of
 from reachjax.proofs.certificates import AbstractProof
+from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet, Ellipsoid, Intersection, Polytope
 from reachjax.sets.cells import covers
 from reachjax.tubes.partitions import PartitionedTube
@@ -62,7 +65,7 @@ class Recheck:
                 k,
             ) from error
         self._sets.append(region)
-        self._proofs.append(proof)
+        self._proofs.append(_unclaimed(proof))
 
     def finished(self) -> ReachTube:
         """The tube as it is proved, once all steps are.
@@ -143,6 +146,26 @@ class Recheck:
         runs = scenarios.runs(loop, begun, tube.horizon, tube.start)
         sizes = np.where(np.isfinite(runs), abs(runs), 0.0).max(axis=0)
         return np.maximum.accumulate(sizes, axis=0)
+
+
+def _unclaimed(said: Any) -> Any:
+    """A proof, or several, without what nobody can prove: how a search ended, and its seconds."""
+    if type(said) is tuple:
+        return tuple(map(_unclaimed, said))
+    if not isinstance(said, AbstractProof):
+        return said
+    parts = {field.name: getattr(said, field.name) for field in dataclasses.fields(said)}
+    nested = {
+        name: _unclaimed(part)
+        for name, part in parts.items()
+        if isinstance(part, AbstractProof) or type(part) is tuple
+    }
+    xp = namespace(said.codes)
+    return said.replace(
+        **nested,
+        codes=xp.full_like(said.codes, int(SolverStatus.RECHECKED)),
+        seconds=xp.full_like(said.seconds, np.nan),
+    )
 
 
 def _require_template(tube: ReachTube, k: int, region: AbstractSet) -> None:

@@ -18,14 +18,14 @@ from jaxtyping import Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.methods.ladder import Ladder
+from reachjax.methods.recursion import goals_of
 from reachjax.methods.steps import Setting, Step, boxed
-from reachjax.methods.successors import goals_of
 from reachjax.numerics.budget import ENDLESS
-from reachjax.programs.facts import FactLayout
 from reachjax.programs.lmi import Origin, Program
 from reachjax.programs.relaxations import (
     AbstractRelaxation,
     AllProducts,
+    FactLayout,
     LinearBounds,
     LocalBounds,
     Products,

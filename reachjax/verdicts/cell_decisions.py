@@ -27,6 +27,7 @@ from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet
 from reachjax.verdicts.cell_tasks import CellTask, outcome_of
 from reachjax.verdicts.findings import Findings
+from reachjax.verdicts.grounds import Asked, Climb, Grounds
 from reachjax.verdicts.sieve import TOGETHER, Ends, Margins, Outcome, Sieve, Unbounded, no_margins
 from reachjax.verdicts.soundness import require_unbroken_cells
 from reachjax.verdicts.verdict import DecidedCell, Verdict, VerdictStatus
@@ -49,6 +50,7 @@ def decided_by_cells(
     budget: Budget,
     executor: Executor | None = None,
     progress: Bar | None = None,
+    counts: tuple[int, ...] = (),
 ) -> Verdict:
     """The verdict on all cells.
 
@@ -60,8 +62,9 @@ def decided_by_cells(
         budget: of the call.
         executor: runs the cells; None: here.
         progress: wraps the iteration over cells.
+        counts: equal parts of each coordinate to begin with; none for the whole set.
     """
-    search = _Decisions(task, X0, cells, budget)
+    search = _Decisions(task, X0, cells, budget, counts)
     if simulations is not None:
         search.findings.simulate(simulations.runs)
     try:
@@ -92,7 +95,15 @@ class _Decisions(AbstractSearch):
 
     ahead = 4
 
-    def __init__(self, task: CellTask, X0: AbstractSet, cells: CellTree, budget: Budget):
+    def __init__(
+        self,
+        task: CellTask,
+        X0: AbstractSet,
+        cells: CellTree,
+        budget: Budget,
+        counts: tuple[int, ...] = (),
+    ):
+        self._counts = counts
         self._task = task._replace(nodes=min(PROGRAMS, task.nodes))
         self._X0, self._cells, self._budget = X0, cells, budget
         self._loop = jax.device_put(task.loop)
@@ -240,7 +251,17 @@ class _Decisions(AbstractSearch):
             else:
                 self.findings.bound(item, least)
         decisions = tuple(decision for _, outcome in found for decision in outcome.open)
-        return self.findings.verdict(cells=cells, decisions=decisions)
+        asked = Asked(self._loop, self._X0, task.horizon, task.start, task.required)
+        more = {"asked": asked, "grounds": self._grounds() if proved else None}
+        return self.findings.verdict(cells=cells, decisions=decisions, **more)
+
+    def _grounds(self) -> Grounds:
+        """What proves every cell anew."""
+        climbs = tuple(
+            (Climb(leaves=node.found.leaves),) if node.found.leaves else ()
+            for node in self._cells.leaves
+        )
+        return Grounds(self._counts, tuple(tuple(each.axes) for each in self._cells.roots), climbs)
 
     def _decided(self, node: Node, outcome: Outcome) -> DecidedCell:
         """What is said of a cell; a counterexample from a proved one would be a contradiction."""

@@ -22,8 +22,10 @@ from reachjax.methods.ladder import WORK, Ladder
 from reachjax.methods.steps import boxed
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.flags import lenient
-from reachjax.sets import AbstractSet, Box
+from reachjax.proofs.branches import Branches
+from reachjax.sets import AbstractSet
 from reachjax.sets.balance import balanced
+from reachjax.verdicts.grounds import Leaves
 from reachjax.verdicts.sieve import Margins, Outcome, Sieve, Unbounded, no_margins
 from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.targets import target_of, values_of
@@ -107,12 +109,12 @@ def _climbed(
     limits = task.nodes, budget.with_work(WORK)
     between = any(item.throughout for item in task.required)
     ladder = Ladder(task.loop, part, around, scenarios, task.start, *limits, between=between)
-    if by_forms and isinstance(part, Box) and not task.by_programs:
+    if by_forms and part.intervals is not None and not task.by_programs:
         ladder.advance(tighten=False)  # nothing but forms could be tried again
         axis = _axis(ladder, _first_open(task.required, margins))
         return Outcome(False, margins, axis=axis)
     middle, failing = scenarios.middle(np.asarray(around.center)), any(broken)
-    proved, axis = not failing, 0
+    proved, axis, leaves = not failing, 0, list[Leaves]()
     for k in range(task.horizon + 1):
         if k:
             ladder.advance(tighten=False)
@@ -124,12 +126,13 @@ def _climbed(
             if failing and broken[number] and fails_everywhere(item, ladder):
                 return Outcome(False, margins, refuted=True)
             if proved:
-                proved, margin = bounded(item, ladder, part, middle)
+                proved, margin, branches = bounded(item, ladder, part, middle)
+                leaves += [Leaves(item.name, k, branches)] if proved and branches else []
                 margins[item.name][k] = np.fmax(margins[item.name][k], margin)
                 axis = axis if proved else _axis(ladder, item)
         if not (proved or failing):
             break
-    return Outcome(proved, margins, axis=axis)
+    return Outcome(proved, margins, axis=axis, leaves=tuple(leaves))
 
 
 def _first_open(required: Sequence[Requirement], margins: Margins) -> Requirement:
@@ -140,16 +143,21 @@ def _first_open(required: Sequence[Requirement], margins: Margins) -> Requiremen
 
 def bounded(
     item: Requirement, ladder: Ladder, part: AbstractSet, middle: Float[np.ndarray, " s"]
-) -> tuple[bool, float]:
-    """Whether a requirement surely holds where the ladder has come to, and its margin."""
+) -> tuple[bool, float, Branches | None]:
+    """Whether a requirement surely holds where the ladder has come to, its margin, and branches.
+
+    There are none where forms alone prove it.
+    """
     if item.time == 0:
         compared = item.compared_with(jax.device_put(part))
-        return item.proved(compared), float(compared.margins.min())
+        return item.proved(compared), float(compared.margins.min()), None
     forms, units = values_of(item, ladder)
     bounds = np.array([rows.ends(ladder.horizon.start)[1].min() for rows in forms])
+    branches = None
     if not _all_right(item, bounds) and len(ladder.horizon.zero):
-        bounds = ladder.bounds(target_of(item, ladder, None, middle)[0]).bounds
-    return _all_right(item, bounds), float(np.min(-bounds / units))
+        climbed = ladder.bounds(target_of(item, ladder, None, middle)[0])
+        bounds, branches = climbed.bounds, climbed.branches
+    return _all_right(item, bounds), float(np.min(-bounds / units)), branches
 
 
 def fails_everywhere(item: Requirement, ladder: Ladder) -> bool:

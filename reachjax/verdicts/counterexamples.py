@@ -65,8 +65,15 @@ def counterexample(
         drawn = loop.split(scenario)
         if not scenarios.surely_contains(scenario):
             continue
-        part = broken_at(on_host, item, drawn, start)
-        if part is not None:
+        reached = enclosures(on_host, drawn, item.time, start)
+        found_at = broken_at(on_host, item, drawn, start, reached)
+        if found_at is not None:
+            part, last = found_at
+            boxes = [*reached[:-1], last]
+            lower, upper = (
+                np.stack([np.asarray(getattr(box, end)) for box in boxes])
+                for end in ("lower", "upper")
+            )
             _, w, v = drawn
             noises = [None] * (len(states) - 1) if v is None else v
             inputs = [
@@ -76,8 +83,9 @@ def counterexample(
             parts = item.name, item.time, -room, states, np.stack(inputs)
             plant: Any = on_host.plant
             instant = (item.time - 1 + part) * float(plant.period) if plant.continuous else None
+            enclosed = {"lower": lower, "upper": upper, "region": item.ball or item.region}
             closest = closest_decision(on_host, states[: item.time + 1], drawn, start)
-            more = {"instant": instant, "decision": closest}
+            more = {"instant": instant, "decision": closest} | enclosed
             return Counterexample(*parts, disturbances=w, noises=v, **more)
     return None
 
@@ -100,25 +108,34 @@ def closest_decision(
     return min(found, default=None)
 
 
-def broken_at(loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int) -> float | None:
+def broken_at(
+    loop: ClosedLoop, item: Requirement, scenario: Scenario, start: int, reached: list[Box]
+) -> tuple[float, Box] | None:
     """Where the exact trajectory of a scenario surely breaks a requirement, rounding accounted for.
 
+    Args:
+        loop: of numpy arrays.
+        item: the requirement.
+        scenario: of the trajectory.
+        start: the time of its initial state.
+        reached: boxes around its states, up to the time of the requirement.
+
     Returns:
-        The part of the period before, 1 at the sample; None where that is not known.
+        The part of the period before, 1 at the sample, and a box around the state there; None where
+        that is not known.
     """
-    reached = enclosures(loop, scenario, item.time, start)
     if most_room(item, reached[-1]) < 0:
-        return 1.0
+        return 1.0, reached[-1]
     if not item.throughout:
         return None
     plant: Any = loop.plant
     t, before = item.time - 1, reached[-2]
     drawn = [None if each is None else each[t] for each in scenario[1:]]
     for part in PARTS:
-        shorter = in_numpy(loop.replace(plant=plant.replace(period=part * plant.period)))
-        held = start + t, *drawn
-        if most_room(item, successor_box(shorter, before, *held)) < 0:
-            return part
+        shorter = in_numpy(loop.replace(plant=plant.shortened(part)))
+        there = successor_box(shorter, before, start + t, *drawn)
+        if most_room(item, there) < 0:
+            return part, there
     return None
 
 
@@ -138,16 +155,24 @@ def deviates(
     """Whether a simulated trajectory leaves the enclosure of a step by more than rounding.
 
     Each step is enclosed from the state that was simulated, so that nothing adds up. Then what was
-    simulated is another loop than what is bounded.
+    simulated is another loop than what is bounded. What is integrated is beside the flow by more
+    than rounding: by about as much as it is beside what twice as many steps say.
     """
     loop, (_, w, v) = in_numpy(loop), scenario
+    plant: Any = loop.plant
+    finer = in_numpy(loop.replace(plant=plant.finer)) if plant.continuous else None
     for t, (x, following) in enumerate(itertools.pairwise(states)):
-        drawn = (None if part is None else part[t] for part in (w, v))
+        drawn = [None if part is None else part[t] for part in (w, v)]
         reached = successor_box(loop, Box(x, x), start + t, *drawn)
         lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
         with np.errstate(over="ignore", invalid="ignore"):
             beyond = np.maximum(lower - following, following - upper)
             slack = TOLERATED * (upper - lower + np.spacing(abs(following)))
+            if finer is not None:
+                one, other = (
+                    each.step(x, start + t, w=drawn[0], v=drawn[1]) for each in (loop, finer)
+                )
+                slack = slack + TOLERATED * np.nan_to_num(abs(other - one), nan=np.inf)
         if np.any(beyond > slack):
             return True
     return False

@@ -27,6 +27,7 @@ from reachjax.programs.followed import OpenDecision
 from reachjax.programs.unrolled import ByForms, along_ways, unrolled, unrolled_from_boxes
 from reachjax.sets import AbstractSet, Box
 from reachjax.sets.balance import balanced
+from reachjax.verdicts.grounds import Leaves
 from reachjax.verdicts.specification import Requirement
 
 TOGETHER = 32
@@ -80,6 +81,7 @@ class Outcome(NamedTuple):
         refuted: whether one of them fails from every state of it.
         axis: along which it should be halved; -1 where nothing says that.
         unbounded: the unit that has no bounds over it, if there is one.
+        leaves: of requirements that forms alone do not prove.
         open: decisions that may go either way from it, as far as that was looked at.
     """
 
@@ -88,6 +90,7 @@ class Outcome(NamedTuple):
     refuted: bool = False
     axis: int = -1
     unbounded: Unbounded | None = None
+    leaves: tuple[Leaves, ...] = ()
     open: tuple[OpenDecision, ...] = ()
 
     @property

@@ -22,10 +22,11 @@ from reachjax.loops import ClosedLoop
 from reachjax.methods.problem import Span, at
 from reachjax.numerics.checks import described, is_concrete, real_number, require_kind
 from reachjax.numerics.flags import lenient
-from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet, Polytope
+from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
 from reachjax.sets.linear_programs import is_empty
 from reachjax.tubes.reach import ReachTube
+from reachjax.tubes.sketches import Sketch
 
 Region = PolyhedralSet | Ellipsoid
 
@@ -201,6 +202,7 @@ class Requirement:
         inside: whether states must be in it, or out of it.
         ball: the ellipsoid; None of other sets.
         throughout: whether it is meant at all times since the sample before.
+        units: the facets of the set in units, once they were asked for; of all times together.
     """
 
     name: str
@@ -209,6 +211,7 @@ class Requirement:
     inside: bool
     ball: Ellipsoid | None = None
     throughout: bool = False
+    units: list[Any] = dataclasses.field(default_factory=list, compare=False, repr=False)
 
     @property
     def span(self) -> Span:
@@ -226,7 +229,7 @@ class Requirement:
         """What every state surely does not exceed, and should not: of each facet, or of the set."""
         return self.compared_with(self.holding(tube))
 
-    def holding(self, tube: ReachTube) -> AbstractSet:
+    def holding(self, tube: ReachTube | Sketch) -> AbstractSet:
         """The set of a tube that holds all states which the requirement is about."""
         return tube.spans[self.time - 1] if self.throughout else tube.sets[self.time]
 
@@ -247,11 +250,17 @@ class Requirement:
         if self.ball is not None:
             depth = _depths(self.ball, trajectories[:, self.time])
             return depth if self.inside else -depth
-        C, d, norms = (np.asarray(part) for part in self.region.facets_in_units())
+        C, d, norms = self._in_units()
         with np.errstate(over="ignore", invalid="ignore"):
             room = (d - trajectories[:, self.time] @ C.T) / norms
         depth = room.min(axis=1)
         return depth if self.inside else -depth
+
+    def _in_units(self) -> list[np.ndarray]:
+        """The facets of the set, as trajectories are compared with them."""
+        if not self.units or self.units[0] is not self.region:
+            self.units[:] = self.region, *map(np.asarray, self.region.facets_in_units())
+        return self.units[1:]
 
     def proved(self, compared: Compared) -> bool:
         """Whether every state surely is on the right side. Sets are closed: touching is inside.
@@ -323,6 +332,64 @@ def requirements(
         found += [Requirement(f"avoid[{i}]", t, A, False) for i, A in regions]  # type: ignore[arg-type]
     if not found:
         raise ValueError("nothing to verify: give a goal, avoid sets or a safe set")
+    return _each_checked(
+        [
+            dataclasses.replace(
+                item,
+                throughout=item.throughout or _is_throughout(item, period is not None),
+            )
+            for item in found
+        ],
+        states,
+    )
+
+
+def _is_throughout(item: Requirement, continuous: bool) -> bool:
+    """Whether a requirement that is no goal is meant in between samples too."""
+    return continuous and item.name != "goal" and item.time > 0
+
+
+def asked_again(
+    said: Sequence[Requirement], states: int, horizon: int, period: float | None
+) -> tuple[Requirement, ...]:
+    """Requirements that somebody wrote into a file, made again from the sets that they are about.
+
+    Args:
+        said: the requirements.
+        states: of the loop.
+        horizon: the number of steps.
+        period: of a plant in continuous time; None of others.
+
+    Raises:
+        TypeError: a set is no Box, Polytope or Ellipsoid.
+        ValueError: there is none, one is there twice, or a name, a time or a set cannot be.
+    """
+    keys = [(item.name, item.time) for item in said]
+    if not keys or len(set(keys)) < len(keys):
+        raise ValueError("nothing is required, or the same twice")
+    times = {item.time for item in said if item.name == "safe"}
+    if times and times != set(range(horizon + 1)):
+        raise ValueError("a safe set must be required at all times")
+    for item in said:
+        kinds = {"goal": True, "safe": True}
+        if kinds.get(item.name, not item.name.startswith("avoid[")) is not item.inside:
+            raise ValueError(f"{item.name!r} is no part of a specification")
+        if not 0 <= item.time <= horizon:
+            raise ValueError(f"{item.name} is required at t = {item.time}, beyond the horizon")
+        held = item.throughout or not _is_throughout(item, period is not None)
+        if not held or (item.throughout and (period is None or item.time == 0)):
+            raise ValueError(f"{item.name} is not meant in between samples as it should be")
+    whole = [
+        Requirement(
+            item.name, item.time, item.ball or item.region, item.inside, None, item.throughout
+        )  # type: ignore[arg-type]
+        for item in said
+    ]
+    return tuple(_each_checked(whole, states))
+
+
+def _each_checked(found: Sequence[Requirement], states: int) -> list[Requirement]:
+    """Requirements of sets that can be decided, each set being looked at once."""
     known: dict[tuple[int, bool], Requirement] = {}
     for item in found:
         key = id(item.region), item.inside
@@ -330,13 +397,7 @@ def requirements(
             known[key] = _checked(item, states)
     checked = (known[id(item.region), item.inside] for item in found)
     return [
-        dataclasses.replace(
-            one,
-            name=item.name,
-            time=item.time,
-            throughout=item.throughout
-            or (period is not None and item.name != "goal" and item.time > 0),
-        )
+        dataclasses.replace(one, name=item.name, time=item.time, throughout=item.throughout)
         for one, item in zip(checked, found, strict=True)
     ]
 
@@ -357,18 +418,19 @@ def _checked(item: Requirement, states: int) -> Requirement:
         raise ValueError(
             f"{item.name} has dimension {region.dimension}, but the loop has {states} states"
         )
-    if isinstance(region, Polytope) and is_concrete(region):
+    flat, ball = region.parts
+    if flat is not None and flat.needs_programs and is_concrete(flat):
         A, b = (np.asarray(part, float) for part in region.facets)
         if _empty(A.tobytes(), b.tobytes()):
             raise ValueError(f"{item.name} is empty: no point satisfies all facets of its polytope")
-    if not isinstance(region, Ellipsoid):
+    if ball is None:
         return item
     if not is_concrete(region):
         raise ValueError(
             f"{item.name} must be a polytope inside jax.jit, but a traced ellipsoid arrived"
         )
-    polytope = (inner_polytope if item.inside else outer_polytope)(region, item.name)
-    return dataclasses.replace(item, region=polytope, ball=region)
+    polytope = (inner_polytope if item.inside else outer_polytope)(ball, item.name)
+    return dataclasses.replace(item, region=polytope, ball=ball)
 
 
 @lru_cache(maxsize=256)
@@ -425,11 +487,18 @@ def shortfall(
         0.1
     """
     check_margin(margin)
-    missing = jnp.zeros(())
-    for item in of_tube(tube, goal, avoid, safe):
+    return missing(of_tube(tube, goal, avoid, safe), tube, margin)
+
+
+def missing(
+    required: Sequence[Requirement], tube: ReachTube | Sketch, margin: float
+) -> Float[Array, ""]:
+    """By how much sets miss requirements, in all: see `shortfall`."""
+    total = jnp.zeros(())
+    for item in required:
         margins = item.compared_with(item.holding(tube), by_offsets=True).margins
-        missing += jnp.sum(jnp.maximum(0.0, margin - margins))
-    return missing
+        total += jnp.sum(jnp.maximum(0.0, margin - margins))
+    return total
 
 
 def check_margin(margin: Any) -> None:

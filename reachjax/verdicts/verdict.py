@@ -4,6 +4,8 @@
 simulated trajectory breaks the specification, and is given. *Unknown*: the sets are too large to
 prove it, and no trajectory breaks it; margins of both kinds say how far apart they are. Margins are
 distances in the units of the state.
+
+Of the initial states of a box, a winning set says which win, which lose, and which are undecided.
 """
 
 from __future__ import annotations
@@ -11,19 +13,27 @@ from __future__ import annotations
 import dataclasses
 import enum
 import html
+import json
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Bool, Float
 
+from reachjax.numerics.archives import writable
+from reachjax.numerics.checks import Numbers, require_kind, same_size
+from reachjax.numerics.flags import lenient
+from reachjax.numerics.seals import Seal
 from reachjax.programs.followed import OpenDecision
 from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.proofs.proposal import AS_ASKED, SolverStatus
-from reachjax.sets import PolyhedralSet
+from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
 from reachjax.sets.pictures import draw_boxes
 from reachjax.tubes.displays import display, picture, table
+from reachjax.tubes.saving import keep
+from reachjax.verdicts.grounds import Asked, Grounds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,6 +61,9 @@ class Counterexample:
         noises: `(horizon, n_x)`; None of a loop without.
         instant: when, in the plant's units of time, of a differential equation: it may be in
             between the sample at `time` and the one before.
+        lower: `(time + 1, n_x)`, the exact trajectory at samples is above, rounding accounted for,
+        upper: `(time + 1, n_x)`, and below. In between samples the last row is of `instant`.
+        region: the set that states must be in, or be out of.
         decision: of a loop that jumps, by how much the closest of the decisions on the trajectory
             wins up to `time`: the size of what is compared with zero, more than its rounding.
     """
@@ -64,6 +77,46 @@ class Counterexample:
     noises: Float[np.ndarray, "h n_x"] | None = None
     instant: float | None = None
     decision: float | None = None
+    lower: Float[np.ndarray, "t n_x"] | None = None
+    upper: Float[np.ndarray, "t n_x"] | None = None
+    region: AbstractSet | None = None
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the trajectory as JSON, which anybody can check.
+
+        Numbers are those of the computer, to the last bit, as Python and others read decimals.
+
+        Args:
+            path: of the file; one that is there is replaced.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        count, required = self.time, _as_numbers(self.region, self.requirement)
+        parts = {
+            "initial_state": self.states[0],
+            "inputs": self.inputs[:count],
+            "disturbances": None if self.disturbances is None else self.disturbances[:count],
+            "noises": None if self.noises is None else self.noises[:count],
+            "states": self.states[: count + 1],
+            "lower": self.lower,
+            "upper": self.upper,
+        }
+        told = {name: None if part is None else part.tolist() for name, part in parts.items()}
+        said = {"requirement": self.requirement, "sample": count, "instant": self.instant}
+        content = said | {"violation": self.violation, "required": required} | told
+        writable("path", path).write_text(json.dumps(content, indent=1, allow_nan=False))
+
+
+def _as_numbers(region: AbstractSet | None, requirement: str) -> dict[str, Any]:
+    """A set as a user would write it, and whether states must be in it."""
+    found: dict[str, Any] = {"inside": not requirement.startswith("avoid")}
+    if isinstance(region, Ellipsoid):
+        found |= {"center": region.center.tolist(), "shape": region.shape.tolist()}
+    elif region is not None:
+        A, b = map(np.asarray, region.facets)
+        found |= {"normals": A.tolist(), "offsets": b.tolist()}
+    return found
 
 
 class DecidedCell(NamedTuple):
@@ -121,6 +174,33 @@ class Recurrence:
     proved: bool
 
 
+class KeptVerdict(NamedTuple):
+    """What a file keeps of a verdict.
+
+    Attributes:
+        asked: what it is about.
+        status: proved, refuted or unknown.
+        counterexample: the trajectory, when refuted.
+        grounds: what proves it anew.
+    """
+
+    asked: Asked
+    status: VerdictStatus
+    counterexample: Counterexample | None
+    grounds: Grounds | None
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict, of whose margins nothing is known before they are proved anew."""
+        times = self.asked.horizon + 1
+        margins = {item.name: np.full(times, np.nan) for item in self.asked.required}
+        for item in self.asked.required:
+            margins[item.name][item.time] = -np.inf
+        simulated = {name: np.full(times, np.nan) for name in margins}
+        given = self.status, margins, simulated, self.counterexample
+        return Verdict(*given, asked=self.asked, grounds=self.grounds)
+
+
 @dataclasses.dataclass(frozen=True)
 class Verdict:
     """What is known of a specification, part by part.
@@ -139,6 +219,8 @@ class Verdict:
             by its name and its time.
         cells: of a decision by cells, what is known of each, see `plot_cells`.
         recurrence: of a statement for all time, what it rests on, or what came nearest to that.
+        asked: of a verdict without a tube, what it is about.
+        grounds: of one that is proved without a tube, what proves it anew.
         decisions: of a loop that jumps, those that may go either way over the initial set, or over
             cells of it that are not proved.
     """
@@ -151,6 +233,8 @@ class Verdict:
     certificates: Mapping[tuple[str, int], AbstractProof] = dataclasses.field(default_factory=dict)
     cells: tuple[DecidedCell, ...] = ()
     recurrence: Recurrence | None = None
+    asked: Asked | None = None
+    grounds: Grounds | None = None
     decisions: tuple[OpenDecision, ...] = ()
 
     @property
@@ -172,6 +256,35 @@ class Verdict:
     def unsolved(self) -> int:
         """How many of the bounds that it rests on are not as tight as was asked for."""
         return sum(count for status, count in self.ends.items() if status not in AS_ASKED)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Keep a verdict of `decide` in a file, from which `reachjax.load` reads it.
+
+        With what it rests on, so that `reachjax.load(path, recheck=True)` proves it anew without a
+        search. A loop with a function that a user wrote cannot be kept: it is left out, and has to
+        be given again to `load`.
+
+        Args:
+            path: of the file; one that is there is replaced.
+
+        Raises:
+            OSError: it cannot be written.
+            ValueError: it is the verdict of a tube, which is to be saved instead, or of a loop of
+                numbers that are traced.
+
+        Example:
+            >>> import pathlib, tempfile
+            >>> from reachjax import MLP, AffinePlant, Box, ClosedLoop, decide, load
+            >>> loop = ClosedLoop(AffinePlant([[0.5]], [[1.0]]), MLP.from_layers([([[0]], [0])]))
+            >>> path = pathlib.Path(tempfile.mkdtemp()) / "stable.verdict"
+            >>> decide(loop, Box([1.0], [2.0]), 3, goal=Box([0.0], [0.5])).save(path)
+            >>> load(path, recheck=True).status.name
+            'PROVED'
+        """
+        if self.asked is None:
+            raise ValueError("the verdict of a tube is kept with it: save the tube")
+        kept = KeptVerdict(self.asked, self.status, self.counterexample, self.grounds)
+        keep(writable("path", path), kept, self.asked.loop)
 
     def __bool__(self) -> bool:
         raise TypeError("a verdict has three values: use verdict.proved, .refuted or .unknown")
@@ -303,3 +416,119 @@ def of_cells(verdicts: list[Verdict]) -> Verdict:
 def _least(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """The smallest of every cell's margins."""
     return {name: np.fmin.reduce([part[name] for part in parts]) for name in parts[0]}
+
+
+AT_ONCE = 1000
+"""So many points are looked up at a time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WinningSet:
+    """Cells that cover a domain, each of which is proved, refuted or undecided.
+
+    Proved is a cell if the specification surely holds from every state of it, refuted if it surely
+    holds from none. Proved cells are an inner estimate of the winning set; all but the refuted ones
+    are an outer one. `plot_cells` draws them.
+
+    Attributes:
+        domain: the initial states that were asked about.
+        cells: they cover it.
+        seal: a hash of the question: of the loop, the domain, and what is required of it when.
+    """
+
+    domain: Box
+    cells: tuple[DecidedCell, ...]
+    seal: Seal
+
+    def __repr__(self) -> str:
+        return f"WinningSet(cells={len(self.cells)}, states={self.domain.dimension})"
+
+    def __str__(self) -> str:
+        lines = [f"{'':10} {'cells':>7} {'volume':>10} {'part':>7}"]
+        for status in VerdictStatus:
+            size, count = self.volume(status), len(self.of(status))
+            part = self._part(status)
+            lines.append(f"{status.value:10} {count:7d} {size:10.4g} {part:>7}")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            [status.value, len(self.of(status)), self.volume(status), self._part(status)]
+            for status in VerdictStatus
+        ]
+        drawn = picture(self.plot) if self.domain.dimension > 1 else ""
+        return display(repr(self), table(["", "cells", "volume", "part"], rows), drawn)
+
+    def plot(self, ax: Axes | None = None, coordinates: tuple[int, int] = (0, 1)) -> Axes:
+        """Draw the cells, see `reachjax.plot_cells`."""
+        return draw_cells(self.cells, ax, coordinates)
+
+    def _part(self, status: VerdictStatus) -> str:
+        """The part of the domain with this status, whose flat coordinates count for nothing."""
+        wide = np.asarray(self.domain.widths) > 0
+        sizes = [
+            sum(np.prod((cell.upper - cell.lower)[wide]) for cell in cells)
+            for cells in (self.of(status), self.cells)
+        ]
+        return f"{sizes[0] / sizes[1]:.2%}"
+
+    def of(self, status: VerdictStatus) -> tuple[DecidedCell, ...]:
+        """The cells of which this is known."""
+        return tuple(cell for cell in self.cells if cell.status is status)
+
+    def volume(self, status: VerdictStatus) -> float:
+        """The volume of these cells together, in the units of the states."""
+        return float(sum(np.prod(cell.upper - cell.lower) for cell in self.of(status)))
+
+    def contains(self, states: Float[ArrayLike, "*batch n"]) -> Bool[np.ndarray, "*batch"]:
+        """Which states are in the inner estimate: the specification surely holds from them."""
+        return self._in(states, VerdictStatus.PROVED)
+
+    def excludes(self, states: Float[ArrayLike, "*batch n"]) -> Bool[np.ndarray, "*batch"]:
+        """Which states are outside of the outer estimate: the specification fails from them."""
+        return self._in(states, VerdictStatus.REFUTED)
+
+    def _in(self, states: Float[ArrayLike, "*batch n"], status: VerdictStatus) -> np.ndarray:
+        points = np.asarray(Numbers("(n,)", "(batch, n)")(states, "states"))
+        same_size(
+            "the domain's dimension is",
+            "the dimension of states is",
+            (self.domain.dimension, points.shape[-1]),
+        )
+        flat, cells = points.reshape(-1, points.shape[-1]), self.of(status)
+        found = np.zeros(len(flat), dtype=bool)
+        if cells:
+            lower, upper = (
+                np.stack([getattr(c, end) for c in cells]) for end in ("lower", "upper")
+            )
+            for first in range(0, len(flat), AT_ONCE):
+                some = flat[first : first + AT_ONCE, None]
+                inside = np.all((lower <= some) & (some <= upper), axis=2)
+                found[first : first + AT_ONCE] = np.any(inside, axis=1)
+        return found.reshape(points.shape[:-1])
+
+
+@lenient
+def plot_cells(
+    verdict: Verdict | WinningSet, ax: Axes | None = None, coordinates: tuple[int, int] = (0, 1)
+) -> Axes:
+    """Draw which cells of an initial set or a domain are proved, refuted and undecided.
+
+    Of sets of more than two dimensions it draws the cells' shadows, the undecided ones above the
+    proved ones, and the refuted ones above all.
+
+    Args:
+        verdict: of `decide(..., cells=...)` or `winning_set`.
+        ax: where to draw; a new figure by default.
+        coordinates: the two states to draw, counted from 0: the horizontal axis, then the vertical
+            one.
+
+    Raises:
+        TypeError: it is no verdict.
+        ValueError: it has no cells, or the coordinates are not two of its states.
+    """
+    expected = "a Verdict, as decide(...) returns it, or a WinningSet"
+    require_kind("verdict", verdict, (Verdict, WinningSet), expected)
+    if not verdict.cells:
+        raise ValueError("verdict has no cells: give decide(..., cells=...) a number of them")
+    return draw_cells(verdict.cells, ax, coordinates)

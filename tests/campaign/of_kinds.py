@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 import reachjax as rj
+from reachjax.programs.unrolled import unrolled_from_boxes
 from tests.campaign.containment import DRAWS
 from tests.campaign.kinds import KindCase
 from tests.campaign.oracle import WIDE, Region, exact
@@ -56,8 +57,30 @@ def checked(trial: Trial) -> None:
     for t, region in enumerate(sets[1:], start=1):
         _contained(trial, region, scenarios, runs[:, t], t, f"tube = {call}", "a state outside")
         _repeated(trial, proofs[t - 1], region, scenarios, runs[:, t], t)
+    if case.kind.columns and isinstance(case.X0, rj.Box):
+        _merged(trial, names, scenarios, runs)
     for _ in range(2):
         _decided(trial, names, scenarios, runs, rng)
+
+
+def _merged(
+    trial: Trial, names: dict[str, Any], scenarios: list[Scenario], runs: np.ndarray
+) -> None:
+    """No state is outside of what forms say whose old columns are merged."""
+    case, rows = trial.case, np.asarray(names["template"].directions)
+    names["rows"] = np.broadcast_to(rows, (case.kind.horizon, *rows.shape))
+    names["bounds"] = unrolled_from_boxes
+    call = "bounds(case.loop, case.X0.lower[None], case.X0.upper[None], rows, columns={})[0]"
+    call = call.format(case.kind.columns)
+    found = trial.attempt("merged columns", call, names)
+    if found is None:
+        return
+    trial.outcome.counts["tubes of merged columns"] += 1
+    for t, offsets in enumerate(np.asarray(found), start=1):
+        if np.isfinite(offsets).all():
+            region = Region(rows, offsets)
+            said = "a state outside of merged columns"
+            _contained(trial, region, scenarios, runs[:, t], t, call, said)
 
 
 def _wide(values: Any) -> np.ndarray:

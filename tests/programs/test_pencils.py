@@ -9,7 +9,7 @@ import reachjax as rj
 from reachjax.programs.lmi import form_rows, weighted_products
 from reachjax.sets import NormalForm
 from reachjax.solvers import Facets, GivenShape, LeastVolume
-from reachjax.solvers.least_volume import form_of
+from reachjax.solvers.ellipsoids import form_of
 from tests.closed_loops import closed_loop, random_loop, step_program
 from tests.networks import box_region
 

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.proofs.gradients import held_level, held_offsets
 from reachjax.proofs.recheck import interval_offsets, sound_level, sound_offsets
 from reachjax.proofs.reported import Sized, judged_offsets
-from reachjax.proofs.slopes import held_level, held_offsets
 from reachjax.sets import NormalForm
 from reachjax.solvers import Facets, LeastVolume
-from reachjax.solvers.ellipsoids import level_slopes
+from reachjax.solvers.ellipsoids import form_of, level_slopes
 from reachjax.solvers.facets import offset_slopes
-from reachjax.solvers.least_volume import form_of
 from tests.closed_loops import proposal_of
 from tests.solvers.test_enclosures import case, program
 

@@ -11,7 +11,7 @@ from reachjax.proofs.recheck import sound_level
 from reachjax.proofs.reported import judged_least
 from reachjax.sets import NormalForm
 from reachjax.solvers import LeastVolume
-from reachjax.solvers.least_volume import form_of
+from reachjax.solvers.ellipsoids import form_of
 from tests.closed_loops import closed_loop, random_loop, recursion, step_program
 from tests.differences import error_in_all_parts
 

@@ -5,7 +5,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.proofs.proposal import ANSWERS, Proposal
-from reachjax.solvers.least_volume import form_of
+from reachjax.solvers.ellipsoids import form_of
 from tests.programs.test_pencils import goals, program_of
 
 SOLVERS = {

@@ -16,7 +16,7 @@ from reachjax.proofs.reported import judged_least, judged_offsets, judged_shape
 from reachjax.sets import NormalForm
 from reachjax.solvers import GivenShape, LeastVolume, barrier, primal_dual
 from reachjax.solvers.barrier import Barrier
-from reachjax.solvers.least_volume import form_of
+from reachjax.solvers.ellipsoids import form_of
 from tests.closed_loops import (
     closed_loop,
     one_step,

@@ -9,7 +9,7 @@ that there is to a state, an input or a disturbance. Each number is
 and a product of two leaves out all that is of degree three in `w`, or of degree two with an `r`.
 
 Since symbols are few, what is computed with them does not grow with the columns of a horizon; the
-`l` are the derivatives by which these are carried on (`programs.flowed`).
+`l` are the derivatives by which these are carried on (`programs.flows`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.loops.units import AbstractUnit, SmoothUnit, UnboundedError
+from reachjax.loops.units import AbstractUnit, UnboundedError
 from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.rounding import TINY, Ball, constant, gamma, namespace, settled
 
@@ -125,7 +125,7 @@ class TaylorModels(AbstractNumber):
         return Ball.between(*self.ends())
 
     def zeros(self) -> TaylorModels:
-        """As many numbers that are zero."""
+        """Zeros of the same symbols, as many of them."""
         xp = namespace(self.rows)
         return TaylorModels(xp.zeros_like(self.rows), xp.zeros_like(self.radii), self.symbols)
 
@@ -195,7 +195,7 @@ class TaylorModels(AbstractNumber):
             UnboundedError: known inputs leave the domain.
         """
         xp, (lower, upper) = namespace(self.rows), self.ends()
-        if not isinstance(unit, SmoothUnit):
+        if not unit.curved:
             return self._bent(unit, lower, upper)
         line = unit.linear(lower, upper)
         require_bounds(unit, line.gap, lower, upper)
@@ -249,7 +249,7 @@ def image(unit: AbstractUnit, y: Ball) -> Ball:
         UnboundedError: known inputs leave the domain, or hold a bend.
     """
     y = Ball(y.mid, y.rad + 2 * gamma(8) * (abs(y.mid) + y.rad))
-    if isinstance(unit, SmoothUnit):
+    if unit.curved:
         lower, upper = unit.interval(y.lower, y.upper)
         require_bounds(unit, upper - lower, y.lower, y.upper)
         return Ball.between(lower, upper)
@@ -283,7 +283,7 @@ def product(one: Any, other: Any) -> Any:
 
 
 def zeros(number: Any) -> Any:
-    """As many zeros of the same kind."""
+    """Zeros of the same kind, as many of them."""
     if isinstance(number, TaylorModels):
         return number.zeros()
     if isinstance(number, Ball):

@@ -32,6 +32,7 @@ from reachjax.loops.tracing.values import Choice, Operand, Parameter, Unsupporte
 from reachjax.loops.units import AtUnit, evaluate
 from reachjax.numerics.checks import described, is_concrete
 from reachjax.numerics.pytrees import pytree, static, unchecked
+from reachjax.numerics.rounding import counting
 
 
 class Structure(NamedTuple):
@@ -223,6 +224,7 @@ class Function:
             object.__setattr__(self, "_kept", kept)
         return kept
 
+    @counting
     def _recorded(self) -> tuple[Any, tuple[Recorder, Operand]]:
         """The parameters, so that this can be traced, and the steps with what they end in."""
         closed, sizes = self.structure.trace.closed, self.structure.inputs
@@ -265,7 +267,7 @@ class Compiled:
     """
 
     def __init__(self, function: Callable[..., Any], **options: Any):
-        self._jitted = jax.jit(function, **options)
+        self._jitted = jax.jit(counting(function), **options)
         functools.update_wrapper(self, function)
 
     def __call__(self, *given: Any, **static: Any) -> Any:

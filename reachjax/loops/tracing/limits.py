@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops.tracing.values import Parameter
-from reachjax.loops.units import AbstractUnit, SmoothUnit
+from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.rounding import TINY, gamma
@@ -141,9 +141,8 @@ class Limits(AbstractNumber):
         """Limits of the values of a layer of units of these inputs."""
         if others:  # products and sums of limits are theirs
             return unit(self, *others)  # type: ignore[arg-type]
-        found: Any = unit.limits if isinstance(unit, SmoothUnit) else unit.interval
         with np.errstate(all="ignore"):
-            least, most = found(self.least, self.most)
+            least, most = unit.limits(self.least, self.most)
         return type(self)(np.asarray(least, float), np.asarray(most, float))
 
 

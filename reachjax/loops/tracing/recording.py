@@ -32,7 +32,6 @@ from reachjax.loops.units import (
     AtUnit,
     Bilinear,
     ReLU,
-    SmoothUnit,
     Square,
     UnboundedError,
 )
@@ -322,11 +321,13 @@ class Recorder:
 
     def unit(self, unit: AbstractUnit, value: Value) -> Value:
         """A layer of units, of which smooth ones are told between what numbers their inputs are."""
-        if isinstance(unit, SmoothUnit) and value.size:
+
+        def ends() -> tuple[float, float]:
             limits = self.limits(value)
-            ends = {"least": float(limits.least.min()), "most": float(limits.most.max())}
-            unit = dataclasses.replace(unit, **ends)
-        elif unit.jumps and not unit.line:
+            return float(limits.least.min()), float(limits.most.max())
+
+        unit = unit.knowing(ends) if value.size else unit
+        if unit.jumps and not unit.line:
             unit = dataclasses.replace(unit, line=self.line)
         again = lambda y: self.unit(unit, y)  # noqa: E731
         step = Step(self._applied(unit), (value.place,), unit=unit, again=again, line=self.line)

@@ -14,13 +14,11 @@ from reachjax.loops.units.base import (
 )
 from reachjax.loops.units.bilinear import Bilinear
 from reachjax.loops.units.disturbance import Constraint, Disturbance
-from reachjax.loops.units.exponential import Exp, Log, XLogX
-from reachjax.loops.units.hyperbolic import Sigmoid, Softplus, Tanh
 from reachjax.loops.units.one_hot import OneHot
 from reachjax.loops.units.piecewise import HardTanh, LeakyReLU, ReLU, clipped
-from reachjax.loops.units.powers import Reciprocal, Sqrt, Square, Within
+from reachjax.loops.units.powers import Exp, Log, Reciprocal, Sqrt, Square, Within, XLogX
 from reachjax.loops.units.projection import ProjectionSlack, projected
-from reachjax.loops.units.saturating import ISRU, Asin, Asinh, Erf
+from reachjax.loops.units.saturating import ISRU, Asin, Asinh, Erf, Sigmoid, Softplus, Tanh
 from reachjax.loops.units.smooth import Origin, Quadratic, SmoothUnit, UnboundedError
 from reachjax.loops.units.step import Entered, Floor, Gated, Step
 from reachjax.loops.units.trigonometric import Atan, Cos, Sin, Sinc

@@ -173,6 +173,14 @@ class AbstractUnit(AbstractActivation):
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """Bounds of the value for inputs in `[lower, upper]`, rounding included."""
 
+    def limits(self, least: Any, most: Any) -> tuple[Array, Array]:
+        """Bounds of the value for inputs of which an end, or both, may be infinite."""
+        return self.interval(least, most)
+
+    def knowing(self, ends: Callable[[], tuple[float, float]]) -> AbstractUnit:
+        """The unit with what it may know of its inputs, `ends` being their least and their most."""
+        return self
+
     @abc.abstractmethod
     def lines(self, lower: Array, upper: Array) -> Lines:
         """Lines for inputs in `[lower, upper]`, rounding included; the same ones if it is affine.

@@ -13,11 +13,13 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, ClassVar, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from reachjax.loops.units.base import AbstractUnit, Block, Facts, Line, Lines, Mark, Product
@@ -25,9 +27,12 @@ from reachjax.numerics.rounding import (
     TINY,
     UNIT,
     constant,
+    errors,
     gamma,
+    is_counted,
     larger,
     namespace,
+    select,
     settled,
     smaller,
 )
@@ -60,6 +65,9 @@ class Quadratic(NamedTuple):
     curvature: Array
     gap: Array
 
+
+EXTREMES = "extremes"
+"""The name of what need not be found again for a derivative (`jax.checkpoint`)."""
 
 ENDLESS = 1e100
 """Inputs of this size are no matter of a domain."""
@@ -162,10 +170,13 @@ class SmoothUnit(AbstractUnit):
             lower, upper = smaller(lower, self.most), smaller(upper, self.most)
         return lower, upper
 
+    def knowing(self, ends: Callable[[], tuple[float, float]]) -> SmoothUnit:
+        """The unit with what its inputs are known never to be below, or above."""
+        least, most = ends()
+        return dataclasses.replace(self, least=least, most=most)
+
     def limits(self, least: Any, most: Any) -> tuple[Any, Any]:
-        """Bounds of the value for inputs in `[least, most]`, one end or both of which may be
-        infinite.
-        """
+        """Bounds of the value for inputs of which an end, or both, may be infinite."""
         ends: Any = [np.where(np.isfinite(end), end, 1.0) for end in (least, most)]
         low, high = ends
         if self.rises:
@@ -200,6 +211,8 @@ class SmoothUnit(AbstractUnit):
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """What remains of the value if nothing is taken from it; NaN where an end is."""
         xp, (least, most) = namespace(lower, upper), self.image
+        if not is_counted():
+            return self._plain_interval(lower, upper)
         low, high = self.remainder(xp.zeros_like(lower), lower, upper)
         unknown = xp.isnan(lower) | xp.isnan(upper)
         low, high = larger(low, least), smaller(high, most)
@@ -214,21 +227,46 @@ class SmoothUnit(AbstractUnit):
         xp = namespace(slope, lower, upper)
         slope, lower, upper = settled((slope, *self.met(lower, upper)))
         fine = self.defined(lower, upper) & (abs(slope) < math.inf)
-        slope = xp.where(fine, slope, 0.0)
-        lower, upper = (xp.where(fine, end, 1.0) for end in (lower, upper))
+        slope = select(fine, slope, 0.0)
+        lower, upper = (select(fine, end, 1.0) for end in (lower, upper))
         # by the envelope theorem a derivative needs no derivatives of the stationary points
         inner = self.stationary(*map(constant, (slope, lower, upper)))
         y = xp.stack([lower, upper, *(_within(point, lower, upper) for point in inner)])
+        if not is_counted():
+            y = self._extremes(slope, lower, upper, constant(y))
+            low, high = self(y) - slope * y
+            return select(fine, low, -math.inf), select(fine, high, math.inf)
         value, product = self(y), slope * y
+        rest = value - product
         rounding = constant(
             SLACK * (abs(value) + abs(product))
             + (self.flushed + TINY * (abs(slope) + abs(y)))  # of what underflows
         )
-        rest = value - product
         known = fine & (abs(rest) < math.inf) & (rounding < math.inf)
-        low = xp.where(known, rest - rounding, -math.inf)
-        high = xp.where(known, rest + rounding, math.inf)
+        low = select(known, rest - rounding, -math.inf)
+        high = select(known, rest + rounding, math.inf)
         return reduce(smaller, low), reduce(larger, high)
+
+    def _plain_interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """What remains of the value, where rounding is not counted."""
+        if not self.rises:
+            low, high = self.remainder(jnp.zeros_like(lower), lower, upper)
+            return larger(low, self.image[0]), smaller(high, self.image[1])
+        lower, upper = self.met(lower, upper)
+        fine, (least, most) = self.defined(lower, upper), self.image
+        low, high = self(select(fine, jnp.stack([lower, upper]), 1.0))
+        return select(fine, low, least), select(fine, high, most)
+
+    def _extremes(self, slope: Array, lower: Array, upper: Array, points: Array) -> Array:
+        """Where `f(y) - slope y` is least and largest of some points, the first two of which are
+        ends, that alone have derivatives; in JAX.
+        """
+        rest = self(points) - constant(slope) * points
+        which = jnp.argmin(jnp.stack([rest, -rest]), axis=1)
+        found = which[:, None] == np.arange(len(points))[:, None]
+        inner = select(found, points, 0.0).sum(axis=1)
+        which, inner = checkpoint_name((which, inner), EXTREMES)
+        return select(which == 0, lower, select(which == 1, upper, inner))
 
     def lines(self, lower: Array, upper: Array) -> Lines:
         """Two lines of the slope of the chord, that touch: never the same.
@@ -243,19 +281,22 @@ class SmoothUnit(AbstractUnit):
     @np.errstate(all="ignore")
     def _chord(self, lower: Array, upper: Array) -> Float[Array, " k"]:
         """The slope of the chord; of the tangent in the middle where differences lose digits."""
-        xp, fine = namespace(lower, upper), self.defined(lower, upper)
-        lower, upper = (xp.where(fine, end, 1.0) for end in (lower, upper))
+        fine = self.defined(lower, upper)
+        lower, upper = (select(fine, end, 1.0) for end in (lower, upper))
         first, last = self(lower), self(upper)
         width, rise = upper - lower, last - first
         lost = abs(rise) <= THIN * (abs(first) + abs(last))
         thin = (width <= THIN * (abs(lower) + abs(upper))) | ((width <= THIN) & lost)
         tangent = self.derivative(lower / 2 + upper / 2)
-        slope = xp.where(thin, tangent, rise / xp.where(thin, 1.0, width))
-        return xp.where(fine & (abs(slope) < math.inf), slope, 0.0)
+        tangent = tangent if is_counted() else constant(tangent)  # so thin that it does not matter
+        slope = select(thin, tangent, rise / select(thin, 1.0, width))
+        return select(fine & (abs(slope) < math.inf), slope, 0.0)
 
     @np.errstate(all="ignore")
     def quadratic(self, lower: Array, upper: Array, linear: Quadratic | None = None) -> Quadratic:
         """The interpolant at Chebyshev nodes, or the lines where those leave less out.
+
+        Where rounding is not counted, nobody looks at the lines.
 
         The error at the nodes is measured. Between them it is at most 5/3 of that (the nodes'
         Lebesgue constant), here 2, beside the error of an exact interpolant.
@@ -270,30 +311,36 @@ class SmoothUnit(AbstractUnit):
         lower, upper = settled(self.met(lower, upper))
         center = settled(lower / 2 + upper / 2)
         fine = self.defined(lower, upper)
-        lower, upper, middle = (xp.where(fine, y, 1.0) for y in (lower, upper, center))
+        lower, upper, middle = (select(fine, y, 1.0) for y in (lower, upper, center))
         radius = larger(upper - middle, middle - lower) * (1 + gamma(2)) + TINY
         wide = fine & (radius > THIN * abs(middle))
         wide = wide & (radius > SQUARES) & (radius < 1 / SQUARES)
-        radius = xp.where(wide, radius, 1.0)
+        radius = select(wide, radius, 1.0)
         step = math.sqrt(0.75) * radius
-        nodes = xp.stack([middle + xp.where(wide, k * step, 0.0) for k in (-1, 0, 1)])
+        away = select(wide, step, 0.0)
+        nodes = xp.stack([middle - away, middle, middle + away])
         values = self(nodes)
         before, at, after = values
         slope = (after - before) / (2 * step)
         curvature = ((after - at) - (at - before)) / (2 * step * step)
         offset, slope, curvature = settled((at, slope, curvature))
-        y = nodes - middle
-        terms = offset, slope * y, curvature * y * y
-        rounding = SLACK * abs(values) + gamma(8) * sum(map(abs, terms)) + self.flushed
-        errors = abs(values - sum(terms)) + constant(rounding)
         third = self.third(lower, upper)
-        wide, third = wide & (third < math.inf), xp.where(third < math.inf, third, 0.0)
+        wide, third = wide & (third < math.inf), select(third < math.inf, third, 0.0)
         # nodes may be off by some `UNIT |c|`, that is `1e-8 r`
         between = radius * radius * radius / 24 * third * (1 + THIN)
-        gap = (between + 2 * reduce(larger, errors)) * (1 + gamma(4))
+
+        def off() -> Any:
+            y = nodes - middle
+            terms = offset, slope * y, curvature * y * y
+            rounding = SLACK * abs(values) + gamma(8) * sum(map(abs, terms)) + self.flushed
+            return reduce(larger, abs(values - sum(terms)) + constant(rounding))
+
+        if not is_counted():
+            return Quadratic(middle, offset, slope, curvature, select(wide, between, math.inf))
+        gap = (between + 2 * off()) * (1 + gamma(4))
         better = wide & (gap < linear.gap)
         curved = Quadratic(middle, offset, slope, curvature, gap)
-        chosen = [xp.where(better, *pair) for pair in zip(curved, linear, strict=True)]
+        chosen = [select(better, *pair) for pair in zip(curved, linear, strict=True)]
         known = reduce(lambda a, b: a & b, (abs(each) < math.inf for each in chosen))
         *chosen, gap = (xp.where(known, each, 0.0) for each in chosen)
         return Quadratic(*settled((*chosen, xp.where(known, gap, math.inf))))
@@ -304,8 +351,16 @@ class SmoothUnit(AbstractUnit):
         lower, upper = self.met(lower, upper)
         center = settled(lower / 2 + upper / 2)
         start, half = slope * center, low / 2 + high / 2
-        gap = high / 2 - low / 2 + gamma(4) * constant(abs(start) + abs(low) + abs(high))
-        gap = gap + TINY * constant(abs(slope) + abs(center) + 2)
+        gap = (
+            high / 2
+            - low / 2
+            + errors(
+                lambda: (
+                    gamma(4) * (abs(start) + abs(low) + abs(high))
+                    + TINY * (abs(slope) + abs(center) + 2)
+                )
+            )
+        )
         return Quadratic(center, start + half, slope, namespace(slope).zeros_like(slope), gap)
 
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:

@@ -7,11 +7,22 @@ import math
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.loops.units.smooth import SLACK, SmoothUnit, farthest, nearest
-from reachjax.numerics.rounding import TINY, gamma, larger, namespace, smaller
+from reachjax.numerics.rounding import (
+    TINY,
+    constant,
+    errors,
+    gamma,
+    is_counted,
+    larger,
+    namespace,
+    select,
+    smaller,
+)
 
 FAR = 1e5
 """Up to this size of arguments sines and cosines of numpy and of XLA were compared with exact ones,
@@ -23,13 +34,25 @@ class WaveUnit(SmoothUnit):
 
     Attributes:
         far: the largest size of arguments of which more is known than that.
+        crest: an argument at which it is 1, and half a turn from which it is -1; None of others.
     """
 
     far: ClassVar[float] = FAR
+    crest: ClassVar[float | None] = None
 
     def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
         """Where arguments are not too large."""
+        if self.crest is not None and not is_counted():  # rounding alone sets that limit
+            return super().defined(lower, upper)
         return farthest(lower, upper) <= self.far
+
+    def _plain_interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        if self.crest is None:
+            return super()._plain_interval(lower, upper)
+        first, last = self(lower), self(upper)
+        high, low = (_meets(self.crest + away, lower, upper) for away in (0.0, math.pi))
+        least = select(low, -1.0, smaller(first, last))
+        return least, select(high, 1.0, larger(first, last))
 
     def extent(self, lower: Array, upper: Array) -> tuple[Any, Any]:
         """Bounds of the value for arguments of any size."""
@@ -39,17 +62,26 @@ class WaveUnit(SmoothUnit):
         """Ends of `f(y) - slope y`; of large arguments, those of numbers in its extent."""
         xp = namespace(slope, lower, upper)
         low, high = super().remainder(slope, lower, upper)
+        if self.crest is not None and not is_counted():
+            return low, high
         far = ~self.defined(lower, upper) & super().defined(lower, upper)
         far = far & (abs(slope) < math.inf)
         if xp is np and not far.any():
             return low, high
-        slope, lower, upper = (xp.where(far, each, 0.0) for each in (slope, lower, upper))
+        slope, lower, upper = (select(far, each, 0.0) for each in (slope, lower, upper))
         ends, (least, most) = (slope * lower, slope * upper), self.extent(lower, upper)
         least, most = least - larger(*ends), most - smaller(*ends)
-        flushed = TINY * (1 + farthest(lower, upper))  # of slopes too small for floats
+        # slopes may be too small for floats
+        flushed = errors(lambda: TINY * (1 + farthest(lower, upper)))
         least, most = least - gamma(4) * abs(least), most + gamma(4) * abs(most)
         least, most = least - flushed, most + flushed
-        return xp.where(far, least, low), xp.where(far, most, high)
+        return select(far, least, low), select(far, most, high)
+
+
+def _meets(angle: float, lower: Array, upper: Array) -> Array:
+    """Whether a point `angle + 2 pi k` is in `[lower, upper]`; in JAX, without derivatives."""
+    lower, turn = constant(lower), 2 * math.pi
+    return angle + turn * jnp.ceil((lower - angle) / turn) <= upper
 
 
 def _met(angle: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
@@ -73,6 +105,7 @@ class Sin(WaveUnit):
     """
 
     image = (-1.0, 1.0)
+    crest = math.pi / 2
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """The value `sin y`."""
@@ -104,6 +137,7 @@ class Cos(WaveUnit):
     """
 
     image = (-1.0, 1.0)
+    crest = 0.0
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """The value `cos y`."""

@@ -17,7 +17,7 @@ import numpy as np
 from reachjax.loops.tracing.rationals import Rationals, aligned, evaluated
 from reachjax.loops.tracing.recording import Recorder
 from reachjax.loops.tracing.values import Operand, Value
-from reachjax.loops.units import ReLU, SmoothUnit
+from reachjax.loops.units import ReLU
 from reachjax.numerics.rounding import TINY, gamma
 
 
@@ -231,7 +231,11 @@ def _is_smooth(recorder: Recorder, operand: Operand, y: Value) -> bool:
     places = recorder.between(operand, y)
     steps = [recorder.steps[place] for place in places if place != y.place]
     known = y.place in places and all(step is not None and step.entrywise for step in steps)
-    return known and any(isinstance(step.unit, SmoothUnit) for step in steps if step)
+    return known and any(
+        step.unit is not None and step.unit.curved and len(step.parents) == 1
+        for step in steps
+        if step
+    )
 
 
 def _meeting(

@@ -1,0 +1,233 @@
+"""Verdicts proved anew, from what was asked and from nothing else that they say.
+
+Of a proof the tree of cells, ranges and multipliers are taken, none of which has to be right: cells
+are made again from the initial set, forms from the loop, and multipliers of a sign that proves
+nothing are zero. Of a counterexample the initial state, the disturbances and the noise are taken:
+its trajectory is enclosed again. Nothing is searched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.methods.cell_tree import CellTree, Node
+from reachjax.methods.ladder import Ladder
+from reachjax.methods.searches import Bar
+from reachjax.methods.steps import boxed
+from reachjax.numerics.budget import ENDLESS
+from reachjax.numerics.checks import wrapped
+from reachjax.programs.affine import AffineForms, joined
+from reachjax.proofs.branches import Branches, bounds_of, leaf_bounds
+from reachjax.sets import AbstractSet
+from reachjax.tubes.repeats import DisagreementError
+from reachjax.verdicts.cell_decisions import sifted
+from reachjax.verdicts.cell_tasks import CellTask
+from reachjax.verdicts.findings import Findings
+from reachjax.verdicts.grounds import Asked, Climb, Grounds, Leaves
+from reachjax.verdicts.sieve import TOGETHER
+from reachjax.verdicts.specification import Requirement
+from reachjax.verdicts.targets import values_of
+from reachjax.verdicts.verdict import Verdict, VerdictStatus
+
+Key = tuple[str, int]
+"""The name and the time of a requirement."""
+
+
+def rechecked(verdict: Verdict, progress: Bar | None = None) -> Verdict:
+    """The verdict as it is proved anew; of one that is unknown nothing is claimed.
+
+    Args:
+        verdict: with what was asked, whose parts have the kinds that they should have.
+        progress: wraps the iteration over cells.
+
+    Raises:
+        DisagreementError: it says what is not proved.
+        ValueError: the progress bar leaves out cells.
+    """
+    asked = verdict.asked
+    assert asked is not None
+    findings = Findings(asked.loop, asked.X0, asked.horizon, asked.start, asked.required)
+    more: dict[str, Any] = {"asked": asked}
+    left_out = 0
+    try:
+        if verdict.status is VerdictStatus.REFUTED:
+            _refute(verdict, asked, findings)
+        elif verdict.status is VerdictStatus.PROVED:
+            grounds = verdict.grounds or Grounds()
+            margins, left_out = _proved(asked, grounds, progress)
+            for item in asked.required:
+                findings.prove(item, *margins[item.name, item.time])
+            more["grounds"] = grounds
+    except DisagreementError:
+        raise
+    except Exception as error:  # what is read may be of any shape and size
+        raise DisagreementError(f"the recheck of the verdict proves nothing: {error}") from error
+    if left_out:
+        raise ValueError(f"progress must pass on each cell, but {left_out} did not arrive")
+    found = findings.verdict(**more)
+    if found.status is not verdict.status:
+        left = ", ".join(f"{name} at t = {time}" for name, time in list(findings.open)[:3])
+        raise DisagreementError(
+            f"the verdict is said to be {verdict.status.name}, but its recheck does not bear that "
+            f"out{f': {left}' if left else ''}. It was made for another loop, initial set or "
+            "specification, or by another version, or it was changed"
+        )
+    return found
+
+
+def _refute(verdict: Verdict, asked: Asked, findings: Findings) -> None:
+    """Note the counterexample, if its scenario surely breaks what it is said to.
+
+    Raises:
+        DisagreementError: there is none, or it breaks no requirement of that name and time.
+    """
+    example = verdict.counterexample
+    if example is None:
+        raise DisagreementError("the verdict is said to be REFUTED, but without a counterexample")
+    loop, X0 = jax.device_get((asked.loop, asked.X0))
+    scenarios = Scenarios.of(loop, X0, asked.horizon, asked.start)
+    drawn = (example.disturbances, example.noises)
+    scenario = np.asarray(scenarios.joined(np.asarray(example.states)[0], *drawn), float)[None]
+    if scenario.shape[1] != len(scenarios.middle(np.asarray(boxed(X0, "X0").center))):
+        raise DisagreementError("the counterexample has not as many numbers as a scenario")
+    runs = Runs(scenario, scenarios.runs(loop, scenario, asked.horizon, asked.start))
+    key = example.requirement, example.time
+    broken = [item for item in asked.required if (item.name, item.time) == key]
+    findings.simulate(runs, broken)
+
+
+def _proved(
+    asked: Asked, grounds: Grounds, progress: Bar | None
+) -> tuple[dict[Key, tuple[float, bool]], int]:
+    """The least margin of each requirement over all cells, and whether it holds over each.
+
+    Returns:
+        These, and how many cells the progress bar left out.
+
+    Raises:
+        ValueError: the tree is none of the initial set's, or there are not as many climbs as cells.
+    """
+    loop, cells = jax.device_get(asked.loop), _cells(asked.X0, grounds)
+    if not cells or len(cells) != len(grounds.climbs):
+        raise ValueError(f"it has {len(cells)} cells, but {len(grounds.climbs)} proofs")
+    found = {(item.name, item.time): (np.inf, True) for item in asked.required}
+    given = zip(_by_forms(loop, asked, cells, grounds), cells, grounds.climbs, strict=True)
+    left = len(cells)
+    for _ in wrapped(progress, list(range(len(cells)))):  # whatever a bar passes on, in order
+        margins, cell, climbs = next(given)
+        left -= 1
+        if margins is None:
+            margins = _over(loop, asked, cell.part, climbs or (Climb(),))
+        for key, (least, holds) in found.items():
+            margin, right = margins.get(key, (-np.inf, False))
+            found[key] = min(least, margin), holds and right
+    return found, left
+
+
+def _cells(X0: AbstractSet, grounds: Grounds) -> list[Node]:
+    """The cells that a tree leaves, which cover the initial set.
+
+    Raises:
+        ValueError: it is none of the set's.
+    """
+    tree = CellTree.over(X0, grounds.counts) if grounds.counts else CellTree.whole(X0)
+    if len(tree.roots) != len(grounds.axes):
+        raise ValueError(f"there are {len(tree.roots)} cells at first, not {len(grounds.axes)}")
+    for root, axes in zip(tree.roots, grounds.axes, strict=True):
+        left = [root]
+        for axis in axes:
+            if not left or not -1 <= axis < X0.dimension:
+                raise ValueError("the tree of cells has other axes than the initial set")
+            node = left.pop()
+            if axis >= 0:
+                tree.replace(node, tree.halved(node, axis), axis)
+                left += node.halves[::-1]
+        if left:
+            raise ValueError("the tree of cells ends too early")
+    return tree.leaves
+
+
+def _by_forms(
+    loop: ClosedLoop, asked: Asked, cells: Sequence[Node], grounds: Grounds
+) -> Iterator[dict[Key, tuple[float, bool]] | None]:
+    """The margins of each cell by forms in compiled calls of many; None where that does not pay."""
+    task = CellTask(loop, asked.horizon, asked.start, asked.required, 0)
+    pays = len(cells) >= TOGETHER and all(cell.is_box for cell in cells)
+    for first in range(0, len(cells), TOGETHER):
+        some = range(first, min(first + TOGETHER, len(cells)))
+        alone = pays and not any(grounds.climbs[number] for number in some)
+        outcomes = sifted(task, [cells[number].ends for number in some], ENDLESS) if alone else []
+        for outcome in outcomes or [None] * len(some):
+            if outcome is None or not outcome.proved:
+                yield None
+            else:
+                yield {
+                    (item.name, item.time): (float(outcome.margins[item.name][item.time]), True)
+                    for item in asked.required
+                }
+
+
+def _over(
+    loop: ClosedLoop, asked: Asked, part: AbstractSet, climbs: Sequence[Climb]
+) -> dict[Key, tuple[float, bool]]:
+    """The margins over a part of the initial set, by all of the climbs."""
+    found: dict[Key, tuple[float, bool]] = {}
+    part, around = jax.device_get((part, boxed(jax.device_put(part), "X0")))
+    scenarios = Scenarios.of(loop, part, asked.horizon, asked.start)
+    between = any(item.throughout for item in asked.required)
+    for item in asked.required:
+        if item.time == 0:
+            compared = item.compared_with(jax.device_put(part))
+            found[item.name, 0] = float(compared.margins.min()), item.proved(compared)
+    for climb in climbs:
+        given = loop, part, around, scenarios, asked.start, 1, ENDLESS
+        ladder = Ladder(*given, between=between)
+        leaves = {(each.name, each.time): each for each in climb.leaves}
+        for k in range(1, asked.horizon + 1):
+            known = climb.ranges[k - 1] if k <= len(climb.ranges) else ()
+            ladder.repeat_ranges(each.matrix for each in known)
+            for item in asked.required:
+                key = item.name, item.time
+                if item.time == k and not found.get(key, (0.0, False))[1]:
+                    found[key] = _bounded(item, ladder, leaves.get(key))
+            if all(found.get((item.name, item.time), (0.0, False))[1] for item in asked.required):
+                return found
+            if climb.ranges and k >= len(climb.ranges):
+                break
+    return found
+
+
+def _bounded(item: Requirement, ladder: Ladder, leaves: Leaves | None) -> tuple[float, bool]:
+    """The margin of a requirement where the ladder has come to, and whether it surely holds."""
+    forms, units = values_of(item, ladder)
+    bounds = np.array([rows.ends(ladder.horizon.start)[1].min() for rows in forms])
+    if leaves is not None:
+        bounds = np.fmin(bounds, _by_branches(forms, ladder, leaves.branches))
+    bounds = np.where(np.isnan(bounds), np.inf, bounds)
+    right = bool(np.all(bounds <= 0 if item.inside else bounds < 0))
+    return float(np.min(-bounds / units)), right
+
+
+def _by_branches(
+    forms: Sequence[AffineForms], ladder: Ladder, said: Branches
+) -> Float[np.ndarray, " g"]:
+    """Bounds of the least of each group of forms, by branches; weights of other groups are zero."""
+    sizes = [len(rows.rows) for rows in forms]
+    about = ladder.about(joined([rows.padded(ladder.width) for rows in forms]))
+    owner = np.asarray(said.owner)
+    if np.any((owner < 0) | (owner >= len(forms))) or np.any(np.asarray(said.phases) > 1):
+        raise ValueError("its branches are of other bounds")
+    group = np.repeat(np.arange(len(forms)), sizes)
+    multipliers = np.asarray(said.multipliers)
+    own = said.replace(
+        weights=np.where(group == owner[:, None], np.asarray(said.weights), 0.0),
+        multipliers=np.where(np.isfinite(multipliers), multipliers, 0.0),
+    )
+    return bounds_of(own, leaf_bounds(about, own), len(forms))

@@ -311,8 +311,8 @@ class _Search(AbstractSearch):
 
     @property
     def _due(self) -> bool:
-        """Whether forms had their chance."""
-        if self.cells.is_full:
+        """Whether forms had their chance; those along all ways cost more than a trial."""
+        if self.cells.is_full or self._follows:
             return True
         if self._budget.timed:
             whole = self._budget.elapsed + self._budget.left

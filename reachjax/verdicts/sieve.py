@@ -236,9 +236,9 @@ class Sieve:
         """
         items, horizon = [rows.item for rows in self._rows], len(self._directions) - 1
         margins, still_open = no_margins(items, horizon), dict[OpenDecision, None]()
-        ends = (np.asarray(end)[None] for end in (box.lower, box.upper))
-        none = np.zeros(0)
-        first = ByForms(_at_first(self._directions[0], *ends)[0], none, none)
+        ends = np.asarray(box.lower)[None], np.asarray(box.upper)[None]
+        begun = _at_first(self._directions[0], *ends)[0]
+        first = ByForms(begun, np.zeros(0), np.zeros((0, 0)))
         between = self._whole is not None
         whole = np.asarray(self._whole) if between else np.zeros(self._later.shape[:2], bool)
         given = self._on_host, part, box, self._directions[1:], self._start

@@ -74,6 +74,6 @@ def taken() -> int:
 def _memory_is_bounded(request):
     """Tests share what they compiled until it fills a gigabyte; the cache on disk keeps it."""
     yield
-    option = request.config.getoption
-    if taken() > (MOST if option("every_case") or option("other_cases") else LARGEST):
+    every = map(request.config.getoption, ("every_case", "other_cases", "experiments"))
+    if taken() > (MOST if any(every) else LARGEST):
         jax.clear_caches()

@@ -42,8 +42,10 @@ from reachjax.loops import (
     Switched,
     Tanh,
     XLogX,
+    delayed,
     one_of,
     runge_kutta,
+    with_inputs,
     zero_order_hold,
 )
 from reachjax.methods.affine_forms import AffineForms
@@ -221,6 +223,7 @@ __all__ = [
     "XLogX",
     "change_of_basis",
     "decide",
+    "delayed",
     "failures",
     "keep_compilations",
     "largest_set",
@@ -244,5 +247,6 @@ __all__ = [
     "volume",
     "volume_penalty",
     "winning_set",
+    "with_inputs",
     "zero_order_hold",
 ]

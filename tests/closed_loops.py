@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,6 +22,8 @@ from tests.networks import (
     simplex_region,
 )
 
+TRAINED = Path(__file__).parent / "data" / "double_integrator_with_margin.npz"
+
 
 def closed_loop(data: LoopData) -> rj.ClosedLoop:
     """The loop that the arrays describe."""
@@ -36,6 +39,14 @@ def autonomous(A: Any, input_box: rj.Box | None = None) -> rj.ClosedLoop:
     n_x = len(A)
     net = rj.MLP.from_layers([(np.zeros((1, n_x)), np.zeros(1))])
     return rj.ClosedLoop(rj.AffinePlant(A, np.zeros((n_x, 1))), net, input_box)
+
+
+def double_integrator() -> rj.ClosedLoop:
+    """A trained loop of two states, under an input limit of one."""
+    data = np.load(TRAINED)
+    net = rj.MLP.from_layers([(data[f"W{i}"], data[f"b{i}"]) for i in range(3)])
+    plant = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
+    return rj.ClosedLoop(plant, net, rj.Box([-1.0], [1.0]))
 
 
 def random_loop(

@@ -1,16 +1,15 @@
 """Loops with disturbances and noise of every kind, and scenarios to attack their bounds with."""
 
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
 import reachjax as rj
+from tests import closed_loops
 from tests.closed_loops import closed_loop, random_loop
 from tests.networks import simplex_region
 
-TRAINED = Path(__file__).parent / "data" / "double_integrator_with_margin.npz"
 STEPS = 3
 
 
@@ -41,12 +40,10 @@ def disturbed_loop(n: int, W: Any, V: Any = None, seed: int = 0, **options: Any)
 
 def double_integrator(w: float = 0.05, v: float = 0.01) -> tuple[rj.ClosedLoop, rj.Box]:
     """A trained loop, both of whose states are pushed and measured with noise, and its states."""
-    data, both = np.load(TRAINED), np.ones(2)
-    net = rj.MLP.from_layers([(data[f"W{i}"], data[f"b{i}"]) for i in range(3)])
-    plant = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]], E=np.eye(2))
+    loop, both = closed_loops.double_integrator(), np.ones(2)
     W, V = (rj.Box(-size * both, size * both) for size in (w, v))
-    loop = rj.ClosedLoop(plant, net, rj.Box([-1.0], [1.0]), disturbance=W, noise=V)
-    return loop, rj.Box([2.5, -0.25], [3.0, 0.25])
+    plant = loop.plant.replace(E=np.eye(2))
+    return loop.replace(plant=plant, disturbance=W, noise=V), rj.Box([2.5, -0.25], [3.0, 0.25])
 
 
 def extremes(W: Any, count: int, steps: int, seed: int, start: int = 0) -> np.ndarray:

@@ -1,8 +1,9 @@
 """Which cases a run takes, and from where all is drawn, as a plugin of pytest.
 
-`python -m pytest` takes one case of each claim: what somebody needs to trust an installation, in
-minutes. With a path, or `--every-case`, all cases are taken; with `--other-cases` those that it
-leaves out.
+`python -m pytest` takes one case of each claim, of laws the basic ones: what somebody needs to
+trust an installation, in minutes. With a path, or `--every-case`, all cases are taken; with
+`--other-cases` those of the library that it leaves out; with `--experiments` those about
+experiments, notebooks and site.
 """
 
 from collections import defaultdict
@@ -33,14 +34,23 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--other-cases",
         action="store_true",
-        help="the cases that are not taken by default, for a machine that has run those",
+        help="the cases of the library that are not taken by default, for after those",
+    )
+    parser.addoption(
+        "--experiments",
+        action="store_true",
+        help=f"all cases about experiments, notebooks and site: {' '.join(ELSEWHERE)}",
     )
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Draw all that is random from the seed of the session, before tests are imported."""
     config.addinivalue_line("markers", "costly: a claim that only `--every-case` or a path runs")
+    config.addinivalue_line("markers", "basic: a case that is taken wherever one of its claim is")
     draw_from(config.getoption("seed"))
+    if config.getoption("experiments"):
+        config.args[:] = ELSEWHERE
+        config.args_source = pytest.Config.ArgsSource.ARGS
 
 
 def draw_from(seed: int) -> None:
@@ -85,21 +95,27 @@ def _is_elsewhere(path: Path, config: pytest.Config) -> bool:
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave unread, in a bare run, the files of claims that are not about the library."""
-    if _everything(config) or config.getoption("other_cases"):
+    if _everything(config):
         return None
     return True if _is_elsewhere(collection_path, config) else None
 
 
+def _taken(cases: list[pytest.Item]) -> list[pytest.Item]:
+    """Of a claim's cases the basic ones, or the one in the middle."""
+    basic = [item for item in cases if item.get_closest_marker("basic")]
+    return basic or [cases[len(cases) // 2]]
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave one case of each claim, the one in the middle, unless all are asked for."""
+    """Leave one case of each claim, the middle one, or basic ones, unless all are asked for."""
     if _everything(config):
         return
     cases = defaultdict(list)
     for item in items:
         if not (item.get_closest_marker("costly") or _is_elsewhere(item.path, config)):
             cases[item.nodeid.partition("[")[0]].append(item)
-    first = {id(each[len(each) // 2]) for each in cases.values()}
+    first = {id(item) for each in cases.values() for item in _taken(each)}
     others = config.getoption("other_cases")
     left = [item for item in items if (id(item) in first) == others]
     items[:] = [item for item in items if (id(item) in first) != others]

@@ -101,12 +101,16 @@ def learned(settings: Settings) -> rj.MLP:
     return rj.MLP.from_layers(fit.layers, rj.Tanh())
 
 
-def closed(net: rj.AbstractNetwork) -> rj.ClosedLoop:
-    """The loop."""
+def equations() -> tuple[Float[ndarray, "4 4"], Float[ndarray, "4 2"]]:
+    """The matrices of Clohessy and Wiltshire."""
     n = MOTION
     A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [3 * n**2, 0, 0, 2 * n], [0, 0, -2 * n, 0]])
-    B = np.vstack([np.zeros((2, 2)), np.eye(2) / MASS])
-    return rj.ClosedLoop(rj.zero_order_hold(A, B, period=1.0), net)
+    return A, np.vstack([np.zeros((2, 2)), np.eye(2) / MASS])
+
+
+def closed(net: rj.AbstractNetwork) -> rj.ClosedLoop:
+    """The loop."""
+    return rj.ClosedLoop(rj.zero_order_hold(*equations(), period=1.0), net)
 
 
 def limit() -> rj.Polytope:

@@ -67,8 +67,13 @@ def draw_training(
 
 
 def _draw_loop(ax, problem: Problem, result: Result) -> None:
-    i, j = problem.plane
     rj.plot_tube(result.tube, ax, coordinates=problem.plane)
+    draw_sets(ax, problem, result.verdict.counterexample)
+
+
+def draw_sets(ax, problem: Problem, example: rj.Counterexample | None) -> None:
+    """What is avoided, the goal, and a trajectory that breaks what is required."""
+    i, j = problem.plane
     ax.margins(0.08)
     ax.autoscale_view()
     limits = problem.view or (ax.get_xlim(), ax.get_ylim())
@@ -78,8 +83,8 @@ def _draw_loop(ax, problem: Problem, result: Result) -> None:
     if problem.goal is not None:
         style = {"facecolor": "tab:green", "edgecolor": "none", "alpha": 0.25}
         _fill(ax, problem.goal, problem, limits, label="goal", **style)
-    if result.verdict.counterexample is not None:
-        path = result.verdict.counterexample.states[:, [i, j]].T
+    if example is not None:
+        path = example.states[:, [i, j]].T
         ax.plot(*path, ".-", color="tab:orange", linewidth=1, label="counterexample")
     ax.set(xlabel=problem.axes[0], ylabel=problem.axes[1], xlim=limits[0], ylim=limits[1])
 

@@ -1,6 +1,7 @@
 """What is verified: units, networks, plants and the loop they close."""
 
 from reachjax.loops.closed_loop import ClosedLoop
+from reachjax.loops.delays import delayed, with_inputs
 from reachjax.loops.networks import MLP, AbstractNetwork, Network, Residual, Switched, one_of
 from reachjax.loops.plants import (
     AbstractPlant,
@@ -70,7 +71,9 @@ __all__ = [
     "Switched",
     "Tanh",
     "XLogX",
+    "delayed",
     "one_of",
     "runge_kutta",
+    "with_inputs",
     "zero_order_hold",
 ]

@@ -70,11 +70,12 @@ def in_between(
     """
     plant: Any = loop.plant
     w, v = (None if part is None else Batch(part) for part in (disturbances, noises))
-    u = loop.input(Batch(states), t, _evaluated, v)
+    begun, u = plant.beginning(Batch(states), loop.input(Batch(states), t, _evaluated, v))
+    states = begun.values
     others, period = [u] if w is None else [u, w], float(plant.period)
     first, last = (
-        period * plant.flow.rate((Batch(x), *others), _evaluated).values
-        for x in (states, following)
+        period * plant.flow_at(time).rate((Batch(x), *others), _evaluated).values
+        for time, x in ((t, states), (t + 1, following))
     )
     found = []
     for s in PARTS:

@@ -203,6 +203,11 @@ class ClosedLoop(Replaceable):
         return self.plant.bends or any(layer.unit.curved for layer in self.unit_layers)
 
     @property
+    def jumps(self) -> bool:
+        """Whether a decision changes at once what follows."""
+        return any(layer.unit.jumps for layer in self.unit_layers)
+
+    @property
     def units(self) -> int:
         """The number of units of one step."""
         return sum(layer.size for layer in self.unit_layers)
@@ -216,6 +221,11 @@ class ClosedLoop(Replaceable):
     def steps(self) -> int | None:
         """How many steps a time-varying loop is given for; `None` when it is time-invariant."""
         return next((part.steps for _, part in self._parts() if part.steps is not None), None)
+
+    @property
+    def varies(self) -> bool:
+        """Whether a step depends on its time."""
+        return self.steps is not None or self.plant.clock
 
     @property
     def is_disturbed(self) -> bool:
@@ -293,7 +303,8 @@ class ClosedLoop(Replaceable):
         *,
         disturbances: Float[ArrayLike, "*batch horizon n_w"] | None = None,
         noises: Float[ArrayLike, "*batch horizon n"] | None = None,
-    ) -> Float[Array, "*batch horizon+1 n"]:
+        parts: int = 1,
+    ) -> Float[Array, "*batch horizon*parts+1 n"]:
         """Trajectories from one initial state `(n,)` or from many `(batch, n)`, `x0` included.
 
         Args:
@@ -303,19 +314,34 @@ class ClosedLoop(Replaceable):
             disturbances: those of each step, and of each initial state or of all; None for the
                 middle of their set.
             noises: the same of what is measured.
+            parts: how many states of each period are given, in equal distances, of a plant in
+                continuous time; 1 for those at samples.
 
         Raises:
             ValueError: `x0` has another dimension, or a time-varying loop ends before the horizon;
-                there are not as many disturbances or noises, or the loop has none.
+                there are not as many disturbances or noises, or the loop has none; or states in
+                between samples are asked for that there are not.
         """
         x0 = Numbers("(n_x,)", "(batch, n_x)")(x0, "x0")
         same_size(
             "the loop's number of states is", "the dimension of x0 is", (self.states, x0.shape[-1])
         )
         self.check_horizon(horizon, start)
+        if whole_number("parts", parts, 1) > 1 and not self.plant.continuous:
+            raise ValueError(
+                f"parts must be 1 of a plant in discrete time, which has no states in between "
+                f"samples, but {parts} arrived"
+            )
         w = self._given("disturbances", self.disturbance, disturbances, x0, horizon)
         v = self._given("noises", self.noise, noises, x0, horizon)
-        return _simulate(self, x0, w, v, horizon, start)
+        return _simulate(self, x0, w, v, horizon, start, parts)
+
+    def _after_parts(self, x: Any, t: Any, parts: int, w: Any, v: Any) -> list[Any]:
+        """The states after each part of a period, the last of which is the next sample's."""
+        plant: Any = self.plant
+        u, drawn = self.input(x, t, v=v), self.pushed(x, t, w=w)
+        earlier = (plant.shortened(k / parts) for k in range(1, parts))
+        return [each.propagate(x, u, t, evaluate, *drawn) for each in (*earlier, plant)]
 
     def _given(
         self, name: str, W: AbstractSet | None, given: Any, x0: Array, horizon: int
@@ -416,18 +442,24 @@ def _recorded(structure: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> tuple
     return tuple(layers)
 
 
-@partial(Compiled, static_argnames="horizon")
+@partial(Compiled, static_argnames=("horizon", "parts"))
 def _simulate(
-    loop: ClosedLoop, x0: Array, w: Array | None, v: Array | None, horizon: int, start: int
+    loop: ClosedLoop,
+    x0: Array,
+    w: Array | None,
+    v: Array | None,
+    horizon: int,
+    start: int,
+    parts: int = 1,
 ) -> Array:
     def trajectory(x, w, v):
         def advance(x, given):
             t, w, v = given
-            following = loop.step(x, t, w=w, v=v)
-            return following, following
+            found = loop._after_parts(x, t, parts, w, v)
+            return found[-1], jnp.stack(found)
 
         _, states = jax.lax.scan(advance, x, (start + jnp.arange(horizon), w, v))
-        return jnp.concatenate([x[None], states])
+        return jnp.concatenate([x[None], states.reshape(-1, len(x))])
 
     if x0.ndim == 1:
         return trajectory(x0, w, v)

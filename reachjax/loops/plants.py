@@ -19,6 +19,7 @@ import numpy as np
 from jax.scipy.linalg import expm
 from jaxtyping import Array, ArrayLike, Float
 
+from reachjax.loops.flows.clock import successor_at, timed
 from reachjax.loops.tracing.functions import Function
 from reachjax.loops.units import AtUnit, evaluate
 from reachjax.numerics.checks import (
@@ -58,6 +59,11 @@ class AbstractPlant(Replaceable, abc.ABC):
     @property
     def bends(self) -> bool:
         """Whether its successors bend smoothly by more than the units it has; not here."""
+        return False
+
+    @property
+    def clock(self) -> bool:
+        """Whether it is a function of the time, whatever that is; not here."""
         return False
 
     @property
@@ -252,8 +258,33 @@ class NonlinearPlant(AbstractPlant):
             n = whole_number(f"{name}.states", states, 1)
             m = whole_number(f"{name}.inputs", inputs, 1)
             d = whole_number(f"{name}.disturbances", disturbances, 0)
-            f = Function.of(f, (n, m, d) if d else (n, m), n, f"{name}.f")
+            f = Function.of(*self._traced(f, (n, m, d) if d else (n, m)), n, f"{name}.f")
         self._set(f=f)
+
+    def _traced(self, f: Any, sizes: tuple[int, ...]) -> tuple[Any, tuple[int, ...]]:
+        """What is traced, and with vectors of which sizes."""
+        return f, sizes
+
+    @staticmethod
+    def timed(f: Any, states: int, inputs: int, disturbances: int = 0) -> TimedPlant:
+        """The plant `x[t+1] = f(x[t], u[t], t)`, or `f(x[t], u[t], w[t], t)`, that knows the time.
+
+        Args:
+            f: of a state, an input, disturbances if there are any, and the number of the step.
+            states: how many there are.
+            inputs: how many there are.
+            disturbances: how many there are.
+
+        Raises:
+            TypeError: `f` is no function, or contains a primitive that has no bounds.
+            ValueError: `f` cannot be called so, or its result has another shape.
+
+        Example:
+            >>> plant = NonlinearPlant.timed(lambda x, u, t: x + t * u, states=1, inputs=1)
+            >>> plant.propagate(jnp.array([1.0]), jnp.array([0.5]), 3).tolist()
+            [2.5]
+        """
+        return TimedPlant(f, states, inputs, disturbances)
 
     def __repr__(self) -> str:
         more = f", disturbances={self.disturbances}" if self.disturbances else ""
@@ -272,22 +303,43 @@ class NonlinearPlant(AbstractPlant):
     @property
     def disturbances(self) -> int:
         """The number `n_w` of disturbances."""
-        return sum(self.f.structure.inputs[2:])
+        return sum(self.f.structure.inputs[2:]) - self.clock
 
     @property
     def steps(self) -> int | None:
-        """No number of steps: the function does not know the time."""
+        """No number of steps: the function is one of any time, if it knows it."""
         return None
 
     def propagate(
         self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
     ) -> Any:
         """The successor of `x` under input `u` and disturbances `w`, for any kind of number."""
-        if not self.disturbances:
-            return self.f.propagate((x, u), unit)
-        if w is None:
-            w = np.zeros((self.disturbances, self.states)) @ x
-        return self.f.propagate((x, u, w), unit)
+        given = [x, u]
+        if self.disturbances:
+            given.append(np.zeros((self.disturbances, self.states)) @ x if w is None else w)
+        if self.clock:
+            xp = jnp if isinstance(t, jax.Array) else np
+            given.append(np.zeros((1, self.states)) @ x + xp.asarray([t], float))
+        return self.f.propagate(tuple(given), unit)
+
+
+@pytree
+class TimedPlant(NonlinearPlant):
+    """A plant that knows the number of the step, as `NonlinearPlant.timed` makes it."""
+
+    __init__ = NonlinearPlant.__init__
+
+    def __repr__(self) -> str:
+        return super().__repr__().replace("NonlinearPlant(", "NonlinearPlant.timed(")
+
+    @property
+    def clock(self) -> bool:
+        """Whether it is a function of the time: it is."""
+        return True
+
+    def _traced(self, f: Any, sizes: tuple[int, ...]) -> tuple[Any, tuple[int, ...]]:
+        """The function of a vector of one in place of the time."""
+        return (timed(f, successor_at) if callable(f) else f), (*sizes, 1)
 
 
 RUNGE_KUTTA_DEGREE = 4

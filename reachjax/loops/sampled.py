@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.loops.flows.flow import AbstractFlow, Flow
+from reachjax.loops.flows.clock import ClockedFlow, rate_with_clock, timed
+from reachjax.loops.flows.flow import LEAST_STEPS, AbstractFlow, Flow
 from reachjax.loops.flows.linear import LinearFlow
 from reachjax.loops.flows.series import Tape
 from reachjax.loops.flows.steps import Settings
@@ -19,7 +20,7 @@ from reachjax.loops.tracing.functions import Function
 from reachjax.loops.tracing.limits import Limits
 from reachjax.loops.tracing.values import UnsupportedError, Value
 from reachjax.loops.units import AtUnit, UnboundedError, evaluate
-from reachjax.numerics.checks import Numbers, is_concrete, real_number, whole_number
+from reachjax.numerics.checks import Numbers, is_concrete, real_number, require_kind, whole_number
 from reachjax.numerics.pytrees import converted, pytree, static
 from reachjax.numerics.rounding import Ball, namespace
 
@@ -51,9 +52,26 @@ class AbstractSampledPlant(AbstractPlant):
     def flow(self) -> AbstractFlow:
         """Its flow over one period."""
 
+    def flow_at(self, t: int | jax.Array) -> AbstractFlow:
+        """Its flow over the period that begins at a sample; of an equation without clock any."""
+        return self.flow
+
+    def beginning(self, x: Any, u: Any) -> tuple[Any, Any]:
+        """What a period begins with, the state and the input that acts: these, if none is late."""
+        return x, u
+
+    def shortened(self, part: float) -> AbstractSampledPlant:
+        """The plant of a part of each period: what follows a sample after so much of it."""
+        return self.replace(period=part * self.period)
+
+    @property
+    def finer(self) -> AbstractSampledPlant:
+        """The plant as it is simulated in twice as many steps."""
+        return self
+
     @property
     def steps(self) -> int | None:
-        """No number of steps: the differential equation does not know the time."""
+        """No number of steps: the differential equation is one of any time, if it knows it."""
         return None
 
     @property
@@ -85,27 +103,28 @@ class AbstractSampledPlant(AbstractPlant):
                 "relaxation=LinearBounds() or BranchAndCut(), and a template of facets"
             )
         given = (x, u) if w is None else (x, u, w)
+        flow = self.flow_at(t)
         if isinstance(x, np.ndarray | jax.Array):  # units of the equation are none of the loop
-            return self.flow.simulated(given, evaluate)
+            return flow.simulated(given, evaluate)
         if hasattr(x, "values"):
-            return self.flow.simulated(given, unit)
+            return flow.simulated(given, unit)
         try:
             with np.errstate(all="ignore"):  # what overflows has no bounds
                 if type(x) is Ball:
-                    return self.flow.enclosed(tuple(map(_interval, given)))
+                    return flow.enclosed(tuple(map(_interval, given)))
                 if isinstance(x, Limits):
-                    return self._limits((x, *given[1:]))
-                return unit(self.flow, *given)
+                    return self._limits(flow, (x, *given[1:]))
+                return unit(flow, *given)
         except UnboundedError as error:
             unit_of, _, lower, upper = error.given
             raise UnboundedError(unit_of, int(t), lower, upper, line=error.line) from None
 
-    def _limits(self, given: tuple[Limits, ...]) -> Limits:
+    def _limits(self, flow: AbstractFlow, given: tuple[Limits, ...]) -> Limits:
         """What limits lead to; nothing is known if they are infinite."""
         ends = [(each.least, each.most) for each in given]
         if not np.isfinite(ends[0]).all() or not np.isfinite(ends[1]).all():
             return Limits.unknown(self.states)
-        found = self.flow.enclosed(tuple(Ball.between(*each) for each in ends))
+        found = flow.enclosed(tuple(Ball.between(*each) for each in ends))
         return Limits(np.asarray(found.lower), np.asarray(found.upper))
 
 
@@ -185,6 +204,8 @@ class SampledPlant(AbstractSampledPlant):
             steps are halved as often as it takes.
         held: whether disturbances are constant over each period; if not, they are any measurable
             signal in their set. What is constant for all time is a state whose derivative is zero.
+        clock: whether `f` has a last argument more, the time, in the plant's units: that of the
+            sample `t = 0` is zero.
 
     Raises:
         TypeError: `f` is no function, or contains what has no bounds or no derivatives; the error
@@ -205,6 +226,8 @@ class SampledPlant(AbstractSampledPlant):
     order: int | None = static(default=None)
     fewest: int = static(default=1)
     held: bool = static(default=False)
+    clock: bool = static(default=False)
+    part: float = static(default=1.0)
 
     def __init__(
         self,
@@ -216,15 +239,20 @@ class SampledPlant(AbstractSampledPlant):
         order: int | None = None,
         steps: int | None = None,
         held: bool = False,
+        clock: bool = False,
     ):
+        require_kind(f"{NAME}.clock", clock, bool, "True or False")
         if not isinstance(f, Function):
             n = whole_number(f"{NAME}.states", states, 1)
             m = whole_number(f"{NAME}.inputs", inputs, 1)
             d = whole_number(f"{NAME}.disturbances", disturbances, 0)
-            f = Function.of(f, (n, m, d) if d else (n, m), n, f"{NAME}.f")
+            if clock and callable(f):
+                f = timed(f, rate_with_clock)
+            sizes = (n + clock, m, *([d] if d else []))
+            f = Function.of(f, sizes, n + clock, f"{NAME}.f")
         order = None if order is None else whole_number(f"{NAME}.order", order, 1)
         steps = 1 if steps is None else whole_number(f"{NAME}.steps", steps, 1)
-        self._set(f=f, period=_period(period), order=order, held=bool(held))
+        self._set(f=f, period=_period(period), order=order, held=bool(held), clock=clock, part=1.0)
         self._set(fewest=1 << (steps - 1).bit_length())  # parts of a period are exact
         try:
             jax.eval_shape(lambda plant: plant.period * len(plant.flow.tape.nodes), self)
@@ -233,7 +261,7 @@ class SampledPlant(AbstractSampledPlant):
 
     def replace(self, **changes: Any) -> SampledPlant:
         """A copy with some of the constructor's arguments changed."""
-        names = "states", "inputs", "disturbances", "f", "period", "order", "held"
+        names = "states", "inputs", "disturbances", "f", "period", "order", "held", "clock"
         given = {name: getattr(self, name) for name in names}
         return SampledPlant(**{**given, "steps": self.fewest, **changes})
 
@@ -245,7 +273,7 @@ class SampledPlant(AbstractSampledPlant):
     @property
     def states(self) -> int:
         """The number `n_x` of states."""
-        return self.f.structure.inputs[0]
+        return self.f.structure.inputs[0] - self.clock
 
     @property
     def inputs(self) -> int:
@@ -257,9 +285,28 @@ class SampledPlant(AbstractSampledPlant):
         """The number `n_w` of disturbances."""
         return sum(self.f.structure.inputs[2:])
 
+    def shortened(self, part: float) -> SampledPlant:
+        """The plant of a part of each period, whose clock goes on by whole ones."""
+        found = self.replace(period=part * self.period)
+        found._set(part=part * self.part)
+        return found
+
+    @property
+    def finer(self) -> SampledPlant:
+        """The plant as it is simulated in twice as many steps."""
+        found = self.replace(steps=2 * max(self.fewest, LEAST_STEPS))
+        found._set(part=self.part)
+        return found
+
+    def flow_at(self, t: int | jax.Array) -> AbstractFlow:
+        """Its flow over the period that begins at a sample."""
+        if not self.clock:
+            return self.flow
+        return ClockedFlow(self.flow, t * (self.period / self.part), self.states)
+
     @property
     def flow(self) -> Flow:
-        """Its flow over one period; of numpy arrays it is kept."""
+        """Its flow over one period, of the state and the time if it knows that; kept of numpy."""
         on_host = all(isinstance(each, np.ndarray) for each in jax.tree.leaves(self))
         kept = self.__dict__.get("_flow") if on_host else None
         if kept is None:

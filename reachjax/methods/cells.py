@@ -72,6 +72,10 @@ TRIAL, TRIED = 1 / 32, 1 / 8
 """It is tried once forms have taken this part of the work, and may take as much; of a limited time
 it may take the other part."""
 
+WAYS = 32
+"""Along so many ways of its decisions a loop that jumps is followed over a cell: each takes as long
+as another cell, but half of a cell may have as many."""
+
 SEARCHING = 0.9
 """The part of the time in which cells are halved: sets, proofs and witnesses take the rest, 0.7 s
 of two hundred steps where measured."""
@@ -128,6 +132,7 @@ class Cells(AbstractMethod):
                 seconds=np.full(facets, search.seconds / facets / (problem.horizon - len(known))),
                 k=k + 1,
                 start=problem.start,
+                ways=search.ways,
             )
             yield ReachSet(Polytope(directions[k], bounds), proof, at(k + 1), search.farthest(k))
 
@@ -152,7 +157,12 @@ class _Bounds(NamedTuple):
     @property
     def is_bounded(self) -> bool:
         """Whether all facets have bounds."""
-        return bool(np.isfinite(self.offsets).all())
+        return bool((self.offsets < np.inf).all())  # nothing is below where no state is
+
+    @property
+    def effort(self) -> float:
+        """What they took, in units of a form of the whole horizon along one way."""
+        return max(1.0, sum(step.ways for step in self.steps) / max(1, len(self.offsets)))
 
     def proofs(self, first: int, k: int) -> tuple[AbstractProof, ...]:
         """The other method's proofs from one step on until `k`; none if it was not asked."""
@@ -199,10 +209,15 @@ class _Search(AbstractSearch):
         self._generations = max(GENERATIONS, 2 * wide)
         self._deepest = 2 * math.ceil(math.log2(method.most))
         self._longest = self._slowest = 0.0
+        # derivatives are those of forms that hold each decision that is open
+        known = is_concrete(problem.loop, problem.X0, problem.directions)
+        self._follows = known and self._loop.jumps
+        self._asks, self._price = method.inner.adds_to_forms(loop), 0.0
+        self.ways = WAYS if self._follows and not self._asks else 1
+        self._wanted_bounds: np.ndarray | None = None
         root.found = self._by_forms(root)
         self._all = self._left = affordable(self._loop, problem.horizon, problem.budget)
         self._form = MULTIPLICATIONS / affordable(self._loop, problem.horizon, Budget())
-        self._asks, self._price = method.inner.adds_to_forms(loop), 0.0
         self._stuck = False
         self._planned, self._wanted, self._halvings, self._looked = False, 1, 0, -1
         self.end = SolverStatus.UNKNOWN_GAP
@@ -218,7 +233,7 @@ class _Search(AbstractSearch):
         given = self._loop, node.part, node.box, self._directions, self._problem.start
         began, steps, lost = self._budget.elapsed, list[ByForms](), None
         try:
-            steps.extend(unrolled(*given))
+            steps.extend(unrolled(*given, most=self.ways, wanted=self._wanted_bounds))
         except UnboundedError as error:  # of halves there may be bounds
             lost = error
         self._longest = max(self._longest, self._budget.elapsed - began)
@@ -343,6 +358,11 @@ class _Search(AbstractSearch):
         before, after = (self._beyond(found.offsets) for found in (node.found, tried))
         self._planned = True
         self._asks = bool(after.sum() <= (1 - CLOSED) * before.sum())
+        if self._follows and not self._asks:  # what is left open is left so by decisions
+            self.ways = WAYS
+            followed = self._by_forms(node)
+            self._left -= followed.effort
+            node.found = followed if followed.is_bounded else node.found
         if self._asks:
             most = self._left / (2 + self._price)
             seconds = 2 * self._longest + self._slowest
@@ -385,6 +405,7 @@ class _Search(AbstractSearch):
         self._open_parts, self._ranges = open_parts, np.where(half > 0, half, 1.0)
         self._levels = most + self._problem.gap * half
         self._levels[: self._known] = np.inf
+        self._wanted_bounds = self._levels
 
     def codes(self, k: int) -> Int[np.ndarray, " f"]:
         """How the search ended for each facet after `k + 1` steps, as values of `SolverStatus`."""
@@ -439,7 +460,7 @@ class _Search(AbstractSearch):
             return False
         self.cells.replace(node, halves, self.cells.longest(node))
         node.found = node.found._replace(steps=(), sets=())
-        self._left -= len(halves)
+        self._left -= sum(half.found.effort for half in halves)
         self._halvings += 1
         self._note()
         return True

@@ -5,9 +5,10 @@ On the host step by step in numpy, where nothing is compiled; for traced numbers
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from reachjax.numerics.rounding import rounding
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
 from reachjax.programs.flows import Between
+from reachjax.programs.followed import NoStatesError, OpenDecision, Way, ways
 from reachjax.programs.initial import InitialColumns, constant
 from reachjax.programs.merging import merged_columns
 from reachjax.sets import AbstractSet, Box
@@ -38,6 +40,8 @@ class ByForms(NamedTuple):
         drawn: for each step so far the values `(m, d)` of disturbances there; nothing of compiled
             code.
         between: `(m,)`, upper bounds at all times since the sample before, if they are asked for.
+        open: decisions of the step that may go either way, none of compiled code.
+        ways: along how many ways of decisions that is so.
     """
 
     offsets: Float[Array | np.ndarray, "*N m"]
@@ -45,6 +49,8 @@ class ByForms(NamedTuple):
     corners: Float[Array | np.ndarray, "*N m n_x"]
     drawn: tuple[Float[np.ndarray, "m d"], ...] = ()
     between: Float[Array | np.ndarray, "*N m"] | None = None
+    open: tuple[OpenDecision, ...] = ()
+    ways: int = 1
 
 
 def unrolled(
@@ -56,6 +62,8 @@ def unrolled(
     slopes: Float[np.ndarray, "N units"] | None = None,
     known: Sequence[Box] | None = None,
     between: bool = False,
+    most: int = 1,
+    wanted: Float[np.ndarray, "N m"] | None = None,
 ) -> Iterator[ByForms]:
     """Bounds of directions of the states after 1, ..., N steps, one step after the other in numpy.
 
@@ -68,6 +76,9 @@ def unrolled(
         slopes: of lines for the units of each step, of which any are sound; None for good ones.
         known: boxes that surely hold the states after each step, where they are known.
         between: whether bounds at all times are asked for, of a differential equation.
+        most: along how many ways of its decisions a loop that jumps is followed.
+        wanted: for each step, bounds of the directions below which nothing is gained; None for
+            bounds that are as good as they can be.
 
     Example:
         >>> from reachjax import MLP, AffinePlant
@@ -76,24 +87,86 @@ def unrolled(
         >>> [step.offsets.round(6).tolist() for step in unrolled(loop, X0, X0, np.ones((2, 1, 1)))]
         [[1.2], [0.72]]
     """
+    given = loop, X0, box, directions, t, slopes, known, between, most, wanted
+    for found in along_ways(*given):
+        yield _together(found)
+
+
+def along_ways(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[np.ndarray, "N m n_x"],
+    t: int = 0,
+    slopes: Float[np.ndarray, "N units"] | None = None,
+    known: Sequence[Box] | None = None,
+    between: bool = False,
+    most: int = 1,
+    wanted: Float[np.ndarray, "N m"] | None = None,
+) -> Iterator[list[ByForms]]:
+    """What `unrolled` says, of each way in which decisions go; arguments are the same.
+
+    At least one way is given, which says minus infinity should there be no states at all.
+    """
     loop, X0, box, known = map(in_numpy, (loop, X0, box, known))
     with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
         start = InitialColumns.of(X0, box, loop.curved)
-        state = AffineForms.beginning(start)
-    free: list[np.ndarray] = []
-    for k, rows in enumerate(np.asarray(directions)):
-        with np.errstate(all="ignore"):
-            given = None if slopes is None else np.asarray(slopes[k])
-            held = None if known is None else known[k]
-            spans = [] if between else None
-            state, units, _ = step_forms(
-                loop, state, t + k, start, slopes=given, known=held, before=k, spans=spans
-            )
-            found = _bounds(rows, state, units, start, spans)
-            forms = rows @ state
-        here = [layer.places for layer in units if layer.unit.free]
-        free.append(np.concatenate([np.zeros(0, int), *here]))
-        yield found._replace(drawn=tuple(np.sign(forms.columns[:, each]) for each in free))
+    given = loop, start, len(directions), t, most, between, slopes, known
+    for k, found in enumerate(ways(*given)):
+        rows = np.asarray(directions[k])
+        enough = np.full(len(rows), -np.inf) if wanted is None else wanted[k]
+        each = list[ByForms]()
+        for way in found:
+            with np.errstate(all="ignore"), contextlib.suppress(NoStatesError):
+                each.append(_of_way(way, rows, start, enough))
+        nowhere = np.tile(start.center, (len(rows), 1))
+        yield each or [ByForms(np.full(len(rows), -np.inf), np.zeros(loop.units), nowhere)]
+
+
+def _of_way(
+    way: Way,
+    rows: Float[np.ndarray, "m n_x"],
+    start: InitialColumns,
+    wanted: Float[np.ndarray, " m"],
+) -> ByForms:
+    """What one way says of the states after a step.
+
+    Raises:
+        NoStatesError: there are none on it.
+    """
+    found, forms = _bounds(rows, way.state, way.units, start, way.spans), rows @ way.state
+    drawn = [np.sign(forms.columns[:, each]) for each in way.free]
+    if len(way.facts):
+        upper, at = way.bounds(forms, start, wanted)
+        known, first = np.isfinite(at).all(axis=1), start.spread.shape[1]
+        corners = found.corners.copy()
+        corners[known] = start.center + at[known, :first] @ start.spread.T
+        drawn = [
+            np.where(known[:, None], at[:, each], one)
+            for each, one in zip(way.free, drawn, strict=True)
+        ]
+        found = found._replace(offsets=upper, corners=corners)
+    return found._replace(drawn=tuple(drawn), open=way.open)
+
+
+def _together(each: Sequence[ByForms]) -> ByForms:
+    """What all ways together say: of each direction the largest."""
+    if len(each) == 1:
+        return each[0]
+    uppers = np.array([found.offsets for found in each])
+    deciding = np.where(np.isnan(uppers), np.inf, uppers).argmax(axis=0)
+
+    def of_deciding(values: Callable[[ByForms], Any]) -> Any:
+        return np.array([values(each[number])[row] for row, number in enumerate(deciding)])
+
+    drawn = tuple(of_deciding(lambda one, k=k: one.drawn[k]) for k in range(len(each[0].drawn)))
+    between = None
+    if each[0].between is not None:
+        between = np.max([one.between for one in each], axis=0)
+    corners = of_deciding(lambda one: one.corners)
+    decisions = tuple(dict.fromkeys(decision for one in each for decision in one.open))
+    uppers = uppers.max(axis=0)
+    return ByForms(uppers, each[0].slopes, corners, drawn, between, decisions, len(each))
 
 
 FOUND = jax.checkpoint_policies.save_only_these_names(EXTREMES)
@@ -205,7 +278,7 @@ def _bounds(
     state: AffineForms,
     units: tuple[UnitForms, ...],
     start: InitialColumns,
-    spans: list[Between] | None,
+    spans: Sequence[Between] | None,
 ) -> ByForms:
     rows = directions @ state
     xp = jnp if isinstance(rows.rows, jax.Array) else np

@@ -98,6 +98,7 @@ class CellCertificate(AbstractProof):
         proofs: for each cell what proves more than forms: the proof of this step, behind those of
             steps before that no certificate has; nothing where forms prove all, and nothing at all
             if that is so of all cells.
+        ways: along how many ways of its decisions a loop that jumps was followed over a cell.
     """
 
     loop: ClosedLoop
@@ -107,6 +108,7 @@ class CellCertificate(AbstractProof):
     k: int = static()
     start: int = static()
     proofs: tuple[tuple[AbstractProof, ...], ...] = ()
+    ways: int = static(default=1)
 
     def __repr__(self) -> str:
         return (
@@ -146,7 +148,8 @@ class CellCertificate(AbstractProof):
             proofs = ((),) * len(cells)
         found = []
         for cell, own in zip(cells, proofs, strict=True):
-            *_, last = unrolled(self.loop, cell.part, cell.box, directions, self.start)
+            given = self.loop, cell.part, cell.box, directions, self.start
+            *_, last = unrolled(*given, most=self.ways)
             bounds = np.where(np.isnan(last.offsets), np.inf, last.offsets)
             found.append(np.fmin(bounds, own[-1].recheck()) if own else bounds)
         return np.max(found, axis=0)

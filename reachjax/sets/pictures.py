@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -21,8 +21,26 @@ ABOVE = {"loc": "lower center", "bbox_to_anchor": (0.5, 1), "ncols": 3, "frameon
 
 SAMPLE_STYLE = {"s": 1.0, "color": "tab:blue", "linewidths": 0, "rasterized": True}
 
-Flowpipe = tuple[Sequence[AbstractSet], Float[np.ndarray, "c h+1 n"]]
-"""Sets of each time, and states of simulated trajectories."""
+SPAN = {"facecolor": "tab:red", "edgecolor": "none", "alpha": 0.15}
+"""Sets that hold all states of a period."""
+
+LINE = {"color": "tab:blue", "linewidth": 0.4, "alpha": 0.6}
+
+
+class Flowpipe(NamedTuple):
+    """What is drawn of a tube.
+
+    Attributes:
+        sets: of each time.
+        states: of simulated trajectories.
+        spans: what holds the states in between samples, of a differential equation.
+        lines: some trajectories, with states in between.
+    """
+
+    sets: Sequence[AbstractSet]
+    states: Float[np.ndarray, "c h+1 n"]
+    spans: Sequence[AbstractSet] = ()
+    lines: Float[np.ndarray, "c p n"] | None = None
 
 
 @lenient
@@ -88,6 +106,8 @@ def draw_flowpipes(
 ) -> Axes:
     """Draw sets over simulated states: shadows, where there are more than two dimensions.
 
+    What holds the states in between is filled below, and trajectories are lines.
+
     Args:
         flowpipes: each with its simulated states; all begin at the same time.
         ax: where to draw; a new figure with a legend by default.
@@ -96,8 +116,13 @@ def draw_flowpipes(
     i, j = _two_of(flowpipes[0][0][0].dimension, coordinates)
     with_legend, ax = ax is None, _axes(ax)
     labels: Sequence[str | None] = ("simulated", "initial set", "certified")
-    for regions, states in flowpipes:
+    for regions, states, spans, lines in flowpipes:
         simulated, initial, certified = labels
+        for t, region in enumerate(spans):
+            named = "at all times" if t == 0 and certified else None
+            plot_set(region, ax, (i, j), **SPAN, label=named)
+        if lines is not None:
+            ax.plot(*lines[:, :, [i, j]].T, **LINE)
         for t, region in enumerate(regions):
             ax.scatter(*states[:, t, [i, j]].T, **SAMPLE_STYLE, label=None if t else simulated)
             first = {"edgecolor": "black", "label": initial}

@@ -53,6 +53,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pandas import DataFrame
 
+LINES, LINE_PARTS = 40, 4
+"""So many trajectories are drawn as lines, with so many points a period."""
+
 
 @pytree
 class ReachTube(Replaceable):
@@ -194,7 +197,13 @@ class ReachTube(Replaceable):
             states = np.asarray(self.simulate(samples))
         except ThinSetError:
             states = np.zeros((0, self.horizon + 1, self.loop.states))
-        return self.sets, states
+        if not self.loop.plant.continuous:
+            return Flowpipe(self.sets, states)
+        lines = None
+        if len(states) and not self.loop.is_disturbed:
+            given = states[:LINES, 0], self.horizon, self.start
+            lines = np.asarray(self.loop.simulate(*given, parts=LINE_PARTS))
+        return Flowpipe(self.sets, states, self.spans, lines)
 
     def _repr_html_(self) -> str:
         steps = [_shown(self, t) for t in range(1, self.horizon + 1)]

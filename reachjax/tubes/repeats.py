@@ -159,7 +159,12 @@ class Repeat:
         return boxed(self._tube.sets[0], "X0")
 
     def _by_forms(
-        self, k: int, key: Any, parts: Any, slopes: Float[np.ndarray, "k units"] | None = None
+        self,
+        k: int,
+        key: Any,
+        parts: Any,
+        slopes: Float[np.ndarray, "k units"] | None = None,
+        most: int = 1,
     ) -> Float[np.ndarray, "c f"]:
         """The bounds over each of these parts of the initial set."""
         tube, forms = self._tube, self._forms
@@ -167,7 +172,9 @@ class Repeat:
             steps = range(1, tube.horizon + 1 if slopes is None else len(slopes) + 1)
             directions = np.stack([np.asarray(self._directions(j)) for j in steps])
             given: Any = directions, tube.start, slopes
-            forms = _Unrolled(key, [unrolled(tube.loop, *part, *given) for part in parts])
+            forms = _Unrolled(
+                key, [unrolled(tube.loop, *part, *given, most=most) for part in parts]
+            )
         found = list[np.ndarray]()
         for _ in range(forms.taken, k):
             found = [np.asarray(next(each).offsets) for each in forms.parts]
@@ -178,7 +185,8 @@ class Repeat:
         """The proof over cells, each by forms and by what else is said of it."""
         axes = np.asarray(proof.axes).tolist()
         cells = from_tree(self._tube.sets[0], axes)
-        found = self._by_forms(k, axes, ((cell.part, cell.box) for cell in cells))
+        parts = ((cell.part, cell.box) for cell in cells)
+        found = self._by_forms(k, (proof.ways, *axes), parts, most=proof.ways)
         if not proof.proofs:
             return proof, found.max(axis=0)
         if len(proof.proofs) != len(cells):

@@ -126,7 +126,8 @@ class _Decisions(AbstractSearch):
     def question(self, asked: int, workers: int) -> Question | None:
         """Forms of many cells, of one, or what programs say of one that is not halved any more."""
         while (self._open or self._left_over) and not self._budget.overdue:
-            if not self._left_over and len(self._open) >= TOGETHER and not self._budget.late:
+            many = len(self._open) >= TOGETHER and not self._task.loop.jumps
+            if not self._left_over and many and not self._budget.late:
                 some = [self._open.popleft() for _ in range(TOGETHER)]
                 given = self._task, [node.ends for node in some], self._budget
                 return Question(some, sifted, given)
@@ -249,9 +250,10 @@ class _Decisions(AbstractSearch):
                 self.findings.prove(item, least, True)
             else:
                 self.findings.bound(item, least)
+        decisions = tuple(decision for _, outcome in found for decision in outcome.open)
         asked = Asked(self._loop, self._X0, task.horizon, task.start, task.required)
         more = {"asked": asked, "grounds": self._grounds() if proved else None}
-        return self.findings.verdict(cells=cells, **more)
+        return self.findings.verdict(cells=cells, decisions=decisions, **more)
 
     def _grounds(self) -> Grounds:
         """What proves every cell anew."""

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.loops.units import UnboundedError
+from reachjax.methods.cells import WAYS
 from reachjax.methods.ladder import WORK, Ladder
 from reachjax.methods.steps import boxed
 from reachjax.numerics.budget import Budget
@@ -25,7 +26,7 @@ from reachjax.proofs.branches import Branches
 from reachjax.sets import AbstractSet
 from reachjax.sets.balance import balanced
 from reachjax.verdicts.grounds import Leaves
-from reachjax.verdicts.sieve import Margins, Outcome, Unbounded, no_margins
+from reachjax.verdicts.sieve import Margins, Outcome, Sieve, Unbounded, no_margins
 from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.targets import target_of, values_of
 
@@ -53,6 +54,11 @@ class CellTask(NamedTuple):
         layers = self.loop.unit_layers
         return self.nodes > 0 and not all(each.unit.curved for each in layers)
 
+    @property
+    def follows(self) -> bool:
+        """Whether forms along the ways of decisions may prove what forms do not."""
+        return self.loop.curved and self.loop.jumps and not self.by_programs
+
 
 @lenient
 def outcome_of(
@@ -76,6 +82,10 @@ def outcome_of(
     margins = {name: row.copy() for name, row in begun.items()}
     with jax.enable_x64(True):
         try:
+            if task.follows and not any(broken):
+                sieve = Sieve(task.loop, task.horizon, task.start, task.required)
+                around = jax.device_get(boxed(jax.device_put(part), "X0"))
+                return sieve.followed(part, around, WAYS, budget)
             return _climbed(task, part, budget, margins, known is not None, broken)
         except UnboundedError as error:
             return Outcome(False, margins, unbounded=Unbounded.of(error))

@@ -13,6 +13,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.batches import PARTS
 from reachjax.loops.closed_loop import Scenario
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
@@ -83,8 +84,28 @@ def counterexample(
             plant: Any = on_host.plant
             instant = (item.time - 1 + part) * float(plant.period) if plant.continuous else None
             enclosed = {"lower": lower, "upper": upper, "region": item.ball or item.region}
-            return Counterexample(*parts, disturbances=w, noises=v, instant=instant, **enclosed)
+            closest = closest_decision(on_host, states[: item.time + 1], drawn, start)
+            more = {"instant": instant, "decision": closest} | enclosed
+            return Counterexample(*parts, disturbances=w, noises=v, **more)
     return None
+
+
+def closest_decision(
+    loop: ClosedLoop, states: Float[np.ndarray, "t n_x"], scenario: Scenario, start: int
+) -> float | None:
+    """How far from zero what is compared on a trajectory is at least; None if nothing jumps."""
+    (_, w, v), found = scenario, list[float]()
+
+    def apply(unit: Any, *y: Any) -> Any:
+        if isinstance(unit, AbstractUnit) and unit.jumps:
+            found.append(unit.distance(*y))
+        return unit(*y)
+
+    if loop.jumps:
+        for t, x in enumerate(states[:-1]):
+            push, noise = (None if part is None else part[t] for part in (w, v))
+            loop.step(x, start + t, apply, push, noise)
+    return min(found, default=None)
 
 
 def broken_at(
@@ -111,7 +132,7 @@ def broken_at(
     t, before = item.time - 1, reached[-2]
     drawn = [None if each is None else each[t] for each in scenario[1:]]
     for part in PARTS:
-        shorter = in_numpy(loop.replace(plant=plant.replace(period=part * plant.period)))
+        shorter = in_numpy(loop.replace(plant=plant.shortened(part)))
         there = successor_box(shorter, before, start + t, *drawn)
         if most_room(item, there) < 0:
             return part, there
@@ -134,16 +155,24 @@ def deviates(
     """Whether a simulated trajectory leaves the enclosure of a step by more than rounding.
 
     Each step is enclosed from the state that was simulated, so that nothing adds up. Then what was
-    simulated is another loop than what is bounded.
+    simulated is another loop than what is bounded. What is integrated is beside the flow by more
+    than rounding: by about as much as it is beside what twice as many steps say.
     """
     loop, (_, w, v) = in_numpy(loop), scenario
+    plant: Any = loop.plant
+    finer = in_numpy(loop.replace(plant=plant.finer)) if plant.continuous else None
     for t, (x, following) in enumerate(itertools.pairwise(states)):
-        drawn = (None if part is None else part[t] for part in (w, v))
+        drawn = [None if part is None else part[t] for part in (w, v)]
         reached = successor_box(loop, Box(x, x), start + t, *drawn)
         lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
         with np.errstate(over="ignore", invalid="ignore"):
             beyond = np.maximum(lower - following, following - upper)
             slack = TOLERATED * (upper - lower + np.spacing(abs(following)))
+            if finer is not None:
+                one, other = (
+                    each.step(x, start + t, w=drawn[0], v=drawn[1]) for each in (loop, finer)
+                )
+                slack = slack + TOLERATED * np.nan_to_num(abs(other - one), nan=np.inf)
         if np.any(beyond > slack):
             return True
     return False

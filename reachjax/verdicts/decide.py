@@ -10,9 +10,11 @@ until it is decided. Between its forms and its programs a smooth loop is halved 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -21,7 +23,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.loops.units import UnboundedError
 from reachjax.methods.cell_tree import CellTree
-from reachjax.methods.cells import affordable
+from reachjax.methods.cells import WAYS, affordable
 from reachjax.methods.ladder import WORK, Ladder, StepBounds
 from reachjax.methods.propagation import (
     Progress,
@@ -43,12 +45,14 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
+from reachjax.programs.followed import OpenDecision, open_decisions
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet
 from reachjax.verdicts.cell_decisions import decided_by_cells
 from reachjax.verdicts.cell_tasks import CellTask
+from reachjax.verdicts.closing import closed
 from reachjax.verdicts.findings import Findings
 from reachjax.verdicts.grounds import Asked, ClimbRecord, Grounds
 from reachjax.verdicts.soundness import compiled_runs, require_unbroken, worst_of
@@ -69,6 +73,15 @@ FIRST_PROGRAMS = 50
 FOR_CELLS = 0.5
 """The part of its time that a smooth loop's cells get, by forms; the rest is for programs over the
 whole set, which close what cells do not where much is switched and little is smooth."""
+
+TO_CLOSE = 50
+"""Linear programs that a bound may take from a set that shall be come back to: there are others."""
+
+HALVES = 16
+"""So many cells such a set may be halved into."""
+
+FEW = 200
+"""So many trajectories are simulated from such a set."""
 
 PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
 """How far an initial state is brought towards the middle of the set, so that it surely is in it."""
@@ -123,7 +136,9 @@ def decide(
 
     Returns:
         The verdict, with a certificate of each requirement that is proved after the first time, or
-        with what is known of each cell.
+        with what is known of each cell. Of a long horizon whose states come into a set that they
+        come back to, its `recurrence` says where; later times have no certificates of their own,
+        and what is required at the last of them holds for ever.
 
     Raises:
         Interrupted: Ctrl-C; its `found` is the verdict so far.
@@ -156,23 +171,89 @@ def decide(
     whole_number("seed", seed, 0)
     budget, (loop, X0) = Budget.of(time_limit), known_numbers("decide", loop, X0, "X0")
     required = requirements(loop.states, horizon, goal, avoid, safe, period_of(loop))
-    simulations = simulations_from(loop, X0, horizon, start, samples, seed)
     if cells is not None:
-        parts = CellTree.over(X0, cells)
-        counts = () if isinstance(cells, int | np.integer) else tuple(map(int, cells))
+        CellTree.over(X0, cells)  # its errors come first
         require_executor(executor)
         require_bar(progress)
-        task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
-        given = task, X0, parts, simulations, budget, executor, progress
-        return decided_by_cells(*given, counts=counts)
-    decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
-    try:
-        return _by_remedies(decision, loop, X0, horizon, start, required, relaxation, budget)
-    except Interrupted:
-        raise
-    except KeyboardInterrupt:
-        message = "interrupted: this exception's `found` is the verdict so far"
-        raise Interrupted(message, decision.verdict()) from None
+    asked = _Asked(loop, start, relaxation, samples, seed)
+    return asked.decided(X0, horizon, required, budget, cells, executor, progress)
+
+
+class _Asked(NamedTuple):
+    """What is the same for all sets from which requirements are decided.
+
+    Attributes:
+        loop: the closed loop.
+        start: the time of the sets, in a loop that varies in time.
+        relaxation: how many linear programs a bound may take.
+        samples: how many trajectories are simulated.
+        seed: of these.
+    """
+
+    loop: ClosedLoop
+    start: int
+    relaxation: BranchAndCut
+    samples: int
+    seed: int
+
+    def decided(
+        self,
+        X0: AbstractSet,
+        horizon: int,
+        required: list[Requirement],
+        budget: Budget,
+        cells: int | Sequence[int] | None = None,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+    ) -> Verdict:
+        """The verdict, by a set that later states come into where that is proved."""
+        drawn = X0, horizon, self.start, self.samples, self.seed
+        simulations = simulations_from(self.loop, *drawn)
+        by = {"cells": cells, "executor": executor, "progress": progress}
+
+        def first(X: AbstractSet, steps: int, some: list[Requirement], share: Budget) -> Verdict:
+            begun = simulations_from(self.loop, X, steps, *drawn[2:])
+            return self._to_the_end(X, steps, some, share, begun, **by)
+
+        if simulations is not None:
+            given = self.loop, X0, horizon, self.start, required, simulations
+            few = self.relaxation
+            few = dataclasses.replace(
+                few, nodes=min(few.nodes, TO_CLOSE), cells=min(few.cells, HALVES)
+            )
+            later = self._replace(relaxation=few, samples=min(self.samples, FEW)).decided
+            found = closed(*given, first, later, cells is not None, budget)
+            if found is not None:
+                return found
+        return self._to_the_end(X0, horizon, required, budget, simulations, **by)
+
+    def _to_the_end(
+        self,
+        X0: AbstractSet,
+        horizon: int,
+        required: list[Requirement],
+        budget: Budget,
+        simulations: Simulations | None,
+        cells: int | Sequence[int] | None = None,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+    ) -> Verdict:
+        """The verdict step by step until the horizon."""
+        loop, start, relaxation = self.loop, self.start, self.relaxation
+        if cells is not None:
+            parts = CellTree.over(X0, cells)
+            counts = () if isinstance(cells, int | np.integer) else tuple(map(int, cells))
+            task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
+            given = task, X0, parts, simulations, budget, executor, progress
+            return decided_by_cells(*given, counts=counts)
+        decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
+        try:
+            return _by_remedies(decision, loop, X0, horizon, start, required, relaxation, budget)
+        except Interrupted:
+            raise
+        except KeyboardInterrupt:
+            message = "interrupted: this exception's `found` is the verdict so far"
+            raise Interrupted(message, decision.verdict()) from None
 
 
 def _by_remedies(
@@ -204,7 +285,8 @@ def _by_remedies(
 
     by_cells, most = None, 1
     if loop.curved:
-        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / 2))
+        each = 2 * WAYS if loop.jumps else 2
+        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / each))
     if most > 1:
         with contextlib.suppress(UnboundedError):  # of halves there may be bounds
             climb(0)
@@ -260,6 +342,7 @@ class _Decision:
         self._climbs = list[ClimbRecord]()
         self._asked = Asked(loop, X0, horizon, start, tuple(required))
         self._ends: dict[tuple[str, int], np.ndarray] = {}
+        self._decisions: tuple[OpenDecision, ...] = ()
         self.simulations = simulations
         if simulations is not None:
             self._findings.simulate(simulations.runs)
@@ -279,7 +362,8 @@ class _Decision:
         ends = Counter(SolverStatus(int(code)) for codes in self._ends.values() for code in codes)
         climbs = tuple(each.climb for each in self._climbs if each.climb is not None)
         more = {"asked": self._asked, "grounds": Grounds(climbs=(climbs,))}
-        return self._findings.verdict(dict(ends), certificates=self._certificates, **more)
+        more |= {"certificates": self._certificates, "decisions": self._decisions}
+        return self._findings.verdict(dict(ends), **more)
 
     def _require_unbroken(self) -> None:
         """Raise an error if a trajectory, as JAX runs it, breaks what is proved."""
@@ -307,9 +391,11 @@ class _Decision:
         """
         last = max(time for _, time in self._findings.open)
         self._climbs.append(ClimbRecord())
+        self._decisions = ()
         for k in range(1, last + 1):
             ladder.advance(tighten)
             self._climbs[-1].advanced(ladder.horizon.tightened)
+            self._decisions += open_decisions(ladder.horizon.steps[-1], self._start + k - 1)
             if self._budget.overdue:
                 return
             for key, item in list(self._findings.open.items()):

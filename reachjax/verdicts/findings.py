@@ -25,6 +25,29 @@ from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.verdict import Counterexample, Verdict, VerdictStatus
 
 
+def rooms_of(
+    loop: ClosedLoop, item: Requirement, runs: Runs, start: int
+) -> Float[np.ndarray, " c"]:
+    """How far each trajectory is on the right side, in between samples too if that is meant.
+
+    Args:
+        loop: of numpy arrays.
+        item: what is required.
+        runs: trajectories.
+        start: the time of their initial states.
+    """
+    rooms, t = item.simulated(runs.states), item.time - 1
+    if not item.throughout:
+        return rooms
+    _, *drawn = loop.split(runs.scenarios)
+    at = [None if part is None else np.asarray(part[:, t]) for part in drawn]
+    ends = runs.states[:, t], runs.states[:, t + 1]
+    with np.errstate(all="ignore"):
+        dense = in_between(loop, *ends, start + t, *at)
+    inner = dataclasses.replace(item, time=0).simulated(dense.reshape(-1, 1, dense.shape[-1]))
+    return np.fmin.reduce([rooms, *inner.reshape(len(dense), -1)])
+
+
 class Findings:
     """What is proved and simulated of each requirement so far.
 
@@ -98,23 +121,13 @@ class Findings:
             return
         found = []
         for item in self._required if items is None else items:
-            rooms, row = self._rooms(item, runs), self._simulated[item.name]
+            rooms, row = (
+                rooms_of(self._on_host, item, runs, self._start),
+                self._simulated[item.name],
+            )
             row[item.time] = np.fmin(row[item.time], rooms.min())
             found += suspects(item, rooms, runs)
         self.example = self.example or counterexample(self._loop, self._X0, found, self._start)
-
-    def _rooms(self, item: Requirement, runs: Runs) -> Float[np.ndarray, " c"]:
-        """How far each trajectory is on the right side, in between samples too if that is meant."""
-        rooms, t = item.simulated(runs.states), item.time - 1
-        if not item.throughout:
-            return rooms
-        _, *drawn = self._loop.split(runs.scenarios)
-        at = [None if part is None else np.asarray(part[:, t]) for part in drawn]
-        ends = runs.states[:, t], runs.states[:, t + 1]
-        with np.errstate(all="ignore"):
-            dense = in_between(self._on_host, *ends, self._start + t, *at)
-        here = dataclasses.replace(item, time=0)
-        return np.fmin.reduce([rooms, *(here.simulated(states[:, None]) for states in dense)])
 
     def verdict(self, ends: Mapping[Any, int] | None = None, **more: Any) -> Verdict:
         """The verdict from everything proved and simulated so far.

@@ -21,12 +21,14 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.methods.witnesses import initial_states
 from reachjax.numerics.budget import Budget, Interrupted
+from reachjax.numerics.host import in_numpy
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.sets import AbstractSet, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope
 from reachjax.tubes.reach import ReachTube
 from reachjax.verdicts.counterexamples import SUSPECTS, counterexample, suspects
 from reachjax.verdicts.decide import decide
+from reachjax.verdicts.findings import rooms_of
 from reachjax.verdicts.recurrent_sets import (
     TRAJECTORIES,
     Candidate,
@@ -35,7 +37,7 @@ from reachjax.verdicts.recurrent_sets import (
     within,
 )
 from reachjax.verdicts.soundness import Claim, compiled_runs, require_unbroken, worst_of
-from reachjax.verdicts.specification import AvoidSets, Region, requirements
+from reachjax.verdicts.specification import AvoidSets, Region, Requirement, period_of, requirements
 from reachjax.verdicts.verdict import Counterexample, Recurrence, Verdict, VerdictStatus
 
 LONG = 500
@@ -90,11 +92,9 @@ def for_ever(
         UnsoundError: a trajectory breaks what is proved.
     """
     loop, start = tubes[0].loop, tubes[0].start
-    if loop.steps is not None:
-        raise ValueError(
-            f"forever=True is of loops that do not vary in time, but this one is given for "
-            f"{loop.steps} time steps"
-        )
+    if loop.varies:
+        this = f"is given for {loop.steps} time steps" if loop.steps else "has a clock"
+        raise ValueError(f"forever=True is of loops that do not vary in time, but this one {this}")
     if isinstance(avoid, Mapping):
         raise ValueError("with forever=True avoid must be a sequence of sets, for all times")
     if safe is None and not avoid:
@@ -145,14 +145,16 @@ def _broken_later(
     """
     tried = 0
     size = (runs.scenarios.shape[1] - loop.states) // LONG
-    for item in requirements(loop.states, LONG, None, wanted.avoid or None, wanted.safe):
+    on_host = in_numpy(loop)
+    for item in _for_long(loop, wanted):
         if budget.late:
             return None
         until = runs.states[:, : item.time + 1]
         some = Runs(runs.scenarios, until).some(np.isfinite(until).all(axis=(1, 2)))
         if len(some.states):
             begun = some.scenarios[:, : loop.states + item.time * size]
-            found = suspects(item, item.simulated(some.states), Runs(begun, some.states))
+            cut = Runs(begun, some.states)
+            found = suspects(item, rooms_of(on_host, item, cut, start), cut)
             example = counterexample(loop, X0, found, start)
             tried += len(found)
             if example is not None or tried > SUSPECTS:
@@ -160,11 +162,17 @@ def _broken_later(
     return None
 
 
+def _for_long(loop: ClosedLoop, wanted: Wanted) -> list[Requirement]:
+    """What is wanted at all times of long simulations."""
+    given = None, wanted.avoid or None, wanted.safe
+    return requirements(loop.states, LONG, *given, period_of(loop))
+
+
 def _require_unbroken(
     loop: ClosedLoop, X0: AbstractSet, wanted: Wanted, runs: Runs, start: int
 ) -> None:
     """Raise an error if a trajectory, as JAX runs it, breaks what is proved for all time."""
-    items = requirements(loop.states, LONG, None, wanted.avoid or None, wanted.safe)
+    items = _for_long(loop, wanted)
     scenarios = Scenarios.of(loop, X0, LONG, start)
     rows = worst_of(runs.some(np.isfinite(runs.states).all(axis=(1, 2))), items)
     long_runs = compiled_runs(loop, scenarios, rows, start)

@@ -37,7 +37,14 @@ from reachjax.programs.relaxations import BranchAndCut
 from reachjax.programs.unrolled import unrolled
 from reachjax.sets import Box, Ellipsoid
 from reachjax.verdicts.decide import decide
-from reachjax.verdicts.specification import AvoidSets, Region, Requirement, Timed, requirements
+from reachjax.verdicts.specification import (
+    AvoidSets,
+    Region,
+    Requirement,
+    Timed,
+    period_of,
+    requirements,
+)
 from reachjax.verdicts.verdict import Verdict, VerdictStatus
 
 Kind = Box | Ellipsoid
@@ -256,7 +263,7 @@ def largest_set(
     loop.check_horizon(horizon, start)
     require_bar(progress)
     loop, X0 = known_numbers("largest_set", loop, X0, "X0")
-    required = requirements(loop.states, horizon, goal, avoid, safe)
+    required = requirements(loop.states, horizon, goal, avoid, safe, period_of(loop))
 
     def decided(region: Kind) -> Verdict:
         limits = {
@@ -405,21 +412,25 @@ def _margins(
     rows = [C / norms[:, None] for C, _, norms in facets] + [np.eye(loop.states)]
     directions = np.unique(np.concatenate([*rows, *(-each for each in rows)]), axis=0)
     on_host, rows_of = in_numpy(loop), np.tile(directions, (horizon, 1, 1))
+    between = any(item.throughout for item in required)
 
     def margins(shape: Shape) -> Float[np.ndarray, " r"]:
         try:
             region = in_numpy(shape.set())
-            steps = unrolled(on_host, region, in_numpy(region.bounding_box()), rows_of, start)
+            box = in_numpy(region.bounding_box())
+            steps = [*unrolled(on_host, region, box, rows_of, start, between=between)]
             offsets = [shape.support(directions), *(step.offsets for step in steps)]
+            spans = [offsets[0], *(step.between for step in steps)]
         except ValueError:  # a unit has no bounds, or there is no set
             return np.full(1, -np.inf)
         found = []
         for item, (C, d, norms) in zip(required, facets, strict=True):
             rows, limits = C / norms[:, None], d / norms
+            known: Any = (spans if item.throughout else offsets)[item.time]
             if item.inside:
-                found.append(limits - offsets[item.time][_places(directions, rows)])
+                found.append(limits - known[_places(directions, rows)])
             else:
-                room = -offsets[item.time][_places(directions, -rows)] - limits
+                room = -known[_places(directions, -rows)] - limits
                 found.append(np.max(room, keepdims=True))
         return np.concatenate(found)
 

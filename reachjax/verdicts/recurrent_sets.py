@@ -73,25 +73,47 @@ def candidate_sets(
     runs = runs[np.isfinite(runs).all(axis=(1, 2))]
     if not len(runs):
         return
-    center = runs[:, -1].mean(axis=0)
-    scale = np.ptp(runs, axis=(0, 1))
-    scale = np.where(scale > 0, scale, max(scale.max(), 1e-9))
+    own = tubes[0].template.at(horizon)
     step = horizon
     while step <= runs.shape[1] // 2:
-        for directions in _directions(tubes[0], loop, center):
-            normals = directions / (abs(directions) @ scale)[:, None]
-            radii = WIDER * abs((runs[:, step:] - center) @ normals.T).max(axis=(0, 1))
-            if step == horizon:
-                ends = [
-                    np.asarray(tube.sets[-1].bounds_along(jnp.asarray(normals))) for tube in tubes
-                ]
-                radii = np.maximum(radii, WIDER * (np.max(ends, axis=0) - normals @ center))
-            radii = np.maximum(radii, FLATTEST * radii.max())
-            if radii.max() > 0:
-                region = _safe_part(_region(normals, center, radii), safe)
-                if region is not None:
-                    yield Candidate(step, region, normals, center, radii)
+        last = [tube.sets[-1] for tube in tubes] if step == horizon else []
+        template = own if isinstance(own, Template) else None
+        for candidate in sets_around(loop, runs, step, WIDER, template, last):
+            region = _safe_part(candidate.region, safe)
+            if region is not None:
+                yield candidate._replace(region=region)
         step *= 2
+
+
+def sets_around(
+    loop: ClosedLoop,
+    runs: Float[np.ndarray, "c T n"],
+    step: int,
+    wider: float,
+    template: Template | None = None,
+    sets: Sequence[AbstractSet] = (),
+) -> Iterator[Candidate]:
+    """Sets around where trajectories end that hold what comes from a step on.
+
+    Args:
+        loop: the closed loop.
+        runs: trajectories.
+        step: from which on they are looked at.
+        wider: by how much the sets are larger.
+        template: directions to be tried after the modes of the loop; None for the axes.
+        sets: what else they shall hold.
+    """
+    center, scale = runs[:, -1].mean(axis=0), np.ptp(runs, axis=(0, 1))
+    scale = np.where(scale > 0, scale, max(scale.max(), 1e-9))
+    for directions in _directions(template or Template.box(loop.states), loop, center):
+        normals = directions / (abs(directions) @ scale)[:, None]
+        radii = wider * abs((runs[:, step:] - center) @ normals.T).max(axis=(0, 1))
+        for each in sets:
+            ends = np.asarray(each.bounds_along(jnp.asarray(normals)))
+            radii = np.maximum(radii, wider * (ends - normals @ center))
+        radii = np.maximum(radii, FLATTEST * radii.max())
+        if radii.max() > 0:
+            yield Candidate(step, _region(normals, center, radii), normals, center, radii)
 
 
 def _region(
@@ -127,9 +149,9 @@ def _safe_part(region: PolyhedralSet, safe: PolyhedralSet | None) -> PolyhedralS
 
 
 def _directions(
-    tube: ReachTube, loop: ClosedLoop, center: Float[np.ndarray, " n"]
+    template: Template, loop: ClosedLoop, center: Float[np.ndarray, " n"]
 ) -> Iterator[Float[np.ndarray, "m n"]]:
-    """Normals along the modes of the loop at a point, then those of the tube."""
+    """Normals along the modes of the loop at a point, then those of a template."""
     jacobian = _jacobian(loop, center)
     if np.isfinite(jacobian).all():
         values, vectors = np.linalg.eig(jacobian.T)
@@ -139,8 +161,7 @@ def _directions(
         modes = np.concatenate([real, pairs.reshape(-1, len(jacobian))])
         if np.linalg.matrix_rank(modes, 1e-6) == len(jacobian):
             yield np.concatenate([modes, -modes])
-    own = tube.template.at(tube.horizon).alone or Template.box(loop.states)
-    yield np.asarray(own.directions)
+    yield np.asarray(template.directions)
 
 
 def _jacobian(loop: ClosedLoop, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:

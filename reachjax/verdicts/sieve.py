@@ -7,6 +7,7 @@ are left over are for whoever can do more: linear programs, or halving them.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -22,8 +23,9 @@ from reachjax.numerics.budget import Budget
 from reachjax.numerics.compilations import CompiledBeside
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import gamma
-from reachjax.programs.unrolled import unrolled, unrolled_from_boxes
-from reachjax.sets import Box
+from reachjax.programs.followed import OpenDecision
+from reachjax.programs.unrolled import ByForms, along_ways, unrolled, unrolled_from_boxes
+from reachjax.sets import AbstractSet, Box
 from reachjax.sets.balance import balanced
 from reachjax.verdicts.grounds import Leaves
 from reachjax.verdicts.specification import Requirement
@@ -80,6 +82,7 @@ class Outcome(NamedTuple):
         axis: along which it should be halved; -1 where nothing says that.
         unbounded: the unit that has no bounds over it, if there is one.
         leaves: of requirements that forms alone do not prove.
+        open: decisions that may go either way from it, as far as that was looked at.
     """
 
     proved: bool
@@ -88,6 +91,7 @@ class Outcome(NamedTuple):
     axis: int = -1
     unbounded: Unbounded | None = None
     leaves: tuple[Leaves, ...] = ()
+    open: tuple[OpenDecision, ...] = ()
 
     @property
     def margin(self) -> float:
@@ -215,6 +219,45 @@ class Sieve:
         bounds = np.concatenate([first[:, None], bounds], axis=1)
         with np.errstate(invalid="ignore"):
             return [self._judged(uppers) for uppers in bounds[: len(cells)]]
+
+    def followed(self, part: AbstractSet, box: Box, most: int, budget: Budget) -> Outcome:
+        """What is found of one cell along all ways of its decisions, on the host.
+
+        It ends with the first step at which a requirement is not proved.
+
+        Args:
+            part: the cell.
+            box: around it.
+            most: along how many ways.
+            budget: of the whole call.
+
+        Raises:
+            UnboundedError: a unit has no bounds over it.
+        """
+        items, horizon = [rows.item for rows in self._rows], len(self._directions) - 1
+        margins, still_open = no_margins(items, horizon), dict[OpenDecision, None]()
+        first = ByForms(_at_first(self._directions[0], box.lower[None], box.upper[None])[0], (), ())
+        between = self._whole is not None
+        whole = np.asarray(self._whole) if between else np.zeros(self._later.shape[:2], bool)
+        given = self._on_host, part, box, self._directions[1:], self._start
+        later = along_ways(*given, between=between, most=most)
+        for k, each in enumerate(itertools.chain([[first]], later)):
+            still_open |= dict.fromkeys(decision for one in each for decision in one.open)
+            uppers = [one.offsets for one in each]
+            if between and k:
+                both = zip((one.between for one in each), uppers, strict=True)
+                uppers = [np.where(whole[k - 1], *pair) for pair in both]
+            uppers = [upper for upper in uppers if not np.isneginf(upper).all()]  # no states
+            for rows in self._rows:
+                if rows.item.time == k:
+                    found = [rows.judged(upper) for upper in uppers]
+                    least = min((margin for *_, margin in found), default=np.inf)
+                    margins[rows.item.name][k] = least
+                    if not all(holds for holds, *_ in found):
+                        return Outcome(False, margins, open=tuple(still_open))
+            if budget.overdue:
+                return Outcome(False, margins, open=tuple(still_open))
+        return Outcome(True, margins)
 
     def _judged(self, uppers: Float[np.ndarray, "h+1 m"]) -> Outcome:
         """What bounds say of one cell."""

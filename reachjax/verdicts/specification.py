@@ -202,6 +202,7 @@ class Requirement:
         inside: whether states must be in it, or out of it.
         ball: the ellipsoid; None of other sets.
         throughout: whether it is meant at all times since the sample before.
+        units: the facets of the set in units, once they were asked for; of all times together.
     """
 
     name: str
@@ -210,6 +211,7 @@ class Requirement:
     inside: bool
     ball: Ellipsoid | None = None
     throughout: bool = False
+    units: list[Any] = dataclasses.field(default_factory=list, compare=False, repr=False)
 
     @property
     def span(self) -> Span:
@@ -248,11 +250,17 @@ class Requirement:
         if self.ball is not None:
             depth = _depths(self.ball, trajectories[:, self.time])
             return depth if self.inside else -depth
-        C, d, norms = (np.asarray(part) for part in self.region.facets_in_units())
+        C, d, norms = self._in_units()
         with np.errstate(over="ignore", invalid="ignore"):
             room = (d - trajectories[:, self.time] @ C.T) / norms
         depth = room.min(axis=1)
         return depth if self.inside else -depth
+
+    def _in_units(self) -> list[np.ndarray]:
+        """The facets of the set, as trajectories are compared with them."""
+        if not self.units or self.units[0] is not self.region:
+            self.units[:] = self.region, *map(np.asarray, self.region.facets_in_units())
+        return self.units[1:]
 
     def proved(self, compared: Compared) -> bool:
         """Whether every state surely is on the right side. Sets are closed: touching is inside.

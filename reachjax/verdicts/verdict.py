@@ -26,6 +26,7 @@ from reachjax.numerics.archives import writable
 from reachjax.numerics.checks import Numbers, require_kind, same_size
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.seals import Seal
+from reachjax.programs.followed import OpenDecision
 from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.proofs.proposal import AS_ASKED, SolverStatus
 from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
@@ -63,6 +64,8 @@ class Counterexample:
         lower: `(time + 1, n_x)`, the exact trajectory at samples is above, rounding accounted for,
         upper: `(time + 1, n_x)`, and below. In between samples the last row is of `instant`.
         region: the set that states must be in, or be out of.
+        decision: of a loop that jumps, by how much the closest of the decisions on the trajectory
+            wins up to `time`: the size of what is compared with zero, more than its rounding.
     """
 
     requirement: str
@@ -73,6 +76,7 @@ class Counterexample:
     disturbances: Float[np.ndarray, "h n_w"] | None = None
     noises: Float[np.ndarray, "h n_x"] | None = None
     instant: float | None = None
+    decision: float | None = None
     lower: Float[np.ndarray, "t n_x"] | None = None
     upper: Float[np.ndarray, "t n_x"] | None = None
     region: AbstractSet | None = None
@@ -217,6 +221,8 @@ class Verdict:
         recurrence: of a statement for all time, what it rests on, or what came nearest to that.
         asked: of a verdict without a tube, what it is about.
         grounds: of one that is proved without a tube, what proves it anew.
+        decisions: of a loop that jumps, those that may go either way over the initial set, or over
+            cells of it that are not proved.
     """
 
     status: VerdictStatus
@@ -229,6 +235,7 @@ class Verdict:
     recurrence: Recurrence | None = None
     asked: Asked | None = None
     grounds: Grounds | None = None
+    decisions: tuple[OpenDecision, ...] = ()
 
     @property
     def proved(self) -> bool:
@@ -325,6 +332,11 @@ class Verdict:
                 f"  counterexample: from {np.round(e.states[0], 4).tolist()} it breaks "
                 f"{e.requirement} at t = {e.time} by {e.violation:.4g}{_drawn(e)}"
             )
+            if e.decision is not None:
+                lines.append(f"    its closest decision wins by {e.decision:.3g}")
+        if self.decisions and self.unknown:
+            closest = max(self.decisions, key=lambda decision: decision.room)
+            lines.append(f"  {len(self.decisions)} decisions stay open; widest {closest}")
         if self.cells:
             counts = [sum(each.status is status for each in self.cells) for status in VerdictStatus]
             proved, refuted, unknown = counts

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.scenarios import Scenarios
+from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.methods.cell_tree import CellTree, Node
 from reachjax.methods.propagation import known_numbers
 from reachjax.methods.searches import AbstractSearch, Bar, Question
@@ -39,9 +39,10 @@ from reachjax.numerics.seals import seal_of
 from reachjax.programs.relaxations import BranchAndCut
 from reachjax.sets import Box
 from reachjax.verdicts.cell_tasks import CellTask, outcome_of
+from reachjax.verdicts.findings import rooms_of
 from reachjax.verdicts.sieve import TOGETHER, Ends, Outcome, Sieve
 from reachjax.verdicts.soundness import require_unbroken_cells
-from reachjax.verdicts.specification import AvoidSets, Region, Timed, requirements
+from reachjax.verdicts.specification import AvoidSets, Region, Timed, period_of, requirements
 from reachjax.verdicts.verdict import DecidedCell, VerdictStatus, WinningSet
 
 LAST_PROGRAMS = 10
@@ -156,11 +157,14 @@ def winning_set(
     most = whole_number("cells", cells, 1)
     require_executor(executor)
     require_bar(progress)
-    required = requirements(loop.states, horizon, goal, avoid, safe)
+    required = requirements(loop.states, horizon, goal, avoid, safe, period_of(loop))
     loop, domain = jax.device_get(known_numbers("winning_set", loop, domain, "domain"))
     task = CellTask(loop, horizon, start, tuple(required), relaxation.nodes)
     asked = {
-        f"{number}: {item.name}, {item.time}, {item.inside}": (item.region, item.ball)
+        f"{number}: {item.name}, {item.time}, {item.inside}{', since' * item.throughout}": (
+            item.region,
+            item.ball,
+        )
         for number, item in enumerate(required)
     }
     seal = seal_of(loop, domain, asked, start=start)
@@ -307,8 +311,8 @@ def _rooms(
     """How far trajectories are on the right side of each requirement; what overflows is not."""
     scenarios = Scenarios.of(task.loop, Box(*boxes[0]), task.horizon, task.start)
     drawn = scenarios.drawn(states, 0)
-    runs = scenarios.runs(task.loop, drawn, task.horizon, task.start)
-    rooms = np.stack([item.simulated(runs) for item in task.required])
+    runs = Runs(drawn, scenarios.runs(task.loop, drawn, task.horizon, task.start))
+    rooms = np.stack([rooms_of(task.loop, item, runs, task.start) for item in task.required])
     return np.where(np.isfinite(rooms), rooms, -np.inf)
 
 

@@ -34,6 +34,8 @@ JAX = SimpleNamespace(
     inverse=jnp.linalg.inv,
     table=lambda y: jnp.interp(y, jnp.array(PLACES), jnp.array(HEIGHTS)),
     constant=_sum_of_tenths,
+    above=lambda y: (y > 0).astype(float),
+    best=lambda scores, values: values[jnp.argmax(scores)],
 )
 
 
@@ -55,7 +57,14 @@ def _plain(m: Any, **functions: Any) -> SimpleNamespace:
         scaled = [r * t.numerator / t.denominator for r, t in zip(ramps, turns, strict=True)]
         return HEIGHTS[0] + sum(scaled)
 
+    def best(scores: Any, values: Any) -> Any:
+        """The value of the largest score, and of several the first one's."""
+        order = range(len(scores))
+        return values[next(k for k in order if all(scores[k] >= each for each in scores))]
+
     return SimpleNamespace(
+        above=lambda y: int(y > 0),
+        best=best,
         hypot=lambda a, b: m.sqrt(a * a + b * b),
         inverse=inverse,
         solve=lambda A, b: inverse(A) @ b,
@@ -98,6 +107,21 @@ def by_cases(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
     angle = f.arctan2(x[1] / 4, 3 + x[0] * x[0]) + f.hypot(x[0], x[1]) * a[0]
     waves = a[2] * f.erf(x[0]) + f.sinc(2 * x[1]) / 4
     return m.stack([x[0] + a[1] * f.table(x[1]) + angle, waves + u[0] * f.constant()])
+
+
+def switched(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
+    """A relay, friction, and one of three pushes: all are tied where `x[0]` is `at`."""
+    f, a, off = of(m), p["a"], x[0] - p["at"][0]
+    relay = a[0] * (2 * f.above(off) - 1)
+    pushed = f.best(m.stack([off, 0 * off, -off / 2]), a)
+    stuck = a[1] * (f.above(x[1]) - f.above(-x[1]))
+    return m.stack([x[0] + x[1] / 8 + relay / 4, x[1] - stuck / 8 + pushed / 4 + u[0] / 8])
+
+
+def switched_waves(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
+    """The same beside a sine, whose sign decides too."""
+    wave = m.sin(x[0])
+    return switched(m, x, u, w, p) + m.stack([0 * wave, wave * of(m).above(wave) / 4])
 
 
 def masses(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:

@@ -17,7 +17,7 @@ import mpmath
 import numpy as np
 
 import reachjax as rj
-from tests.campaign.functions import by_cases, masses
+from tests.campaign.functions import by_cases, masses, switched, switched_waves
 from tests.campaign.oracle import WIDE, Region, exact
 from tests.input_polytopes import exact_multipliers
 
@@ -132,6 +132,8 @@ class Kind:
         skips: whether the network is traced, with a connection that skips it.
         horizon: the number of steps.
         columns: what old columns of forms are merged into, from a box; 0 where that is not tried.
+        period: of a plant in continuous time, of which `step` is the field; 0 in discrete time.
+        jumps: whether decisions of the plant are tied in the middle of the initial box.
     """
 
     name: str
@@ -148,6 +150,8 @@ class Kind:
     skips: bool = False
     horizon: int = 2
     columns: int = 0
+    period: float = 0.0
+    jumps: bool = False
 
     @property
     def loop(self) -> tuple:
@@ -156,6 +160,7 @@ class Kind:
 
 
 BOXES, ROUND = ("box", "varying", "polytope"), ("ellipsoid", "box")
+EDGED = ("box", "flat", "point")
 OCTAGONAL, PAIRS = rj.Template.octagonal, rj.Template.regular
 
 KINDS = (
@@ -179,8 +184,35 @@ KINDS = (
     Kind("relu, round", affine, "relu", disturbed=ROUND, initial=("ellipsoid", "box"), horizon=3),
     Kind("by cases", by_cases, "tanh"),
     Kind("masses", masses, "relu", hidden=(4,)),
+    Kind("sine, sampled", sine, "tanh", horizon=3, period=0.0625),
+    Kind("products, sampled", products, "relu", disturbed=("box",), period=0.125),
+    Kind("quotients, sampled", quotients, "sigmoid", period=0.0625, noisy=True),
+    Kind("unicycle, sampled", unicycle, "relu", states=3, hidden=(4,), period=0.125),
+    Kind("switched", switched, "relu", initial=EDGED, template=OCTAGONAL, jumps=True),
+    Kind("switched waves", switched_waves, "tanh", initial=EDGED, jumps=True),
     Kind("tanh, to balls", affine, "tanh", template=lambda n: rj.EllipsoidTemplate(), horizon=1),
 )
+
+
+COLUMNS = 8
+"""Results that are extrapolated: of order 16."""
+
+
+def flowed(rate: Callable[[Any], Any], x: Any, h: float) -> Any:
+    """The solution of `x' = rate(x)` after a time, by midpoints, in the digits of `x`."""
+    rows: list[Any] = []
+    for row in range(COLUMNS):
+        count = 2 * (row + 1)
+        part = (0 * x[0] + h) / count
+        last, here = x, x + part * rate(x)
+        for _ in range(count - 1):
+            last, here = here, last + 2 * part * rate(here)
+        column = (last + here + part * rate(here)) / 2
+        for k in range(row):
+            own, other = count**2, (count - 2 * (k + 1)) ** 2
+            rows[k], column = column, (own * column - other * rows[k]) / (own - other)
+        rows.append(column)
+    return rows[-1]
 
 
 @dataclass(frozen=True)
@@ -252,7 +284,12 @@ class KindCase:
             seen = x if v is None else x + given(v[t])
             u = _network(m, seen, layers, self.kind)
             u = self._projected(u, given)
-            x = self.kind.step(m, x, u, None if w is None else given(w[t]), p)
+            pushed = None if w is None else given(w[t])
+
+            def step(x: Any, u: Any = u, pushed: Any = pushed) -> Any:
+                return self.kind.step(m, x, u, pushed, p)
+
+            x = flowed(step, x, self.kind.period) if self.kind.period else step(x)
             found.append(x)
         return np.stack(found)
 
@@ -354,6 +391,10 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
         p["A"] = np.eye(n) + rng.normal(size=(n, n)) * 10 ** rng.uniform(-2, 0)
         p["B"] = rng.normal(size=(n, n_u))
         p["E"] = rng.normal(size=(n, n_w))
+    region = str(rng.choice(kind.initial))
+    X0 = _initial(region, n, rng)
+    if kind.jumps:
+        p["at"] = np.array(X0.center[:1])
     W = _disturbances(kind, n_w, rng) if kind.disturbed else None
     noise = rj.Box(*_ends(rng, n, 0.02)) if kind.noisy else None
     inputs, allowed = _inputs(kind, rng)
@@ -367,15 +408,16 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
         plant: Any = rj.AffinePlant(p["A"], p["B"], E=p["E"] if W is not None else None)
     else:
         f = jax.tree_util.Partial(step, p)
-        plant = rj.NonlinearPlant(f, n, n_u, disturbances=n_w if W is not None else 0)
+        drawn_from = n_w if W is not None else 0
+        plant = rj.NonlinearPlant(f, n, n_u, disturbances=drawn_from)
+        if kind.period:
+            plant = rj.SampledPlant(f, n, n_u, kind.period, disturbances=drawn_from, held=True)
     loop = rj.ClosedLoop(plant, net, allowed, disturbance=W, noise=noise)
-    region = str(rng.choice(kind.initial))
-    X0 = _initial(region, n, rng)
     gap = float(rng.choice([1e-4, 1e-2, 0.1]))
     relaxation: Any = rj.BranchAndCut(nodes=int(rng.choice([0, 3, 40])))
     if rng.random() < 0.25:
         relaxation = rj.LinearBounds()
-    elif rng.random() < 0.1 and kind.disturbed != ROUND:
+    elif rng.random() < 0.1 and kind.disturbed != ROUND and not kind.period:
         relaxation = rj.LocalBounds()
     window = None
     if "balls" in kind.name:

@@ -94,6 +94,10 @@ def _scenarios(case: KindCase, tube: rj.ReachTube, proofs: list) -> list[Scenari
     states = np.asarray(case.X0.sample(jax.random.key(case.number), DRAWS))
     if isinstance(case.X0, rj.Box):
         states = np.concatenate([states, np.asarray(case.X0.corners())])
+    if case.kind.jumps:  # where decisions are tied, exactly
+        tied = states.copy()
+        tied[:, 0] = case.parameters["at"]
+        states = np.concatenate([states, tied])
     surface = case.X0.sample_boundary(jax.random.key(case.number), DRAWS)
     if surface is not None:
         states = np.concatenate([states, np.asarray(surface)])

@@ -1,1 +1,1 @@
-"""What the library says of some ninety drawn cases, kept bit for bit, and compared."""
+"""What the library says of some hundred drawn cases, kept bit for bit, and compared."""

@@ -1,4 +1,6 @@
-"""The cases: two of each architecture of the campaign, with a real solver and no limit of time."""
+"""The cases: two of each architecture of the campaign, with a real solver and no limit of time,
+and rows of the table of laws, for the kinds of loops and methods that the campaign does not draw.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -9,6 +11,7 @@ import numpy as np
 import reachjax as rj
 from tests.campaign import cases, kinds
 from tests.campaign.architectures import BLOCK, EVERY
+from tests.cases import HORIZON, Case
 
 EACH = 2
 """So many cases of an architecture; the first of them is differentiated, too."""
@@ -25,8 +28,18 @@ KEPT = (
     "leaky, traced 951",
     "relu, round 1051",
     "linear, octagonal 301",
+    "argmax; forms",
+    "friction; forms",
+    "sampled; forms",
 )
 """Cases of which nothing is compiled: what is said of them is kept beside the tests."""
+
+ROWS = (
+    *(Case(loop, "forms") for loop in ("argmax", "friction", "sampled", "sampled, pushed")),
+    *(Case(loop) for loop in ("relay", "bang-bang", "oscillator, hard", "sampled, affine")),
+    *(Case("sine", f"cells of {inner}") for inner in ("forms", "branches", "programs")),
+)
+"""Jumps, differential equations, products of signals, and cells of every method."""
 
 DRAWS = 60
 ROOM = 0.05
@@ -67,6 +80,9 @@ def every() -> Iterator[Golden]:
         some = (_of_kind if isinstance(shapes, kinds.Kind) else _of_chain)(numbers, shapes)
         for count, each in zip(range(EACH), some, strict=False):
             yield replace(each, differentiated=count == 0)
+    for row in ROWS:
+        parts = {"loop": row.closed_loop, "X0": row.X0, "template": row.shape}
+        yield Golden(row.name, parts, HORIZON, row.of.start, row.options, row.method == "forms")
 
 
 def _of_chain(numbers: range, shapes: Any) -> Iterator[Golden]:

@@ -11,7 +11,7 @@ import reachjax as rj
 from reachjax.programs.bounds import loop_bounds
 from tests.activations import ACTIVATIONS, CONTROLLERS, NAMES, controlled
 from tests.closed_loops import step_program
-from tests.networks import box_region, directions
+from tests.networks import box_region
 from tests.quick_cases import some
 
 STATES = [1, 2, 3, 6]
@@ -119,79 +119,6 @@ def test_units_that_are_affine_leave_the_basis_and_the_set_is_then_exact(options
     assert int(np.sum(certificate.program.used)) == 3  # two states and the constant
     ends = case.successors(np.asarray(X.vertices())) @ np.asarray(following.A).T
     np.testing.assert_allclose(following.b, ends.max(axis=0), atol=1e-12)
-
-
-@pytest.fixture(scope="module", params=range(len(CONTROLLERS)), ids=NAMES)
-def tube_of(request):
-    """A loop and its tube of two steps in default settings."""
-    case = controlled(n_x=2, seed=3, **CONTROLLERS[request.param])
-    return case, rj.reach(case.loop, initial_box(2), 2, rj.Template.octagonal(2))
-
-
-def test_sets_hold_every_sample_and_are_as_tight_as_witnesses_show(tube_of):
-    case, tube = tube_of
-    x = samples(tube.sets[0], 20_000)
-    for t in (1, 2):
-        x = case.successors(x)
-        reached = (x @ np.asarray(tube.sets[t].A).T).max(axis=0)
-        bounds = np.asarray(tube.proof(t).bounds)
-        assert np.all(reached <= bounds + 1e-12)
-        widths = np.ptp(x, axis=0).max()
-        assert np.all(bounds - reached <= 0.05 * widths)
-        assert np.all(tube.proof(t).gaps >= -1e-12)
-
-
-def test_garbage_multipliers_prove_what_holds(tube_of):
-    case, tube = tube_of
-    certificate, rng = tube.proof(1), np.random.default_rng(0)
-    reached = case.successors(samples(tube.sets[0])) @ np.asarray(tube.sets[1].A).T
-    shape = np.shape(certificate.multipliers)
-    for garbage in (rng.normal(size=shape), 1e8 * rng.normal(size=shape), np.zeros(shape)):
-        assert np.all(certificate.recheck(garbage) >= reached.max(axis=0) - 1e-12)
-
-
-@pytest.mark.parametrize(
-    ("place", "n_x"),
-    some(
-        product(range(len(CONTROLLERS)), [1, 3, 6]),
-        lambda place, n_x: n_x == [3, 6, 1, 3][place],
-    ),
-)
-@pytest.mark.costly
-def test_sets_of_other_dimensions_hold_every_sample(place, n_x):
-    case, X = controlled(n_x=n_x, seed=n_x, **CONTROLLERS[place]), initial_box(n_x)
-    template = rj.Template(directions(n_x, extra=1))
-    following, _ = rj.reach_step(case.loop, X, template, relaxation=rj.LocalBounds())
-    reached = case.successors(samples(X)) @ directions(n_x, extra=1).T
-    assert np.all(reached.max(axis=0) <= np.asarray(following.b) + 1e-12)
-
-
-@pytest.mark.parametrize(
-    "options", some(CONTROLLERS, lambda options: options is not CONTROLLERS[0]), ids=NAMES
-)
-@pytest.mark.costly
-def test_the_gradient_in_all_weights_is_the_central_difference(options):
-    case, X = controlled(n_x=2, seed=3, **options), initial_box(2)
-    loop, weights = case.loop, jnp.linspace(0.5, 2.0, 4)
-
-    @jax.jit
-    @jax.value_and_grad
-    def size(net):
-        moved, template = loop.replace(controller=net), rj.Template.box(2)
-        return weights @ rj.reach_step(moved, X, template, relaxation=rj.LocalBounds())[0].b
-
-    leaves, structure = jax.tree.flatten(loop.controller)
-    rng, h = np.random.default_rng(1), 1e-5
-    direction = [rng.normal(size=leaf.shape) for leaf in leaves]
-
-    def moved(by):
-        pairs = zip(leaves, direction, strict=True)
-        return size(jax.tree.unflatten(structure, [leaf + by * d for leaf, d in pairs]))
-
-    difference = (moved(h)[0] - moved(-h)[0]) / (2 * h)
-    slopes = jax.tree.leaves(moved(0.0)[1])
-    along = sum(float(np.sum(g * d)) for g, d in zip(slopes, direction, strict=True))
-    assert along == pytest.approx(float(difference), rel=1e-3)
 
 
 def test_a_residual_network_adds_its_input_and_may_be_nested():

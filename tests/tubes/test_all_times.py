@@ -51,20 +51,6 @@ def test_what_is_safe_at_all_times_is_proved(loop):
 
 
 @pytest.mark.parametrize("loop", loops(), ids=["function", "matrices"])
-def test_spans_hold_what_is_simulated_in_between(loop):
-    tube = rj.reach(loop, X0, 3, rj.Template.box(2), relaxation=rj.LinearBounds())
-    points = np.random.default_rng(0).uniform(X0.lower, X0.upper, size=(50, 2))
-    states = np.asarray(loop.simulate(points, 3))
-    for k, span in enumerate(tube.spans):
-        period = loop.plant.period
-        for part in (0.1, 0.3, 0.5, 0.9):
-            shorter = loop.replace(plant=loop.plant.replace(period=part * period))
-            inner = np.asarray(shorter.simulate(states[:, k], 1))[:, 1]
-            assert np.all(np.asarray(span.contains(inner)))
-        assert np.all(np.asarray(span.contains(states[:, k : k + 2].reshape(-1, 2))))
-
-
-@pytest.mark.parametrize("loop", loops(), ids=["function", "matrices"])
 def test_a_goal_over_a_span_is_one_at_all_times_of_it(loop):
     right, wide = rj.Box([-0.2, -1.2], [1.2, 1.2]), rj.Box([-1.2, -1.2], [1.2, 1.2])
     first = rj.decide(loop, X0, 2, goal={(0.0, 0.5): right})  # half a turn on this side
@@ -100,3 +86,42 @@ def test_states_that_are_looked_at_in_between_are_near_the_flow():
     found = in_between(loop, points, states[:, 1], 0)
     exact = np.stack([np.sin(math.pi / 8) * points[:, 1] + np.cos(math.pi / 8) * points[:, 0]])
     np.testing.assert_allclose(found[0][:, 0], exact[0], atol=0.05)
+
+
+@pytest.mark.parametrize("loop", loops(), ids=["function", "matrices"])
+def test_winning_and_largest_sets_are_of_all_times(loop):
+    """Half a turn apart a state is as far from zero as before; in between it is on the circle."""
+    safe = rj.Box([-0.5, -2.0], [0.5, 2.0])
+    lost = rj.winning_set(loop, X0, 1, safe=safe, cells=4)
+    assert not lost.of(rj.VerdictStatus.PROVED)
+    won = rj.winning_set(loop, rj.Box([-0.1, -0.3], [0.1, 0.3]), 1, safe=safe, cells=4)
+    assert won.contains([[0.0, 0.0], [0.1, 0.3]]).all()
+    found = rj.largest_set(loop, rj.Box([-0.1, -0.1], [0.1, 0.1]), 1, safe=safe, rounds=5)
+    corners = np.asarray(found.region.corners())
+    assert np.linalg.norm(corners, axis=1).max() <= 0.5 + 1e-9
+    assert np.linalg.norm(corners, axis=1).max() >= 0.4
+
+
+@pytest.mark.parametrize("loop", loops(), ids=["function", "matrices"])
+def test_spans_are_little_larger_than_dense_samples(loop):
+    tube = rj.reach(loop, X0, 3, rj.Template.box(2), relaxation=rj.LinearBounds())
+    dense = np.asarray(loop.simulate(X0.corners(), 3, parts=64))
+    ratios = []
+    for k, span in enumerate(tube.spans):
+        box, seen = span.bounding_box(), dense[:, 64 * k : 64 * (k + 1) + 1]
+        ratios.append(np.prod(np.asarray(box.widths)) / np.prod(np.ptp(seen, axis=(0, 1))))
+    assert 1 - 1e-12 <= np.mean(ratios) <= 1.1
+
+
+def test_simulations_with_states_in_between_are_of_the_flow():
+    for each in loops():
+        loop = each.replace(plant=each.plant.replace(period=0.05))
+        points = np.random.default_rng(0).uniform(X0.lower, X0.upper, size=(5, 2))
+        dense = np.asarray(loop.simulate(points, 2, parts=4))
+        angles = TURN * 0.05 * np.arange(9) / 4
+        turned = np.cos(angles) * points[:, :1] + np.sin(angles) * points[:, 1:]
+        np.testing.assert_allclose(dense[:, :, 0], turned, atol=1e-9)
+        np.testing.assert_allclose(dense[:, ::4], loop.simulate(points, 2), rtol=1e-9, atol=1e-12)
+    discrete = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.zeros((2, 1))), STILL)
+    with pytest.raises(ValueError, match="parts must be 1"):
+        discrete.simulate([0.0, 1.0], 2, parts=2)

@@ -44,40 +44,6 @@ def tube(request) -> rj.ReachTube:
     return rj.reach(loop_of(X0.dimension), X0, 3, rj.Template.box(X0.dimension), relaxation)
 
 
-def test_no_state_is_outside(tube):
-    states = np.asarray(tube.simulate(5000, seed=1))
-    for t, region in enumerate(tube.sets):
-        assert np.asarray(region.contains(states[:, t], 1e-12)).all()
-
-
-def test_cells_prove_no_less_than_one_cell_does(tube):
-    for t in (1, 2, 3):
-        proof = tube.proof(t)
-        assert isinstance(proof, rj.CellCertificate)
-        assert 1 <= proof.cells <= 24
-        assert (proof.recheck() == proof.bounds).all()
-        assert (proof.recheck([-1]) >= proof.bounds - 1e-12).all()
-
-
-@pytest.mark.parametrize(
-    "axes", [[], [0], [0, -1], [0, -1, -1, -1], [7, -1, -1], [-2], [-1, -1], [0, 0, -1, -1]]
-)
-def test_what_leaves_something_out_is_no_tree(tube, axes):
-    with pytest.raises(ValueError, match="axes must be those of a tree"):
-        tube.proof(1).recheck(axes)
-
-
-def test_any_tree_is_sound(tube):
-    rng, n = np.random.default_rng(0), tube.loop.states
-    for _ in range(3):
-        axes = [int(rng.integers(n)), int(rng.integers(n)), -1, -1, -1]
-        try:
-            found = tube.proof(3).recheck(axes)
-        except ValueError:  # the set reaches one half only
-            continue
-        assert (found >= np.asarray(tube.proof(3).witnesses) - 1e-12).all()
-
-
 @pytest.mark.costly
 def test_a_gap_that_may_stay_open_takes_fewer_cells():
     given = loop_of(2), STARTS["two"], 3, rj.Template.box(2)
@@ -107,30 +73,6 @@ def test_what_is_interrupted_keeps_what_is_proved(monkeypatch):
     with pytest.raises(rj.Interrupted) as caught:
         rj.reach(loop_of(2), STARTS["two"], 3, rj.Template.box(2))
     assert caught.value.tube.horizon == 2
-
-
-@pytest.mark.long  # what gradients of many kinds of loops claim too
-def test_derivatives_are_those_of_what_is_proved():
-    def size(lower, gravity):
-        def f(gravity, x, u):
-            return jnp.array(
-                [x[0] + PERIOD * x[1], x[1] + PERIOD * (gravity * jnp.sin(x[0]) + u[0])]
-            )
-
-        plant = rj.NonlinearPlant(jax.tree_util.Partial(f, gravity), 2, 1)
-        loop = rj.ClosedLoop(plant, loop_of(2).controller, rj.Box([-1.0], [1.0]))
-        relaxation = rj.BranchAndCut(cells=16)
-        tube = rj.reach(loop, rj.Box(lower, [0.5, 0.3]), 3, rj.Template.box(2), relaxation)
-        return jnp.sum(tube.sets[3].b)
-
-    at = jnp.array([0.1, -0.2]), jnp.array(5.0)
-    slopes, h = jax.grad(size, argnums=(0, 1))(*at), 1e-5
-    for i in range(2):
-        step = h * jnp.eye(2)[i]
-        along = (size(at[0] + step, at[1]) - size(at[0] - step, at[1])) / (2 * h)
-        np.testing.assert_allclose(slopes[0][i], along, rtol=1e-5, atol=1e-8)
-    along = (size(at[0], at[1] + h) - size(at[0], at[1] - h)) / (2 * h)
-    np.testing.assert_allclose(slopes[1], along, rtol=1e-5)
 
 
 @pytest.mark.costly

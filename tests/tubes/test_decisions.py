@@ -125,28 +125,6 @@ def test_margins_are_those_of_exact_suprema():
     assert np.isnan(verdict.margins["goal"][:2]).all()
 
 
-SWITCHING = [(1, "box", 21), (2, "box", 22), (2, "ellipsoid", 24), (3, "box", 23)]
-
-
-@pytest.mark.parametrize(("n_x", "kind", "seed"), SWITCHING)
-def test_decisions_are_those_of_a_tube(n_x, kind, seed):
-    """A little above and below what each tube's offsets say."""
-    loop = switching_loop(n_x, seed=seed, hidden=(4, 3), steps=5)
-    X0, start = initial_set(kind, n_x, seed=n_x), 2
-    tube = rj.reach(loop, X0, 3, rj.Template.box(n_x), start=start)
-    rows, offsets = np.asarray(tube.template.directions), np.asarray(tube.sets[3].b)
-    width = np.ptp(np.asarray(tube.simulate(500))[:, 3], axis=0).max()
-    for share, status in ((0.02, PROVED), (-0.02, REFUTED)):
-        goal = rj.Polytope(rows, offsets + share * width)
-        verdict = rj.decide(loop, X0, 3, goal=goal, start=start, samples=100)
-        assert verdict.status is rj.verify(tube, goal=goal).status is status
-        checked(verdict, loop, X0, start)
-        avoid = {3: [half_space(-rows[0], -offsets[0] - share * width)]}
-        verdict = rj.decide(loop, X0, 3, avoid=avoid, start=start, samples=100)
-        assert verdict.status is rj.verify(tube, avoid=avoid).status is status
-        checked(verdict, loop, X0, start)
-
-
 def test_certificates_own_their_numbers():
     loop, X0 = halves(BOX)
     verdict = rj.decide(loop, X0, 2, goal=half_space([1, 1], 0.6), samples=100)

@@ -1,7 +1,5 @@
 """Loops with disturbances and noise: nothing that may enter them leaves a tube, and it is tight."""
 
-from itertools import product
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +7,6 @@ import pytest
 
 import reachjax as rj
 from experiments.tightness.exact import exact_tube
-from tests.closed_loops import initial_set
-from tests.differences import central_difference, dot
 from tests.disturbed_loops import (
     STEPS,
     attacked,
@@ -18,7 +14,6 @@ from tests.disturbed_loops import (
     disturbed_loop,
     double_integrator,
 )
-from tests.quick_cases import some
 
 KINDS = ["box", "varying box", "polytope", "ellipsoid", "intersection"]
 ROUNDING = 1e-9
@@ -35,53 +30,6 @@ def beyond(tube, states):
         for k, region in enumerate(tube.sets)
     )
     return max(each)
-
-
-@pytest.mark.parametrize(("n", "kind"), list(product((1, 2, 3), KINDS)))
-def test_no_scenario_leaves_a_tube_by_forms_or_branches(n, kind):
-    V = disturbance_set(KINDS[(KINDS.index(kind) + n) % len(KINDS)], n, seed=3)
-    loop, X0 = disturbed_loop(n, disturbance_set(kind, n), V, seed=1), initial(n)
-    states = attacked(loop, X0, STEPS)
-    template = rj.Template.octagonal(n)
-    for relaxation in (rj.LinearBounds(), rj.BranchAndCut()):  # a wide gap: no products
-        tube = rj.reach(loop, X0, STEPS, template, relaxation, samples=100, gap=0.5)
-        assert beyond(tube, states) < ROUNDING
-        for k in range(1, STEPS + 1):
-            assert np.all(tube.proof(k).gaps > -ROUNDING)
-
-
-@pytest.mark.parametrize(
-    ("relaxation", "kind", "template"),
-    [
-        (rj.LocalBounds(), "polytope", rj.Template.box(2)),
-        (rj.PaperQC(), "ellipsoid", rj.Template.box(2)),
-        (rj.PaperQC(), "box", rj.EllipsoidTemplate()),
-    ],
-)
-@pytest.mark.costly
-def test_no_scenario_leaves_a_tube_by_windows(relaxation, kind, template):
-    loop = disturbed_loop(2, disturbance_set(kind, 2), disturbance_set("box", 2, seed=3), seed=1)
-    states = attacked(loop, initial(2), 2)
-    tube = rj.reach(loop, initial(2), 2, template, relaxation, 1, samples=100)
-    assert beyond(tube, states) < ROUNDING
-    assert all(s is rj.SolverStatus.SOLVED for k in (1, 2) for s in tube.proof(k).statuses)
-
-
-@pytest.mark.costly
-def test_no_scenario_leaves_a_tube_by_long_windows_and_cuts():
-    loop = disturbed_loop(2, disturbance_set("polytope", 2), disturbance_set("box", 2, 3), seed=1)
-    relaxation = rj.CuttingPlanes(rounds=0)
-    tube = rj.reach(loop, initial(2), 2, rj.Template.box(2), relaxation, 2, samples=100)
-    assert beyond(tube, attacked(loop, initial(2), 2)) < ROUNDING
-
-
-@pytest.mark.parametrize("kind", ["ellipsoid", "simplex", "intersection"])
-@pytest.mark.costly
-def test_initial_sets_of_every_kind(kind):
-    X0 = initial_set(kind, 2)
-    loop = disturbed_loop(2, disturbance_set("box", 2), disturbance_set("ellipsoid", 2, 3), seed=1)
-    tube = rj.reach(loop, X0, 2, rj.Template.box(2), samples=100, gap=0.5)
-    assert beyond(tube, attacked(loop, X0, 2)) < ROUNDING
 
 
 @pytest.mark.costly
@@ -149,44 +97,6 @@ def test_noise_alone_and_disturbances_without_width():
     np.testing.assert_allclose(tube.sets[2].b, other.sets[2].b, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("kind", "relaxation"),
-    some(
-        product(["box", "polytope", "ellipsoid"], [rj.LinearBounds(), rj.BranchAndCut()]),
-        lambda *case: case in (("box", rj.BranchAndCut()), ("ellipsoid", rj.LinearBounds())),
-    ),
-    ids=lambda each: each if isinstance(each, str) else type(each).__name__,
-)
-@pytest.mark.costly
-def test_gradients_are_those_of_differences(kind, relaxation):
-    loop = disturbed_loop(2, disturbance_set(kind, 2), disturbance_set("box", 2, 3), seed=1)
-    X0, template = initial(2), rj.Template.octagonal(2)
-    weights = jnp.asarray(np.random.default_rng(0).uniform(size=8))
-
-    def value(loop, X0):
-        tube = rj.reach(loop, X0, 2, template, relaxation, samples=20)
-        return sum(weights @ region.b for region in tube.sets[1:])
-
-    gradient = jax.grad(value, argnums=(0, 1))(loop, X0)
-    rng = np.random.default_rng(1)
-    # normals of a polytope have kinks where the box around it touches along an edge
-    normals = loop.disturbance.A if kind == "polytope" else None
-    for chosen in (loop.disturbance, (loop, X0)):
-        ids = {id(leaf) for leaf in jax.tree.leaves(chosen)} - {id(normals)}
-        direction = jax.tree.map(
-            lambda leaf, ids=ids: (
-                0.1 * jnp.asarray(rng.normal(size=leaf.shape)) * (id(leaf) in ids)
-            ),
-            (loop, X0),
-        )
-        if kind == "ellipsoid":
-            Q = direction[0].disturbance.shape
-            direction[0].disturbance._set(shape=(Q + Q.T) / 20)
-        exact = dot(gradient, direction)
-        difference = central_difference(value, (loop, X0), direction, 1e-5)
-        assert abs(exact - difference) <= 1e-4 * max(abs(difference), 1e-2)
-
-
 @pytest.mark.costly
 def test_a_compiled_gradient_is_the_same():
     loop, X0 = double_integrator()
@@ -244,22 +154,6 @@ def test_partitions_and_longer_tubes_are_those_of_one_call():
     longer = rj.reach(loop, X0, 2, template).extended(1)
     for one, other in zip(longer.sets, tube.sets, strict=True):
         np.testing.assert_array_equal(one.facets[1], other.facets[1])
-
-
-@pytest.mark.costly
-def test_a_proof_is_checked_again():
-    loop, X0 = double_integrator()
-    for relaxation in (rj.LinearBounds(), rj.BranchAndCut()):
-        proof = rj.reach(loop, X0, 3, rj.Template.box(2), relaxation).proof(3)
-        np.testing.assert_allclose(proof.recheck(), proof.bounds, rtol=1e-12)
-    rng, states = np.random.default_rng(0), attacked(loop, X0, 3)[:, 3]
-    proof = rj.reach(loop, X0, 3, rj.Template.box(2), rj.LinearBounds()).proof(3)
-    largest = np.asarray(states @ np.asarray(proof.directions).T).max(axis=0)
-    for scale in (0.1, 3.0):
-        assert np.all(proof.recheck(scale * rng.normal(size=proof.slopes.shape)) >= largest)
-    proof = rj.reach(loop, X0, 3, rj.Template.box(2)).proof(3)
-    for scale in (0.1, 3.0):
-        assert np.all(proof.recheck(scale * rng.normal(size=proof.multipliers.shape)) >= largest)
 
 
 @pytest.mark.costly

@@ -16,8 +16,6 @@ import reachjax as rj
 from reachjax.numerics import archives, storage
 from reachjax.proofs.certificates import AbstractProof
 from tests.closed_loops import closed_loop, random_loop
-from tests.disturbed_loops import double_integrator
-from tests.input_polytopes import polygon, polytope_loop
 
 BOX = rj.Template.box(2)
 
@@ -104,61 +102,6 @@ def curved(f=sine, p=0.5):
     return rj.ClosedLoop(plant, net)
 
 
-SEMIDEFINITE = [rj.LocalBounds(), rj.CuttingPlanes(rounds=1), rj.PaperQC(), rj.AllProducts()]
-TEMPLATES = [rj.EllipsoidTemplate(), rj.MixedTemplate(BOX)]
-KINDS = {
-    **{str(one): ({"relaxation": one, "window": 1}, BOX) for one in SEMIDEFINITE},
-    "forms": ({"relaxation": rj.LinearBounds()}, BOX),
-    "branches": ({}, rj.Template.octagonal(2)),
-    **{
-        type(one).__name__: ({"relaxation": rj.LocalBounds(), "window": 1}, one)
-        for one in TEMPLATES
-    },
-}
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_tube_of_every_kind_is_read_as_it_was(kind, loop, X0, path):
-    options, template = KINDS[kind]
-    tube = rj.reach(loop, X0, 2, template, **options)
-    tube.save(path)
-    again = rj.load(path, recheck=True)
-    equal(tube, again)
-    assert str(tube) == str(again)
-    assert [type(each) for each in again.certificates] == [type(e) for e in tube.certificates]
-    verdicts = [
-        rj.verify(each, safe=rj.Box([-9, -9], [9, 9]), samples=10) for each in (tube, again)
-    ]
-    assert verdicts[0].status is verdicts[1].status
-    equal(tube.extended(1, **options).sets, again.extended(1, **options).sets)
-
-
-def test_loops_of_every_kind(path):
-    loops = [double_integrator(), (polytope_loop(polygon(4)), rj.Box([-0.2, -0.2], [0.2, 0.2]))]
-    for loop, X0 in loops:
-        tube = rj.reach(loop, X0, 2, BOX, rj.LinearBounds())
-        tube.save(path)
-        equal(tube, rj.load(path, recheck=True))
-
-
-@pytest.mark.costly
-def test_a_network_of_a_file_is_kept(path):
-    net = rj.Network.from_onnx("tests/data/networks/torch_tanh.onnx")
-    loop = rj.ClosedLoop(rj.AffinePlant(0.9 * np.eye(2), [[0.0], [0.1]]), net)
-    tube = rj.reach(loop, rj.Box([-0.1, -0.1], [0.1, 0.1]), 2, BOX)
-    tube.save(path)
-    equal(tube, rj.load(path, recheck=True))
-
-
-@pytest.mark.costly
-def test_cells_are_kept(loop, X0, path):
-    parts = rj.reach_partitioned(loop, X0, 2, BOX, cells=(2, 1))
-    parts.save(path)
-    again = rj.load(path, recheck=True)
-    assert isinstance(again, rj.PartitionedTube)
-    equal(parts, again)
-
-
 @pytest.mark.costly
 def test_another_process_reads_the_same(tube, path):
     tube.save(path)
@@ -202,29 +145,10 @@ def test_a_seal_is_of_what_functions_compute():
         tube.replace(loop=made(5e-10))
 
 
-def test_what_does_not_prove_the_bounds_is_refused(path, loop, X0):
-    tube = rj.reach(loop, X0, 2, BOX, rj.LinearBounds())
-    proof = tube.proof(2)
-    lower = proof.replace(bounds=proof.bounds - 1e-3)
-    sets = (*tube.sets[:2], tube.sets[2].replace(b=lower.bounds))
-    proofs = (*tube.certificates[:2], lower)
-    rj.ReachTube.sealed(loop, tube.template, sets, proofs, 0).save(path)
-    rj.load(path)  # nothing was asked
-    with pytest.raises(ValueError, match="the recheck of step 2 proves"):
-        rj.load(path, recheck=True)
-
-
 def test_a_bar_must_pass_on_all_steps(tube, path):
     tube.save(path)
     with pytest.raises(ValueError, match="progress must pass on each step, but 1 of 2 did not"):
         rj.load(path, recheck=True, progress=lambda steps: list(steps)[1:])
-
-
-def test_the_loop_of_a_file_is_compared(tube, loop, path):
-    tube.save(path)
-    equal(rj.load(path, loop), tube)
-    with pytest.raises(ValueError, match="loop must be that of the tube"):
-        rj.load(path, closed_loop(random_loop(2, (4, 3), seed=5)))
 
 
 @jax.tree_util.register_dataclass

@@ -8,6 +8,7 @@ import pytest
 import reachjax as rj
 from experiments.quadrotor import model
 from reachjax.verdicts.recurrent_sets import _safe_part
+from tests.closed_loops import double_integrator
 
 LATER = 2000
 """Steps of simulation, beyond what any proof looks at."""
@@ -45,10 +46,7 @@ def stays(verdict, loop, X0, safe):
 
 @pytest.fixture(scope="module")
 def with_margin():
-    data = np.load("tests/data/double_integrator_with_margin.npz")
-    net = rj.MLP.from_layers([(data[f"W{i}"], data[f"b{i}"]) for i in range(3)])
-    plant = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
-    return rj.ClosedLoop(plant, net, rj.Box([-1.0], [1.0]))
+    return double_integrator()
 
 
 @pytest.mark.costly

@@ -124,3 +124,16 @@ def test_a_pole_is_named_with_its_line_its_time_its_range_and_the_smallest_cell(
         rj.reach(loop, rj.Box([-1.0], [1.3]), 2, rj.Template.box(1), rj.BranchAndCut(cells=32))
     assert "even over one of" in str(found.value)
     assert "smaller X0" in str(found.value)
+
+
+def test_a_remainder_that_is_infinite_says_where_and_what_to_do():
+    loop = rj.ClosedLoop(
+        rj.NonlinearPlant(lambda x, u: 1 / x + u, 1, 1), rj.Network(lambda x: 0 * x, 1, 1)
+    )
+    message = r"Reciprocal .in .*test_halving.* at t = 0 has inputs in .-.*, .*cells"
+    for relaxation in (rj.LinearBounds(), rj.BranchAndCut()):
+        with pytest.raises(ValueError, match=message):
+            rj.reach(loop, rj.Box([-1.0], [1.0]), 1, rj.Template.box(1), relaxation)
+    whole = rj.BranchAndCut(cells=1)
+    with pytest.raises(ValueError, match=message):
+        rj.decide(loop, rj.Box([-1.0], [1.0]), 1, goal=rj.Box([-1e9], [1e9]), relaxation=whole)

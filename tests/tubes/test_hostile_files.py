@@ -5,15 +5,19 @@ import json
 import zipfile
 from collections import Counter
 
-import jax
 import numpy as np
 import pytest
 
 import reachjax as rj
 from reachjax.numerics import archives
-from tests.tubes.test_tampering import BOX, X0, made, rectified
+from tests.cases import Case
+from tests.laws.changes import same
+from tests.laws.test_saves import given, made
 
-ATTACKED = ["branches", "smooth", "cells", "forms", "programs", "ellipsoids", "mixed", "partition"]
+ATTACKED = (
+    *("branches", "cells", "cells of branches", "forms", "jumps", "programs", "ellipsoids"),
+    *("mixed", "partition"),
+)
 ODD = [np.nan, np.inf, -np.inf, -1e300, 1e300, 0.0, -1.0, 5e-324]
 NOTHING = [None, "x", 3, -1, 2**70, 1e400, True, [], {}, {"tuple": []}, {"list": [1, 2]}]
 REFUSED = rj.UnreadableError, rj.DisagreementError
@@ -161,10 +165,8 @@ def attack(rng, path, kind):
         head["left_out"] = False
         CHANGES[rng.integers(len(CHANGES))](rng, head, arrays)
         written(path, head, arrays)
-    loop = tube[0].loop if isinstance(tube, rj.PartitionedTube) else tube.loop
-    given = loop if not isinstance(loop.plant, rj.AffinePlant) else None
     try:
-        again = rj.load(path, given, recheck=True)
+        again = rj.load(path, given(kind), recheck=True)
     except REFUSED as error:
         return type(error).__name__
     except ValueError as error:
@@ -176,13 +178,6 @@ def attack(rng, path, kind):
 
 def tubes_of(tube):
     return tube.tubes if isinstance(tube, rj.PartitionedTube) else (tube,)
-
-
-def same(one, other):
-    if jax.tree.structure(one) != jax.tree.structure(other):
-        return False
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
 
 
 def judged(tube, again):
@@ -243,7 +238,7 @@ def test_files_that_were_changed_in_any_way(count, tmp_path, record_property):
 
 @pytest.fixture(scope="module")
 def small():
-    return rj.reach(rectified(), X0, 1, BOX, rj.LinearBounds())
+    return Case("relu", "forms").reach(steps=1)
 
 
 @pytest.fixture

@@ -23,20 +23,6 @@ def task():
     return loop, rj.Box([0.4, -0.3], [1.0, 0.3])
 
 
-WAYS = {
-    "default": (rj.Template.octagonal(2), {}),
-    "forms": (rj.Template.box(2), {"relaxation": rj.LinearBounds()}),
-    "paper": (rj.Template.box(2), {"relaxation": rj.LocalBounds(), "window": 1}),
-    "windows": (rj.Template.box(2), {"relaxation": rj.LocalBounds(), "window": 2}),
-    "ellipsoids": (rj.EllipsoidTemplate(), {"relaxation": rj.LocalBounds(), "window": 1}),
-}
-
-
-@pytest.fixture(scope="module", params=WAYS)
-def way(request):
-    return WAYS[request.param]
-
-
 def same(one, other):
     """Whether all sets are the same, bit for bit, and all witnesses."""
     for mine, theirs in zip(
@@ -46,32 +32,6 @@ def same(one, other):
     ):
         np.testing.assert_array_equal(mine, theirs)
     return True
-
-
-class Stopping:
-    """A progress bar whose user presses Ctrl-C when so many steps are done."""
-
-    def __init__(self, after):
-        self.after = after
-
-    def __call__(self, steps):
-        for step in steps:
-            if step == self.after:
-                raise KeyboardInterrupt
-            yield step
-
-
-@pytest.mark.costly
-def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(task, way):
-    template, options = way
-    whole = rj.reach(*task, STEPS, template, **options)
-    with pytest.raises(rj.Interrupted, match=rf"after {DONE} of {STEPS} steps") as stopped:
-        rj.reach(*task, STEPS, template, **options, progress=Stopping(DONE))
-    tube = stopped.value.tube
-    assert tube.horizon == DONE
-    assert same(pickle.loads(pickle.dumps(stopped.value)).tube, tube)
-    assert rj.verify(tube, safe=rj.Box([-9.0, -9.0], [9.0, 9.0])).status is not None
-    assert same(tube.extended(STEPS - DONE, **options), whole)
 
 
 CONTINUE = """
@@ -140,12 +100,6 @@ def test_ctrl_c_within_a_step_leaves_the_steps_before(task):
     assert same(tube.extended(STEPS - DONE), rj.reach(*task, STEPS, template))
 
 
-def test_nothing_is_left_of_a_call_that_proved_nothing(task):
-    with pytest.raises(KeyboardInterrupt) as stopped:
-        rj.reach(*task, STEPS, rj.Template.box(2), progress=Stopping(0))
-    assert not isinstance(stopped.value, rj.Interrupted)
-
-
 @pytest.mark.parametrize(
     ("steps", "options", "error", "match"),
     [
@@ -159,14 +113,3 @@ def test_bad_continuations_are_named(task, steps, options, error, match):
     tube = rj.reach(*task, 1, rj.Template.box(2), rj.LinearBounds())
     with pytest.raises(error, match=match):
         tube.extended(steps, **options)
-
-
-def test_a_time_varying_loop_goes_on_where_it_stopped():
-    A = np.stack([np.eye(2) * factor for factor in (0.5, 2.0, 0.25, 1.0)])
-    plant = rj.AffinePlant(A, np.zeros((4, 2, 1)))
-    loop = rj.ClosedLoop(plant, rj.MLP.from_layers(he_network((2, 3, 1), 0)))
-    X0 = rj.Box([0.0, 0.0], [1.0, 2.0])
-    tube = rj.reach(loop, X0, 1, rj.Template.box(2), start=1)
-    assert same(tube.extended(2), rj.reach(loop, X0, 3, rj.Template.box(2), start=1))
-    with pytest.raises(ValueError, match="horizon"):
-        tube.extended(3)

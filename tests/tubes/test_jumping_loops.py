@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.methods.cells import Cells
 
 STEPS, H = 3, Fraction(1, 4)
 
@@ -107,7 +108,16 @@ def starting(lower, upper):
     return points
 
 
-@pytest.mark.parametrize("relaxation", [rj.LinearBounds(), rj.BranchAndCut()], ids=str)
+ALONG_WAYS = Cells(most=3)
+
+METHODS = {
+    "forms": rj.LinearBounds(),
+    "branches": rj.BranchAndCut(),
+    "forms along ways": ALONG_WAYS,
+}
+
+
+@pytest.mark.parametrize("relaxation", METHODS.values(), ids=METHODS.keys())
 @pytest.mark.parametrize("name", LAWS)
 def test_all_that_the_closed_law_allows_is_in_the_sets(name, relaxation):
     _, law, ends = LAWS[name]

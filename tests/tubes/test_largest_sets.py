@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.closed_loops import double_integrator
 from tests.tubes.test_forever import scalar
 
 WANTED = {"goal": rj.Box([-0.6, -0.6], [0.6, 0.6]), "safe": rj.Box([-3.5, -1.5], [3.5, 1.5])}
@@ -15,10 +16,7 @@ QUICK = rj.BranchAndCut(nodes=20)
 
 @pytest.fixture(scope="module")
 def loop():
-    data = np.load("tests/data/double_integrator_with_margin.npz")
-    net = rj.MLP.from_layers([(data[f"W{i}"], data[f"b{i}"]) for i in range(3)])
-    plant = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
-    return rj.ClosedLoop(plant, net, rj.Box([-1.0], [1.0]))
+    return double_integrator()
 
 
 def wins(loop, X):

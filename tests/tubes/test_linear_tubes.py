@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.activations import CONTROLLERS, NAMES, controlled
 from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
-from tests.differences import error_in_all_parts
 from tests.networks import directions
-from tests.quick_cases import some
 
 HORIZON = 5
 ROUNDING = 1e-13
 """Of what is simulated, as a part of its size."""
-KINDS = ["box", "polytope", "simplex", "ellipsoid", "intersection", "far intersection"]
 
 
 def tube_of(loop, X0, template, horizon=HORIZON, **options):
@@ -29,40 +25,6 @@ def assert_holds(tube, start=0):
         slack = ROUNDING * abs(values).max()
         assert (values <= np.asarray(tube.sets[t].b) + slack).all()
         assert (tube.proof(t).gaps >= -slack).all()
-
-
-@pytest.mark.parametrize("n_x", [1, 2, 3, 6])
-@pytest.mark.parametrize("options", CONTROLLERS, ids=NAMES)
-def test_every_trajectory_is_inside(options, n_x):
-    loop = controlled(**options, n_x=n_x, seed=n_x).loop
-    assert_holds(tube_of(loop, initial_set("box", n_x, n_x), rj.Template(directions(n_x, 0, 3))))
-
-
-@pytest.mark.parametrize("n_x", [2, 3])
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.costly
-def test_every_trajectory_from_any_set_is_inside(kind, n_x):
-    loop = closed_loop(random_loop(n_x, seed=1))
-    assert_holds(tube_of(loop, initial_set(kind, n_x, 1), rj.Template(directions(n_x, 0, 3))))
-
-
-@pytest.mark.parametrize("boxed", [True, False])
-@pytest.mark.costly
-def test_plants_and_input_boxes_may_vary_in_time(boxed):
-    loop = closed_loop(random_loop(2, boxed=boxed, steps=7))
-    tube = tube_of(loop, initial_set("box", 2), rj.Template.octagonal(2), start=2)
-    assert_holds(tube)
-    late = rj.reach(loop, initial_set("box", 2), HORIZON, rj.Template.octagonal(2), start=2)
-    for t in range(1, HORIZON + 1):
-        assert (tube.sets[t].b >= late.sets[t].b - 1e-7).all()
-
-
-@pytest.mark.costly
-def test_templates_may_vary_in_time():
-    loop, X0 = closed_loop(random_loop(2)), initial_set("box", 2)
-    tube = tube_of(loop, X0, rj.Template.adapted(loop, X0, HORIZON, 8, samples=500))
-    assert_holds(tube)
-    np.testing.assert_array_equal(tube.proof(2).recheck(), tube.proof(2).bounds)
 
 
 @pytest.mark.parametrize("width", [0.0, 1e-12])
@@ -88,49 +50,6 @@ def test_affine_loops_are_exact():
 
 
 @pytest.mark.costly
-def test_a_recheck_gives_the_same_bounds_and_holds_for_any_slopes():
-    loop, X0 = closed_loop(random_loop(2, seed=1)), initial_set("box", 2, 1)
-    tube = tube_of(loop, X0, rj.Template.octagonal(2))
-    proof, rng = tube.proof(HORIZON), np.random.default_rng(0)
-    np.testing.assert_array_equal(proof.recheck(), proof.bounds)
-    attained = np.max(np.asarray(tube.simulate()[:, -1]) @ proof.directions.T, axis=0)
-    slopes = np.asarray(proof.slopes)
-    for garbage in (rng.normal(size=slopes.shape), 0 * slopes, 1 + 0 * slopes, -slopes):
-        found = proof.recheck(garbage)
-        assert (found >= attained - ROUNDING).all()
-    assert np.any(found > proof.bounds + 0.01)
-    with pytest.raises(ValueError, match=r"slopes must be finite and have shape \(5, 14\)"):
-        proof.recheck(slopes * np.nan)
-
-
-@pytest.mark.parametrize("kind", ["box", "polytope"])
-@pytest.mark.costly
-def test_slopes_that_overflow_prove_nothing(kind):
-    """Nor do they end in the linear programs of a polytope."""
-    loop = closed_loop(random_loop(2, hidden=(6, 4), seed=3))
-    proof = rj.reach(loop, initial_set(kind, 2), 2, rj.Template.box(2), rj.LinearBounds()).proof(2)
-    for size in (1e150, 1e300):
-        found = proof.recheck(np.full(proof.slopes.shape, size))
-        assert np.all(found >= proof.witnesses)
-
-
-@pytest.mark.costly
-def test_a_certificate_says_what_every_other_says():
-    loop, X0 = closed_loop(random_loop(2)), initial_set("box", 2)
-    tube = tube_of(loop, X0, rj.Template.octagonal(2))
-    proof = tube.proof(3)
-    assert isinstance(proof, rj.AbstractProof)
-    assert set(proof.statuses) == {rj.SolverStatus.AFFINE_FORM}
-    assert (proof.witnesses <= proof.bounds).all()
-    assert proof.witness_states.shape == (8, 2)
-    assert (proof.seconds > 0).all()
-    assert int(rj.unsolved(tube)) == 0
-    verdict = rj.verify(tube, safe=rj.Box([-9.0, -9.0], [9.0, 9.0]))
-    assert verdict.status is rj.VerdictStatus.PROVED
-    assert np.isfinite(float(rj.log_volume(tube)))
-
-
-@pytest.mark.costly
 def test_cells_are_tighter():
     loop, X0 = closed_loop(random_loop(2, seed=1)), initial_set("box", 2, 1)
     template = rj.Template.octagonal(2)
@@ -143,34 +62,6 @@ def penalty(loop, X0):
     tube = tube_of(loop, X0, rj.Template.octagonal(2))
     widths = jnp.stack([region.b[0:4:2] + region.b[1:4:2] for region in tube.sets[1:]])
     return jnp.sum(jnp.log(widths))
-
-
-@pytest.mark.parametrize(
-    ("options", "kind"),
-    some(
-        [(options, "box") for options in CONTROLLERS]
-        + [(CONTROLLERS[0], kind) for kind in ("ellipsoid", "far intersection")],
-        lambda options, kind: options is not CONTROLLERS[0] or kind == "ellipsoid",
-    ),
-    ids=[*NAMES, "ellipsoid", "intersection"],
-)
-def test_a_gradient_is_that_of_the_bounds(options, kind):
-    """In all parts at once, away from where a unit becomes affine; differences of the compiled."""
-    X0 = initial_set(kind, 2, 2)
-    if kind == "far intersection":  # whose box touches the ellipsoid, which is a kink
-        box, by = X0.polytope, 0.1 * X0.polytope.widths
-        X0 = X0.replace(polytope=rj.Box(box.lower + by, box.upper - by))
-    args = controlled(**options, hidden=(4, 3), seed=2).loop, X0
-    value, gradient = jax.jit(jax.value_and_grad(penalty, argnums=(0, 1)))(*args)
-    np.testing.assert_allclose(value, penalty(*args), rtol=1e-9)  # compiled, and in numpy
-    assert error_in_all_parts(penalty, args, gradient, 1e-5) < 1e-5
-
-
-@pytest.mark.costly
-def test_nothing_is_called_from_compiled_code():
-    args = closed_loop(random_loop(2)), initial_set("box", 2)
-    compiled = jax.jit(jax.value_and_grad(penalty)).lower(*args)
-    assert "callback" not in compiled.as_text()
 
 
 @pytest.mark.costly
@@ -189,15 +80,6 @@ def test_a_training_step_compiles_once_whatever_switches():
         assert np.isfinite(value)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
     assert len(traced) == 1
-
-
-@pytest.mark.costly
-def test_loops_and_sets_are_mapped_over():
-    loops = [closed_loop(random_loop(2, seed=seed)) for seed in range(3)]
-    X0 = initial_set("box", 2)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loops)
-    values = jax.vmap(penalty, in_axes=(0, None))(stacked, X0)
-    np.testing.assert_allclose(values, [float(penalty(loop, X0)) for loop in loops], rtol=1e-9)
 
 
 @pytest.mark.costly

@@ -9,10 +9,8 @@ import reachjax as rj
 from tests.closed_loops import one_step, recursion
 from tests.differences import error_in_all_parts
 from tests.networks import box_region, simplex_region
-from tests.quick_cases import some
 from tests.sets.test_intersection import intersection
 from tests.solvers.test_enclosures import PROMISED, case
-from tests.tubes.test_ellipsoid_tubes import holds
 
 FACETS = {1: rj.Template.box(1), 2: rj.Template.octagonal(2), 3: rj.Template.box(3)}
 
@@ -26,40 +24,6 @@ def starts(n):
         "ellipsoid": case(n, 1)[1],
         "intersection": intersection(n, 1),
     }
-
-
-@pytest.mark.parametrize(
-    ("n", "X0"),
-    some(
-        [
-            (1, "intersection"),
-            (2, "box"),
-            (2, "polytope"),
-            (2, "ellipsoid"),
-            (2, "intersection"),
-            (3, "intersection"),
-        ],
-        lambda n, X0: X0 == "polytope" or (X0 == "intersection" and n != 2),
-    ),
-)
-@pytest.mark.costly
-def test_no_state_is_outside_and_every_bound_is_proved_anew(n, X0):
-    region = starts(n)[X0]
-    tube = recursion(case(n, 1)[0], region, 2, rj.MixedTemplate(FACETS[n]))
-    assert all(holds(tube))
-    if X0 == "intersection":
-        surface = region.sample_boundary(jax.random.key(0), 1000)
-        trajectories = tube.loop.simulate(surface[region.contains(surface)], 2)
-        assert all(X.contains(trajectories[:, t]).all() for t, X in enumerate(tube.sets))
-    for t in (1, 2):
-        proof, reached = tube.proof(t), tube.sets[t]
-        np.testing.assert_allclose(proof.bounds, [*reached.polytope.b, 1.0])
-        assert (proof.gaps >= -1e-9).all()
-        assert (proof.recheck() <= proof.bounds).all()
-        worst = tube.loop.simulate(jnp.asarray(proof.witness_states), t)[:, t]
-        np.testing.assert_allclose(np.diag(reached.bounded_values(worst)), proof.witnesses)
-        garbage = proof.recheck(-proof.multipliers)
-        assert (garbage >= proof.witnesses).all()
 
 
 @pytest.mark.parametrize("X0", ["box", "polytope", "ellipsoid", "intersection"])
@@ -97,13 +61,6 @@ def test_facets_tell_a_program_what_the_ellipsoid_does_not():
     # the ellipse of least area around half of a disk has sqrt(16 / 27) times the disk's area
     least = np.sqrt(16 / 27) * np.pi / 4
     assert float(following.ellipsoid.volume()) == pytest.approx(least, rel=1e-5)
-
-
-@pytest.mark.parametrize("relaxation", [rj.PaperQC(), rj.LocalBounds(remove_stable=False)], ids=str)
-@pytest.mark.costly
-def test_other_relaxations_hold_too(relaxation):
-    loop, X0 = case(2, 1, hidden=(3,))
-    assert all(holds(recursion(loop, X0, 2, rj.MixedTemplate(FACETS[2]), relaxation)))
 
 
 @pytest.mark.costly
@@ -166,16 +123,6 @@ def test_compiled_and_plain_penalties_agree(horizon):
     value, gradient = jax.jit(jax.value_and_grad(missed))(loop.controller)
     assert float(value) == pytest.approx(float(missed(loop.controller)), abs=1e-6)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
-
-
-@pytest.mark.costly
-def test_compiled_and_plain_steps_agree():
-    loop, X0 = case(1, 0, hidden=(3,))[0], intersection(1)
-
-    def size(X0):
-        return rj.log_volume(recursion(loop, X0, 1, rj.MixedTemplate(rj.Template.box(1))))
-
-    assert float(jax.jit(size)(X0)) == pytest.approx(float(size(X0)), abs=1e-6)
 
 
 @pytest.mark.costly

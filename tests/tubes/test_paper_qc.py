@@ -13,7 +13,7 @@ import pytest
 
 import reachjax as rj
 from experiments.benchmark.reference import paper_E_in, paper_E_mid, paper_E_out, paper_step
-from tests.closed_loops import recursion
+from tests.closed_loops import closed_loop, recursion
 from tests.networks import (
     LoopData,
     Region,
@@ -53,14 +53,6 @@ def loop_data(n_x, boxed, time_varying, network=he_network):
     box = input_box(n_u, seed=n_x, steps=steps) if boxed else (None, None)
     layers = network((n_x, *HIDDEN, n_u), seed=20 + n_x)
     return LoopData(layers, *plant(n_x, n_u, seed=n_x, steps=steps), *box)
-
-
-def closed_loop(loop):
-    return rj.ClosedLoop(
-        rj.AffinePlant(loop.A, loop.B, loop.c),
-        rj.MLP.from_layers(loop.layers, activation=rj.ReLU()),
-        input_box=None if loop.u_lower is None else rj.Box(loop.u_lower, loop.u_upper),
-    )
 
 
 def case(n_x, boxed, time_varying, region, repeated, network=he_network):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.closed_loops import autonomous
+from tests.closed_loops import autonomous, double_integrator
 from tests.tubes.test_forever import scalar
 
 HORIZON = 5
@@ -33,10 +33,7 @@ def wins(runs):
 
 @pytest.fixture(scope="module")
 def loop():
-    data = np.load("tests/data/double_integrator_with_margin.npz")
-    net = rj.MLP.from_layers([(data[f"W{i}"], data[f"b{i}"]) for i in range(3)])
-    plant = rj.AffinePlant([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]])
-    return rj.ClosedLoop(plant, net, rj.Box([-1.0], [1.0]))
+    return double_integrator()
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,9 @@ from reachjax.loops.tracing.functions import Function
 from reachjax.loops.units import AtUnit
 from reachjax.numerics.rounding import Ball
 
+LEAST_STEPS = 2
+"""Simulations do a period in so many steps, at least."""
+
 
 class AbstractFlow(abc.ABC):
     """What a state is led to within a period, under an input that is held."""
@@ -78,7 +81,7 @@ class Flow(AbstractFlow):
     def simulated(self, given: tuple[Any, ...], unit: AtUnit) -> Any:
         """The state afterwards, by extrapolation."""
         x, *others = given
-        steps = max(2, self.settings.steps)
+        steps = max(LEAST_STEPS, self.settings.steps)
         return integrated(lambda x: self.rate((x, *others), unit), x, self.settings.period, steps)
 
     def followed(self, given: list[TaylorModels], box: Ball, between: bool = False) -> Flowed:

@@ -34,7 +34,7 @@ from reachjax.loops.flows.taylor_models import (
     zeros,
 )
 from reachjax.loops.tracing.recording import Recorder
-from reachjax.loops.tracing.values import UnsupportedError, Value
+from reachjax.loops.tracing.values import Step, UnsupportedError, Value
 from reachjax.loops.units import (
     ISRU,
     AbstractUnit,
@@ -45,7 +45,9 @@ from reachjax.loops.units import (
     Cos,
     Erf,
     Exp,
+    Floor,
     Log,
+    OneHot,
     Reciprocal,
     Sin,
     SmoothUnit,
@@ -57,6 +59,7 @@ from reachjax.loops.units import (
     XLogX,
     evaluate,
 )
+from reachjax.loops.units import Step as Jump
 from reachjax.numerics.numbers import AbstractNumber, size, widened
 from reachjax.numerics.rounding import UNIT, Ball, namespace
 
@@ -106,6 +109,7 @@ class Tape:
                 found[place] = self.product(*factors, terms=step.unit.terms)
             elif step.unit is not None:
                 (parent,) = step.parents
+                _require_no_jump(step)
                 found[place] = self.unit(step.unit, found[parent], step.apply)
             else:
                 parents = tuple(found[parent] for parent in step.parents)
@@ -191,6 +195,20 @@ class Tape:
         elif not unit.separable or unit.free:
             raise UnsupportedError(f"{type(unit).__name__} has no derivatives")
         return z
+
+
+def _require_no_jump(step: Step) -> None:
+    """Raise an error at a unit that jumps.
+
+    Raises:
+        UnsupportedError: it is one.
+    """
+    if isinstance(step.unit, Jump | OneHot | Floor):
+        raise UnsupportedError(
+            f"it jumps{step.line}, and solutions may slide along where it does: let the "
+            "controller decide, whose input is held from one sample to the next, or take a "
+            "function without jumps, such as jnp.tanh(50 * y) for jnp.sign(y)"
+        )
 
 
 def _less_square(tape: Tape, one: float, y: int) -> int:

@@ -50,6 +50,10 @@ WORTH = 1e-4
 EXACT = 1e-14
 """Or this part of its size, where that is larger."""
 
+IN_BETWEEN = 0.01
+"""What control points are beside the solutions shall be at most this part of what these move by in
+a period, and of how far the set spreads: four steps of half a turn make spans wider by 5 %."""
+
 SHORTEST = 2.0**-12
 """No step is a smaller part of a period: solutions escape, or are too fast."""
 
@@ -151,7 +155,8 @@ def flowed(
         here, given = _refreshed(state, others)
         # a signal may have taken states away from where its mean has
         X = here.widened(within).ball if done else here.ball.meeting(box)
-        piece, holds = _enclosed(tape, X, [each.ball for each in given], h, part, settings)
+        boxes = [each.ball for each in given]
+        piece, holds = _enclosed(tape, X, boxes, h, part, settings, between)
         if piece is None or (piece.excess > 1 and count < MOST and part / 2 >= SHORTEST):
             todo, count = [*todo, part / 2, part / 2], count + 1
             continue
@@ -213,7 +218,13 @@ def _composed(found: TaylorModels, state: TaylorModels) -> TaylorModels:
 
 
 def _enclosed(
-    tape: Tape, X: Ball, others: list[Ball], h: Any, part: float, settings: Settings
+    tape: Tape,
+    X: Ball,
+    others: list[Ball],
+    h: Any,
+    part: float,
+    settings: Settings,
+    between: bool,
 ) -> tuple[_Piece | None, Any]:
     """A step with its enclosure, and whether that is proved; None of one that has to be halved.
 
@@ -230,7 +241,8 @@ def _enclosed(
             if shortest:
                 raise _escaped(X, B)
             return None, proved
-        return _remainder(tape, X, B, others, h, settings.order), proved
+        whole = 1 / part if between else None
+        return _remainder(tape, X, B, others, h, settings.order, whole), proved
     except UnboundedError:
         if shortest:
             raise
@@ -238,18 +250,35 @@ def _enclosed(
 
 
 def _remainder(
-    tape: Tape, X: Ball, B: Ball, others: list[Ball], h: Any, order: int | None
+    tape: Tape,
+    X: Ball,
+    B: Ball,
+    others: list[Ball],
+    h: Any,
+    order: int | None,
+    whole: float | None = None,
 ) -> _Piece:
     """A step of the order that was asked for, or of the lowest whose remainder is small enough.
 
     Derivatives take remainders for constants.
 
-    If none is, of the one whose remainder is smallest.
+    If none is, of the one whose remainder is smallest. On the host a step whose control points are
+    too far from solutions is too long as well.
+
+    Args:
+        tape: of `f`.
+        X: where solutions begin.
+        B: what they stay in.
+        others: what the other arguments are in.
+        h: how long the step is.
+        order: of the polynomials; None to choose it.
+        whole: how many such steps a period is, if control points are asked for.
     """
-    chosen, least = order or ORDER, 0.0
-    if order is None and namespace(X.mid) is np:
+    chosen, least, on_host = order or ORDER, 0.0, namespace(X.mid) is np
+    rate = h * Series.value(tape, [X, *others]) if on_host else X
+    if order is None and on_host:
         solution, terms = Solution(tape, B, others, h), list[Ball]()
-        chosen, least, rate = 0, np.inf, h * Series.value(tape, [X, *others])
+        chosen, least = 0, np.inf
         for k in range(HIGHEST + 1):
             terms.append(solution.advance())
             excess = _excess(terms[k], rate, X)
@@ -261,16 +290,29 @@ def _remainder(
             terms.append(solution.advance())
     else:
         terms = solved(tape, B, others, h, max(chosen, 3) + 1)
-    fourth = constant(larger(abs(terms[3].lower), abs(terms[3].upper)))
+    second, fourth = (_size(terms[k]) for k in (1, 3))
+    if whole is not None and on_host:
+        moved = IN_BETWEEN * (X.rad + whole * (_size(rate) + second))
+        least = max(least, _over(second / 12 + fourth / 16, moved))
     return _Piece(B, constant_ball(terms[chosen]), fourth, chosen, least)
 
 
 def _excess(remainder: Ball, rate: Ball, X: Ball) -> float:
     """A remainder over what it shall be, of the worst state; infinite if it is not known."""
     allowed = WORTH * (X.rad + rate.rad) + EXACT * (abs(X.mid) + X.rad + abs(rate.mid))
+    return _over(remainder.rad, allowed)
+
+
+def _over(found: Any, allowed: Any) -> float:
+    """The largest ratio of what is found to what is allowed; infinite if it is not known."""
     with np.errstate(all="ignore"):
-        found = np.where(remainder.rad > 0, remainder.rad / allowed, remainder.rad)
-    return float(np.nan_to_num(found, nan=np.inf).max(initial=0.0))
+        ratios = np.where(found > 0, found / allowed, found)
+    return float(np.nan_to_num(ratios, nan=np.inf).max(initial=0.0))
+
+
+def _size(ball: Ball) -> Any:
+    """Bounds of absolute values, which derivatives take for constants."""
+    return constant(larger(abs(ball.lower), abs(ball.upper)))
 
 
 def _escaped(X: Ball, B: Ball) -> UnboundedError:

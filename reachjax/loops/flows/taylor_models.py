@@ -125,7 +125,7 @@ class TaylorModels(AbstractNumber):
         return Ball.between(*self.ends())
 
     def zeros(self) -> TaylorModels:
-        """As many numbers that are zero."""
+        """Zeros of the same symbols, as many of them."""
         xp = namespace(self.rows)
         return TaylorModels(xp.zeros_like(self.rows), xp.zeros_like(self.radii), self.symbols)
 
@@ -283,7 +283,7 @@ def product(one: Any, other: Any) -> Any:
 
 
 def zeros(number: Any) -> Any:
-    """As many zeros of the same kind."""
+    """Zeros of the same kind, as many of them."""
     if isinstance(number, TaylorModels):
         return number.zeros()
     if isinstance(number, Ball):

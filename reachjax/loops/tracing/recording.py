@@ -7,6 +7,7 @@ step is affine (a choice of entries, a matrix, a factor, a sum) or a layer of un
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Container, Sequence
 from typing import Any
 
@@ -326,8 +327,10 @@ class Recorder:
             return float(limits.least.min()), float(limits.most.max())
 
         unit = unit.knowing(ends) if value.size else unit
+        if unit.jumps and not unit.line:
+            unit = dataclasses.replace(unit, line=self.line)
         again = lambda y: self.unit(unit, y)  # noqa: E731
-        step = Step(self._applied(unit), (value.place,), unit=unit, again=again)
+        step = Step(self._applied(unit), (value.place,), unit=unit, again=again, line=self.line)
         return self.layer(value.shape, step, ("unit", unit, value.place))
 
     def _applied(self, unit: AbstractUnit) -> Any:

@@ -192,6 +192,7 @@ class Step(NamedTuple):
         unit: that of a layer of units.
         again: how it is recorded of other values, flat ones, in place of its parents.
         linear: whether it is affine, by numbers that are known.
+        line: where a user wrote it, of a unit.
     """
 
     apply: Callable[..., Any]
@@ -200,6 +201,7 @@ class Step(NamedTuple):
     unit: AbstractUnit | None = None
     again: Callable[..., Any] | None = None
     linear: bool = False
+    line: str = ""
 
 
 class Parameter(np.ndarray):

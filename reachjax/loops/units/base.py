@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import abc
 import enum
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -141,6 +142,8 @@ class AbstractUnit(AbstractActivation):
             the input is: then all that there is to know of it is that.
         stated: whether its facts are known of its inputs, so that they count where it is affine.
         closed: whether these bound the free units before it by themselves.
+        jumps: whether its value changes at once where an input changes its sign, and nowhere else.
+        line: where a user wrote it, of one that jumps.
     """
 
     separable: ClassVar[bool] = True
@@ -149,7 +152,9 @@ class AbstractUnit(AbstractActivation):
     nonexpansive: ClassVar[bool] = True
     free: ClassVar[bool] = False
     stated: ClassVar[bool] = False
+    jumps: ClassVar[bool] = False
     closed: bool = False
+    line: str = ""
 
     @property
     def kind(self) -> AbstractUnit:
@@ -212,6 +217,10 @@ class AbstractUnit(AbstractActivation):
     def open(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
         """Inputs whose bounds are worth a program each: here those of units that are not affine."""
         return ~self.lines(lower, upper).affine
+
+    def distance(self, *y: Float[Array, " k"]) -> float:
+        """How far inputs are from where the value jumps."""
+        return math.inf
 
     @abc.abstractmethod
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:

@@ -44,9 +44,11 @@ class OneHot(AbstractUnit):
     """
 
     count: int
+    line: str = dataclasses.field(default="", compare=False, repr=False)
 
     separable: ClassVar[bool] = False
     nonexpansive: ClassVar[bool] = False
+    jumps: ClassVar[bool] = True
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
@@ -59,6 +61,11 @@ class OneHot(AbstractUnit):
         winner = scores.argmax(axis=-1)[..., None]
         z = xp.where(winner == np.arange(self.count), 1.0, 0.0)
         return xp.concatenate([z, xp.zeros_like(y[..., self.count :])], axis=-1)
+
+    def distance(self, y: Float[np.ndarray, " n"]) -> float:
+        """By how much the largest number exceeds the second."""
+        *_, second, first = np.sort(y[: self.count])
+        return float(first - second)
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """Zero of what surely loses, and one of what alone may win."""

@@ -52,12 +52,18 @@ class Step(AbstractUnit):
     """
 
     at_zero: float = 0.0
+    line: str = dataclasses.field(default="", compare=False, repr=False)
 
     nonexpansive: ClassVar[bool] = False
+    jumps: ClassVar[bool] = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`1` above zero, `0` below; derivatives are zero."""
         return namespace(y).where(y >= 0 if self.at_zero else y > 0, 1.0, 0.0)
+
+    def distance(self, y: Float[np.ndarray, " k"]) -> float:
+        """How far the closest input is from where the value changes."""
+        return float(abs(y).min(initial=np.inf))
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """`[0, 1]`, or one of the two where the sign is known."""

@@ -19,6 +19,7 @@ from tests.loops.flows.fields import KINDS, field, solution
 
 STATES = 1, 2, 3, 6
 PARTS = 0.0, 0.1, 0.37, 0.5, 0.83, 1.0
+DENSE = tuple(k / 50 for k in range(1, 51))
 
 
 def on_host(plant):
@@ -69,7 +70,9 @@ def next_forms(found: AffineForms) -> AffineForms:
     return forms
 
 
-def missed(own, plant, box: rj.Box, gain, rng, periods: int = 2, points: int = 3) -> int:
+def missed(
+    own, plant, box: rj.Box, gain, rng, periods: int = 2, points: int = 3, parts=PARTS
+) -> int:
     """How often a solution is outside of what forms say of it, at samples or in between."""
     start = InitialColumns.of(box, box, curved=True)
     center, wide = np.asarray(box.center), np.asarray(box.widths) / 2
@@ -86,7 +89,7 @@ def missed(own, plant, box: rj.Box, gain, rng, periods: int = 2, points: int = 3
         for n, first in enumerate(firsts):
             w = columns_of(start, first)
             u = [sum(mpf(g) * a for g, a in zip(row, states[n], strict=True)) for row in gain]
-            times = [(k, part) for k in range(len(between.ends)) for part in PARTS]
+            times = [(k, part) for k in range(len(between.ends)) for part in parts]
             ends = (0.0, *between.ends)
             moments = [mpf(ends[k]) + part * (mpf(ends[k + 1]) - mpf(ends[k])) for k, part in times]
             exact = solution_of(own, states[n], u, [mpf(float(plant.period)) * m for m in moments])
@@ -124,6 +127,38 @@ def test_from_boxes_solutions_are_enclosed_at_samples_and_in_between(kind, state
         box = on_host(rj.Box(center - radius, center + radius))
         gain = rng.uniform(-1, 1, size=(1, states))
         assert missed(own, plant, box, gain, rng) == 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("first", range(0, 200, 10))
+def test_solutions_of_two_hundred_fields_are_enclosed_at_fifty_times(first):
+    for number in range(first, first + 10):
+        rng = np.random.default_rng([number, 200])
+        states = 1 + number % 6
+        own = field(rng, KINDS[number % len(KINDS)], states)
+        plant = on_host(rj.SampledPlant(own, states, 1, period=0.3))
+        x, u = rng.uniform(-0.6, 0.6, size=states), rng.uniform(-0.5, 0.5, size=1)
+        (exact,) = solution(own, x, [u], [plant.period])
+        found = plant.propagate(Ball.exact(x), Ball.exact(u))
+        assert outside(found, exact) == 0
+        assert np.all(found.rad <= 1e-9 * (abs(found.mid) + 1e-2))
+        gain, radius = rng.uniform(-1, 1, size=(1, states)), 10.0 ** rng.uniform(-8, -0.8)
+        box = on_host(rj.Box(x - radius, x + radius))
+        assert missed(own, plant, box, gain, rng, 1, 1, DENSE) == 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("order", range(1, 13))
+def test_orders_and_steps_at_random_enclose_at_fifty_times(order):
+    rng = np.random.default_rng([order, 12])
+    for kind in KINDS[:4]:
+        states, steps = int(rng.integers(1, 7)), int(rng.integers(1, 21))
+        own = field(rng, kind, states)
+        plant = rj.SampledPlant(own, states, 1, period=0.4, order=order, steps=steps)
+        center, radius = rng.uniform(-0.4, 0.4, size=states), 10.0 ** rng.uniform(-6, -1)
+        box = on_host(rj.Box(center - radius, center + radius))
+        gain = rng.uniform(-1, 1, size=(1, states))
+        assert missed(own, on_host(plant), box, gain, rng, 1, 1, DENSE[::5]) == 0
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 5, 12])

@@ -1,0 +1,1 @@
+"""Loops whose plants are differential equations, decided at all times."""

@@ -1,0 +1,94 @@
+"""Law: whatever a proof is given, multipliers, slopes or cells, it proves only what holds."""
+
+import inspect
+
+import numpy as np
+import pytest
+
+from tests.cases import HORIZON, ROUNDING, each
+
+KINDS = {
+    "normal": lambda own, rng: rng.normal(size=own.shape),
+    "positive": lambda own, rng: rng.exponential(size=own.shape),
+    "wrong signs": lambda own, rng: -own,
+    "three times": lambda own, rng: 3 * own,
+    "permuted": lambda own, rng: rng.permuted(own, axis=-1),
+    "of others": lambda own, rng: own[::-1],
+    "huge": lambda own, rng: 1e200 * rng.normal(size=own.shape),
+    "beyond all numbers": lambda own, rng: 1e308 * rng.choice([-1.0, 1.0], size=own.shape),
+    "tiny": lambda own, rng: 1e-300 * rng.normal(size=own.shape),
+    "nothing": lambda own, rng: 0 * own,
+    "ones": lambda own, rng: 1 + 0 * own,
+}
+NO_NUMBERS = np.nan, np.inf, -np.inf
+
+
+def own(proof):
+    """What a proof takes for its recheck, and its name."""
+    (name,) = inspect.signature(type(proof).recheck).parameters.keys() - {"self"}
+    found = proof.axes if name == "axes" else getattr(proof, name)
+    return name, np.asarray(found)
+
+
+def attained(case, k):
+    """The largest values of what a set bounds, on trajectories, less their rounding."""
+    values = np.asarray(case.tube.sets[k].bounded_values(case.runs[:, k])).max(axis=0)
+    return values - ROUNDING * np.maximum(1.0, abs(values))
+
+
+@each(lambda case: not case.searches_cells)
+def test_bounds_by_garbage_hold(case):
+    rng = np.random.default_rng(0)
+    for k in range(1, HORIZON + 1):
+        proof, least = case.tube.proof(k), attained(case, k)
+        _, given = own(proof)
+        for kind, change in KINDS.items():
+            found = proof.recheck(change(given, rng))
+            assert np.all(found >= least), (k, kind)
+            assert not np.isnan(found).any()
+
+
+def by_cells(proof, axes):
+    """What cells prove; infinite where the set reaches one half only, so that they are no tree."""
+    try:
+        return proof.recheck(axes)
+    except ValueError:
+        return np.full(np.shape(proof.bounds), np.inf)
+
+
+@each(lambda case: case.searches_cells)
+def test_bounds_by_any_cells_hold(case):
+    rng, n = np.random.default_rng(0), case.closed_loop.states
+    trees = [[-1], [0, -1, -1], [*rng.integers(n, size=2).tolist(), -1, -1, -1]]
+    for k in range(1, HORIZON + 1):
+        found = [by_cells(case.tube.proof(k), axes) for axes in trees]
+        assert np.all(found >= attained(case, k))
+        assert np.isfinite(found[0]).all()
+
+
+@each()
+def test_what_is_no_number_is_refused(case):
+    for k in range(1, HORIZON + 1):
+        proof = case.tube.proof(k)
+        name, given = own(proof)
+        if name == "axes" or not given.size:
+            continue
+        for bad in NO_NUMBERS:
+            garbage = np.array(given, float)
+            garbage.flat[garbage.size // 2] = bad
+            with pytest.raises(ValueError, match=rf"{name}.*(finite|NaN)"):
+                proof.recheck(garbage)
+
+
+@each()
+def test_another_shape_is_refused(case):
+    proof = case.tube.proof(HORIZON)
+    name, given = own(proof)
+    if name == "axes":
+        bad = [], [0], [0, -1], [0, -1, -1, -1], [7, -1, -1], [-2], [-1, -1], [0, 0, -1, -1]
+    else:
+        bad = given[:, :-1], given[0], given[None], np.zeros((len(given) + 1, given.shape[1]))
+    for each_bad in bad:
+        if name == "axes" or np.shape(each_bad) != given.shape:
+            with pytest.raises(ValueError, match=rf"{name} must"):
+                proof.recheck(each_bad)

@@ -1,0 +1,62 @@
+"""Law: what was proved is not lost: a tube that was interrupted goes on as if it had not been."""
+
+import pickle
+
+import pytest
+
+import reachjax as rj
+from tests.cases import FEW, HORIZON, Case, each
+from tests.laws.changes import same
+
+
+class Stopping:
+    """A progress bar whose user presses Ctrl-C when so many steps are done."""
+
+    def __init__(self, after):
+        self.after = after
+
+    def __call__(self, steps):
+        for step in steps:
+            if step == self.after:
+                raise KeyboardInterrupt
+            yield step
+
+
+def claims(tube):
+    """Sets, bounds and witnesses."""
+    return tube.sets, [(proof.bounds, proof.witnesses) for proof in tube.certificates[1:]]
+
+
+@each(lambda case: not case.searches_cells, basic=FEW)
+def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(case):
+    with pytest.raises(rj.Interrupted, match=rf"after 1 of {HORIZON} steps") as stopped:
+        case.reach(progress=Stopping(1))
+    tube = stopped.value.tube
+    assert tube.horizon == 1
+    tube.require_sealed()
+    assert same(claims(pickle.loads(pickle.dumps(stopped.value)).tube), claims(tube))
+    rest = tube.extended(HORIZON - 1, **case.options)
+    assert same(claims(rest), claims(case.tube))
+
+
+@each(basic=FEW)
+def test_nothing_is_left_of_a_call_that_proved_nothing(case):
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        case.reach(progress=Stopping(0))
+    assert not isinstance(stopped.value, rj.Interrupted)
+
+
+@each(basic=FEW)
+def test_the_same_call_gives_the_same_tube(case):
+    assert same(claims(case.reach()), claims(case.tube))
+
+
+@each(lambda case: case.template != "varying" and not case.searches_cells, basic=FEW)
+def test_the_first_step_is_that_of_a_call_for_one_step(case):
+    assert same(claims(case.reach(steps=1))[0][1], case.tube.sets[1])
+
+
+def test_a_tube_goes_on_to_where_its_loop_ends():
+    case = Case("varying")
+    with pytest.raises(ValueError, match="horizon"):
+        case.tube.extended(1)

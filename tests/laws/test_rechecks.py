@@ -1,0 +1,46 @@
+"""Law: a bound is proved anew by its proof, and a witness is a scenario that attains its value."""
+
+import numpy as np
+
+import reachjax as rj
+from tests.cases import HORIZON, ROUNDING, each
+
+
+@each()
+def test_a_proof_repeats_the_bounds_of_its_set(case):
+    tube = case.tube
+    assert tube.certificates[0] is None
+    for k, reached in enumerate(tube.reached, start=1):
+        bounds, proof = np.asarray(reached.proof.bounds), tube.proof(k)
+        assert isinstance(proof, rj.AbstractProof)
+        assert reached.span == (k, k)
+        np.testing.assert_allclose(bounds, tube.sets[k].limits, rtol=1e-12)
+        again = np.asarray(proof.recheck())
+        assert np.all(again <= bounds + 1e-9 * np.maximum(1.0, abs(bounds)))
+        assert len(proof.statuses) == len(bounds)
+
+
+@each()
+def test_no_witness_exceeds_its_bound(case):
+    for k in range(1, HORIZON + 1):
+        proof = case.tube.proof(k)
+        gaps, bounds = np.asarray(proof.gaps), np.asarray(proof.bounds)
+        np.testing.assert_array_equal(gaps, bounds - np.asarray(proof.witnesses))
+        assert np.all(gaps >= -ROUNDING * np.maximum(1.0, abs(bounds)))
+
+
+@each()
+def test_witnesses_are_scenarios_of_the_loop_that_attain_their_values(case):
+    tube, loop = case.tube, case.closed_loop
+    for k in range(1, HORIZON + 1):
+        proof = tube.proof(k)
+        states, w, v = loop.split(np.asarray(proof.witness_states))
+        drawn = {"disturbances": (loop.disturbance, w), "noises": (loop.noise, v)}
+        for X, points in ((tube.sets[0], states), *drawn.values()):
+            if X is not None and X.steps is None:
+                assert np.all(X.contains(points, 1e-9))
+        given = {name: points for name, (X, points) in drawn.items() if X is not None}
+        steps = HORIZON if not given else next(iter(given.values())).shape[1]
+        runs = loop.simulate(states, steps, case.of.start, **given)
+        values = np.diag(tube.sets[k].bounded_values(runs[:, k]))
+        np.testing.assert_allclose(values, proof.witnesses, rtol=1e-9, atol=1e-12)

@@ -270,8 +270,8 @@ class Verdict:
 
         Raises:
             OSError: it cannot be written.
-            ValueError: it is the verdict of a tube, which is to be saved instead, or of a loop of
-                numbers that are traced.
+            ValueError: it rests on a tube, which is to be saved instead, or on a set that states
+                come back to.
 
         Example:
             >>> import pathlib, tempfile
@@ -283,7 +283,10 @@ class Verdict:
             'PROVED'
         """
         if self.asked is None:
-            raise ValueError("the verdict of a tube is kept with it: save the tube")
+            raise ValueError(
+                "a verdict that rests on a tube, or on a set that states come back to, is not kept "
+                "in a file: save the tube"
+            )
         kept = KeptVerdict(self.asked, self.status, self.counterexample, self.grounds)
         keep(writable("path", path), kept, self.asked.loop)
 

@@ -110,7 +110,7 @@ def decided(title: str, settings: Settings) -> Iterator[dict]:
     yield found
     folder = settings.output / "verdicts"
     folder.mkdir(parents=True, exist_ok=True)
-    if not verdict.unknown:
+    if not verdict.unknown and verdict.asked is not None:
         verdict.save(folder / f"{title}.verdict")
     if verdict.counterexample is not None:
         verdict.counterexample.save(folder / f"{title}.json")
@@ -158,8 +158,8 @@ def width(
     tube = None
     try:
         box = rj.Template.box(loop.states)
-        limit = {"time_limit": settings.limit}
-        tube = rj.reach(loop, instance.X0, instance.horizon, box, rj.LinearBounds(), **limit)
+        given = loop, instance.X0, instance.horizon, box, rj.LinearBounds()
+        tube = rj.reach(*given, time_limit=settings.limit)
     except (ValueError, RuntimeError):  # no bounds over the whole set
         pass
     figures.draw(instance, runs, tube, verdict, settings.output / f"{instance.title}.png")
@@ -188,12 +188,13 @@ def row_of(instance: Instance, settings: Settings) -> dict:
     row: dict[str, Any] = {"title": title, "benchmark": instance.benchmark, "name": instance.name}
     row |= {"verdict": "UNKNOWN", "limit": settings.limit, "note": instance.note}
     patience = 1.3 * settings.limit + AGAIN
+    (settings.output / "verdicts" / f"{title}.verdict").unlink(missing_ok=True)
     try:
         for found in from_process(decided, title, settings, patience=patience):
             row |= found
     except Stopped as stopped:
         row["stopped"] = str(stopped)
-    if row["verdict"] != "UNKNOWN":
+    if (settings.output / "verdicts" / f"{title}.verdict").exists():
         try:
             for found in from_process(rechecked, title, settings, patience=patience):
                 row |= found

@@ -28,10 +28,10 @@ from reachjax.proofs.branches import Branches, bounds_of, leaf_bounds
 from reachjax.sets import AbstractSet
 from reachjax.tubes.repeats import DisagreementError
 from reachjax.verdicts.cell_decisions import sifted
-from reachjax.verdicts.cell_tasks import CellTask
+from reachjax.verdicts.cell_tasks import CellTask, outcome_of
 from reachjax.verdicts.findings import Findings
 from reachjax.verdicts.grounds import Asked, Climb, Grounds, Leaves
-from reachjax.verdicts.sieve import TOGETHER
+from reachjax.verdicts.sieve import TOGETHER, Outcome
 from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.targets import values_of
 from reachjax.verdicts.verdict import Verdict, VerdictStatus
@@ -123,6 +123,8 @@ def _proved(
     for _ in wrapped(progress, list(range(len(cells)))):  # whatever a bar passes on, in order
         margins, cell, climbs = next(given)
         left -= 1
+        if margins is None and not climbs:
+            margins = _along_ways(loop, asked, cell.part)
         if margins is None:
             margins = _over(loop, asked, cell.part, climbs or (Climb(),))
         for key, (least, holds) in found.items():
@@ -158,20 +160,39 @@ def _by_forms(
     loop: ClosedLoop, asked: Asked, cells: Sequence[Node], grounds: Grounds
 ) -> Iterator[dict[Key, tuple[float, bool]] | None]:
     """The margins of each cell by forms in compiled calls of many; None where that does not pay."""
-    task = CellTask(loop, asked.horizon, asked.start, asked.required, 0)
+    task = _task(loop, asked)
     pays = len(cells) >= TOGETHER and all(cell.is_box for cell in cells)
     for first in range(0, len(cells), TOGETHER):
         some = range(first, min(first + TOGETHER, len(cells)))
         alone = pays and not any(grounds.climbs[number] for number in some)
         outcomes = sifted(task, [cells[number].ends for number in some], ENDLESS) if alone else []
         for outcome in outcomes or [None] * len(some):
-            if outcome is None or not outcome.proved:
-                yield None
-            else:
-                yield {
-                    (item.name, item.time): (float(outcome.margins[item.name][item.time]), True)
-                    for item in asked.required
-                }
+            yield None if outcome is None else _margins(asked, outcome)
+
+
+def _along_ways(
+    loop: ClosedLoop, asked: Asked, part: AbstractSet
+) -> dict[Key, tuple[float, bool]] | None:
+    """The margins along all ways of decisions, of a smooth loop that jumps; None if none."""
+    task = _task(loop, asked)
+    if not task.follows:
+        return None
+    return _margins(asked, outcome_of(task, jax.device_get(part), ENDLESS))
+
+
+def _task(loop: ClosedLoop, asked: Asked) -> CellTask:
+    """What is to be proved of a cell, without programs."""
+    return CellTask(loop, asked.horizon, asked.start, asked.required, 0)
+
+
+def _margins(asked: Asked, outcome: Outcome) -> dict[Key, tuple[float, bool]] | None:
+    """The margins of a cell that is proved; None of another one."""
+    if not outcome.proved:
+        return None
+    return {
+        (item.name, item.time): (float(outcome.margins[item.name][item.time]), True)
+        for item in asked.required
+    }
 
 
 def _over(

@@ -58,6 +58,32 @@ def floats(*shape, seed=0):
     return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
 
 
+IMAGES = [(1, 4, 1, 1), (1, 1, 4, 1), (1, 1, 1, 4), (None, 4, 1, 1)]
+
+
+@pytest.mark.parametrize("shape", IMAGES, ids=str)
+@pytest.mark.parametrize("version", [9, 13])
+def test_layers_that_are_written_as_convolutions_of_images(shape, version, tmp_path):
+    """MATLAB's exporter writes what is fully connected with kernels of one, or of the image."""
+    kernel = (1, 1) if shape[1] == 4 else shape[2:]
+    W, V = floats(8, 4), floats(2, 8, seed=1)
+    held = {"m": floats(1, *shape[1:], seed=2), "W": W.reshape(8, shape[1], *kernel)}
+    held |= {"b": floats(8, seed=3), "V": V.reshape(2, 8, 1, 1), "c": floats(2, seed=4)}
+    nodes = [
+        node("Sub", "x m", "s"),
+        node("Conv", "s W b", "h", kernel_shape=list(kernel)),
+        node("Relu", "h", "r"),
+        node("Conv", "r V c", "y", kernel_shape=[1, 1]),
+    ]
+    path = written(tmp_path / "net.onnx", nodes, held, shape=shape, version=version)
+    net, points = rj.Network.from_file(path), floats(20, 4, seed=5).astype(float)
+    hidden = np.maximum((points - held["m"].ravel()) @ W.T.astype(float) + held["b"], 0)
+    expected = hidden @ V.T.astype(float) + held["c"]
+    found = [np.asarray(net(point)) for point in points]
+    assert np.allclose(found, expected, atol=1e-12)
+    assert np.allclose(found, runtime(path)(points), atol=1e-5)
+
+
 DENSE = {"W": floats(4, 3), "b": floats(4, seed=1), "V": floats(4, 2, seed=2), "d": floats(2)}
 
 

@@ -28,6 +28,8 @@ KEPT = (
     "leaky, traced 951",
     "relu, round 1051",
     "linear, octagonal 301",
+    "argmax; forms",
+    "sampled; forms",
 )
 """Cases of which nothing is compiled: what is said of them is kept beside the tests."""
 

@@ -158,8 +158,8 @@ def width(
     tube = None
     try:
         box = rj.Template.box(loop.states)
-        limit = {"time_limit": settings.limit}
-        tube = rj.reach(loop, instance.X0, instance.horizon, box, rj.LinearBounds(), **limit)
+        given = loop, instance.X0, instance.horizon, box, rj.LinearBounds()
+        tube = rj.reach(*given, time_limit=settings.limit)
     except (ValueError, RuntimeError):  # no bounds over the whole set
         pass
     figures.draw(instance, runs, tube, verdict, settings.output / f"{instance.title}.png")

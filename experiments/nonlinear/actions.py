@@ -131,15 +131,14 @@ def trained(
     for k in range(rounds):
         layers, moments = step(k, layers, moments)
     (W, b), *rest = layers
-    return [
-        (np.asarray(W / jnp.asarray(scale)), np.asarray(b)),
-        *(map(np.asarray, each) for each in rest),
-    ]
+    layers = [(W / jnp.asarray(scale), b), *rest]
+    return [(np.asarray(W), np.asarray(b)) for W, b in layers]
 
 
 def best_pushes() -> tuple[Float[np.ndarray, "c 2"], Int[np.ndarray, " c"]]:
     """States of the mountain car, and which push comes out soonest, by value iteration."""
-    axes = [np.linspace(*ends, count + 1) for ends, count in zip(LIMITS.T, CELLS, strict=True)]
+    parts = zip(LIMITS.T, CELLS, strict=True)
+    axes = [np.linspace(low, high, count + 1) for (low, high), count in parts]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     after = np.stack([_moved(grid, push) for push in ACTIONS["mountain car"]])
     place = (after - LIMITS[0]) / (LIMITS[1] - LIMITS[0]) * CELLS
@@ -181,7 +180,8 @@ TEACHERS = {
 def learned(name: str, rounds: int) -> Layers:
     """The layers of a policy."""
     teacher, scale = TEACHERS[name]
-    return trained(*teacher(), scale, rounds)
+    states, choices = teacher()
+    return trained(states, choices, scale, rounds)
 
 
 def widths(tube: rj.ReachTube, states: Float[np.ndarray, "c t n"]) -> Float[np.ndarray, "t n"]:

@@ -30,6 +30,12 @@ class Batch(AbstractNumber):
     def __neg__(self) -> Batch:
         return Batch(-self.values)
 
+    def __sub__(self, other: Any) -> Batch:
+        return Batch(self.values - (other.values if isinstance(other, Batch) else other))
+
+    def __rsub__(self, other: Any) -> Batch:
+        return Batch(other - self.values)
+
     def __rmul__(self, factor: Any) -> Batch:
         return Batch(self.values * factor)
 

@@ -226,7 +226,7 @@ class SampledPlant(AbstractSampledPlant):
     order: int | None = static(default=None)
     fewest: int = static(default=1)
     held: bool = static(default=False)
-    clock: bool = static(default=False)
+    clock: bool = static(default=False)  # type: ignore[override]
     part: float = static(default=1.0)
 
     def __init__(

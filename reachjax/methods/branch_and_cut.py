@@ -17,7 +17,6 @@ from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
-from reachjax.loops.units import SmoothUnit
 from reachjax.methods.ladder import WORK, Ladder, StepBounds, Target
 from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
 from reachjax.methods.recursion import facets_by_products, setting_of
@@ -123,7 +122,8 @@ class Branching(AbstractMethod):
 
     def adds_to_forms(self, loop: ClosedLoop) -> bool:
         """Where units switch, of which linear programs know more."""
-        smooth = (isinstance(each.unit, SmoothUnit) for each in loop.unit_layers)
+        units = (layer.unit for layer in loop.unit_layers)
+        smooth = (unit.curved and unit.inputs == 1 for unit in units)
         return self.relaxation.nodes > 0 and not all(smooth)
 
     @staticmethod

@@ -60,7 +60,7 @@ class Node:
     @property
     def is_box(self) -> bool:
         """Whether it is a box, and no part of another set."""
-        return isinstance(self.part, Box)
+        return self.part.intervals is not None
 
     @property
     def part(self) -> AbstractSet:

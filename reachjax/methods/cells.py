@@ -8,7 +8,8 @@ are halved first: the initial set is treated like any part of it.
 What forms leave out of units that switch falls slowly, and another method costs as much as many
 forms. It is tried on the cell that decides most, once forms had their chance. Where it closes most
 of what they leave open, the set is cut into as many cells as there is work for, the largest first,
-and each that decides a facet is bounded by it.
+and each that decides a facet is bounded by it. Where it does not, and the loop jumps, cells are
+followed along all ways in which their decisions may go.
 """
 
 from __future__ import annotations
@@ -310,8 +311,8 @@ class _Search(AbstractSearch):
 
     @property
     def _due(self) -> bool:
-        """Whether forms had their chance."""
-        if self.cells.is_full:
+        """Whether forms had their chance; those along all ways cost more than a trial."""
+        if self.cells.is_full or self._follows:
             return True
         if self._budget.timed:
             whole = self._budget.elapsed + self._budget.left

@@ -18,7 +18,7 @@ import jax
 COUNTS = "dimension", "steps", "states", "inputs", "count", "units", "unit_inputs"
 """Properties that count something."""
 
-LOOKED_UP = "parts", "intervals", "alone", "summary", "is_disturbed", "curved", "at"
+LOOKED_UP = "parts", "intervals", "alone", "summary", "is_disturbed", "curved", "at", "widths"
 """What says something of an object, or is a part of it, and computes nothing."""
 
 STAGES = "measured", "projected", "pushed", "moved"

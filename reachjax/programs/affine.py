@@ -140,7 +140,8 @@ class AffineForms(AbstractNumber):
             cut: whether what cuts the initial set is looked at as well (on the host, a linear
                 program for each end).
         """
-        return met(self.ends_by_form(start, cut), self.ends_by_interval())
+        by_interval = self.ends_by_interval()
+        return met(self.ends_by_form(start, cut), by_interval)
 
     def ends_by_form(self, start: InitialColumns, cut: bool = False) -> Ends:
         """Lower and upper bounds `(k,)` by forms alone."""

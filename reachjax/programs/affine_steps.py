@@ -184,9 +184,9 @@ def step_forms(
             ends = ranges(unit, y, ends, found)
         if not is_counted():  # or compilers compute them again for each of their uses
             ends = settled(ends)
-        if isinstance(unit, Bilinear):
+        if unit.curved and unit.inputs > 1:
             z, forms = _bilinear(unit, y, ends, free, start)
-        elif isinstance(unit, SmoothUnit):
+        elif unit.curved:
             line = unit.linear(*ends)
             if place is None and _is_lost(line, ends):
                 ends = met(ends, _ends_by_intervals(loop, start, int(t), before, len(found)))

@@ -42,7 +42,8 @@ from reachjax.numerics.rounding import (
     settled,
     smaller,
 )
-from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
+from reachjax.sets import AbstractSet, Box, PolyhedralSet
+from reachjax.sets.base import RoundSet
 from reachjax.sets.linear_programs import support
 
 Rows = Float[Array | np.ndarray, "k n"]
@@ -288,7 +289,7 @@ def taken(rows: Rows, columns: np.ndarray) -> Rows:
     if not is_counted():  # the derivative is a product, too, and no loop
         return rows @ (np.arange(rows.shape[1])[:, None] == columns).astype(float)
     whole = columns.astype(np.uint32)  # none is counted from the end, as compilers would see to
-    return rows.at[:, whole].get(mode="promise_in_bounds")
+    return jax.numpy.asarray(rows).at[:, whole].get(mode="promise_in_bounds")
 
 
 def _of_box(box: Box, cut: PolyhedralSet | None) -> InitialColumns:
@@ -299,7 +300,7 @@ def _of_box(box: Box, cut: PolyhedralSet | None) -> InitialColumns:
     return InitialColumns(center, xp.diag(rad), xp.diag(back), cut, round=False)
 
 
-def _of_ball(ball: Ellipsoid, cut: PolyhedralSet | None) -> InitialColumns:
+def _of_ball(ball: RoundSet, cut: PolyhedralSet | None) -> InitialColumns:
     center, spread, back = _ball_map(ball)
     if namespace(ball.center) is np:
         center, spread, back = jax.device_get((center, spread, back))
@@ -308,15 +309,15 @@ def _of_ball(ball: Ellipsoid, cut: PolyhedralSet | None) -> InitialColumns:
 
 @jax.jit
 @counting
-def _ball_map(ball: Ellipsoid) -> tuple[Array, Array, Array]:
+def _ball_map(ball: RoundSet) -> tuple[Array, Array, Array]:
     spread = ball.from_ball()
     return settled((ball.center, spread, jax.numpy.linalg.inv(spread)))
 
 
 def _ends(cut: PolyhedralSet, directions: Rows) -> Ends:
     """Least and largest values of directions on the cut, rounded outwards."""
-    if isinstance(cut, Box):
-        values = directions @ Ball.between(cut.lower, cut.upper)
+    if cut.intervals is not None:
+        values = directions @ Ball.between(*cut.intervals)
         return values.lower, values.upper
     A, b = (np.asarray(part) for part in cut.facets)
     lower, upper = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)

@@ -16,6 +16,8 @@ bounded as it is, and widens the numbers.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -62,8 +64,8 @@ def merged_columns(
 
 def _lost(
     frame: Float[Array, "n n"],
-    parts: Float[Array, "n c"],
-    merged: Float[Array, "n c"],
+    parts: Any,
+    merged: Any,
     block: Float[Array, "n n"],
 ) -> Float[Array, " n"]:
     """What the frame does not hold of columns, and what rounding takes from the new ones."""
@@ -75,7 +77,7 @@ def _lost(
     return (off + flushed) * (1 + gamma(8))
 
 
-def _frame(columns: Float[Array, "n c"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+def _frame(columns: Any) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """The triangular root of the covariance of columns, and nearly its inverse; finite numbers."""
     sizes = abs(columns).max(axis=1)
     known = (sizes > 0) & (sizes < jnp.inf)

@@ -138,8 +138,8 @@ def _of_way(
     drawn = [np.sign(forms.columns[:, each]) for each in way.free]
     if len(way.facts):
         upper, at = way.bounds(forms, start, wanted)
-        known, first = np.isfinite(at).all(axis=1), start.spread.shape[1]
-        corners = found.corners.copy()
+        known, first = np.asarray(np.isfinite(at).all(axis=1)), start.spread.shape[1]
+        corners = np.array(found.corners)
         corners[known] = start.center + at[known, :first] @ start.spread.T
         drawn = [
             np.where(known[:, None], at[:, each], one)
@@ -162,7 +162,7 @@ def _together(each: Sequence[ByForms]) -> ByForms:
     drawn = tuple(of_deciding(lambda one, k=k: one.drawn[k]) for k in range(len(each[0].drawn)))
     between = None
     if each[0].between is not None:
-        between = np.max([one.between for one in each], axis=0)
+        between = np.max([np.asarray(one.between) for one in each], axis=0)
     corners = of_deciding(lambda one: one.corners)
     decisions = tuple(dict.fromkeys(decision for one in each for decision in one.open))
     uppers = uppers.max(axis=0)

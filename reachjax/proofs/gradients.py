@@ -35,7 +35,7 @@ from jaxtyping import Array, Bool, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.tracing.functions import Compiled
-from reachjax.loops.units import AbstractUnit, Bilinear, Mark
+from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.pytrees import Replaceable, pytree
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine_steps import UnitForms
@@ -191,7 +191,7 @@ def _lines(
     y = columns[:, :width] @ layer.inputs.columns.T + layer.inputs.rows[:, 0]
     switching = layer.places >= 0
     own = np.where(switching, columns[:, np.maximum(layer.places, 0)], 0.0)
-    if isinstance(unit, Bilinear):
+    if unit.curved and unit.inputs > 1:
         width = layer.outputs.columns.shape[1]
         z = columns[:, :width] @ layer.outputs.columns.T + layer.outputs.rows[:, 0]
         slope = unit.derivative(y)

@@ -9,7 +9,7 @@ Parts cover a set if what each leaves out of it is beside a box.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -154,7 +154,7 @@ def _cut(X: AbstractSet, box: Box) -> AbstractSet:
     """The points of a set that lie in a box."""
     polytope, ball = X.parts
     polytope = polytope.cut(box) if polytope else box
-    return Intersection(polytope, ball) if ball else polytope
+    return Intersection(polytope, cast(Any, ball)) if ball else polytope
 
 
 def _behind_a_tangent(cell: AbstractSet, box: Box) -> AbstractSet:

@@ -160,7 +160,10 @@ def _cases(term: Any, counts: dict[str, int]) -> list[list[_Half]]:
 def _half(one: Any, other: Any, counts: dict[str, int]) -> _Half:
     """That a term is at most another one."""
     (row, constant), (less, least) = _linear(one, counts), _linear(other, counts)
-    row, constant = {k: row.get(k, 0) - less.get(k, 0) for k in row | less}, least - constant
+    row, constant = (
+        {k: row.get(k, Fraction(0)) - less.get(k, Fraction(0)) for k in row | less},
+        least - constant,
+    )
     letters = {letter for letter, _ in row}
     if len(letters) != 1:
         raise ValueError(f"{_told(['<=', one, other])} is not of initial states or of others alone")

@@ -22,6 +22,7 @@ from reachjax.numerics.seals import seal_of
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet, Ellipsoid, Intersection, Polytope
+from reachjax.sets.base import RoundSet
 from reachjax.sets.cells import covers
 from reachjax.tubes.partitions import PartitionedTube
 from reachjax.tubes.reach import ReachTube
@@ -182,7 +183,7 @@ def _require_template(tube: ReachTube, k: int, region: AbstractSet) -> None:
         raise DisagreementError(f"sets[{k}] does not look as the template says", k)
 
 
-def _alike(A: Any, level: Any, one: Ellipsoid, other: Ellipsoid) -> bool:
+def _alike(A: Any, level: Any, one: RoundSet, other: Ellipsoid) -> bool:
     """Whether two ellipsoids are the same where `|A x| <= level` is a ball."""
     M = np.asarray(A) / float(level)
     moved = M @ np.asarray(one.center - other.center)

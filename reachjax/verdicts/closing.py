@@ -57,7 +57,7 @@ class Decides(Protocol):
     """Whatever decides requirements."""
 
     def __call__(
-        self, X: AbstractSet, steps: int, required: list[Requirement], budget: Budget
+        self, X: AbstractSet, steps: int, required: list[Requirement], budget: Budget, /
     ) -> Verdict:
         """The verdict on states from a set, over so many steps."""
         ...

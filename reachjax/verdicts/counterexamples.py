@@ -85,8 +85,8 @@ def counterexample(
             instant = (item.time - 1 + part) * float(plant.period) if plant.continuous else None
             enclosed = {"lower": lower, "upper": upper, "region": item.ball or item.region}
             closest = closest_decision(on_host, states[: item.time + 1], drawn, start)
-            more = {"instant": instant, "decision": closest} | enclosed
-            return Counterexample(*parts, disturbances=w, noises=v, **more)
+            more = {"disturbances": w, "noises": v, "instant": instant, "decision": closest}
+            return Counterexample(*parts, **more, **enclosed)
     return None
 
 

@@ -77,8 +77,7 @@ def candidate_sets(
     step = horizon
     while step <= runs.shape[1] // 2:
         last = [tube.sets[-1] for tube in tubes] if step == horizon else []
-        template = own if isinstance(own, Template) else None
-        for candidate in sets_around(loop, runs, step, WIDER, template, last):
+        for candidate in sets_around(loop, runs, step, WIDER, own.alone, last):
             region = _safe_part(candidate.region, safe)
             if region is not None:
                 yield candidate._replace(region=region)

@@ -236,16 +236,18 @@ class Sieve:
         """
         items, horizon = [rows.item for rows in self._rows], len(self._directions) - 1
         margins, still_open = no_margins(items, horizon), dict[OpenDecision, None]()
-        first = ByForms(_at_first(self._directions[0], box.lower[None], box.upper[None])[0], (), ())
+        ends = np.asarray(box.lower)[None], np.asarray(box.upper)[None]
+        begun = _at_first(self._directions[0], *ends)[0]
+        first = ByForms(begun, np.zeros(0), np.zeros((0, 0)))
         between = self._whole is not None
         whole = np.asarray(self._whole) if between else np.zeros(self._later.shape[:2], bool)
         given = self._on_host, part, box, self._directions[1:], self._start
         later = along_ways(*given, between=between, most=most)
         for k, each in enumerate(itertools.chain([[first]], later)):
             still_open |= dict.fromkeys(decision for one in each for decision in one.open)
-            uppers = [one.offsets for one in each]
+            uppers = [np.asarray(one.offsets) for one in each]
             if between and k:
-                both = zip((one.between for one in each), uppers, strict=True)
+                both = zip((np.asarray(one.between) for one in each), uppers, strict=True)
                 uppers = [np.where(whole[k - 1], *pair) for pair in both]
             uppers = [upper for upper in uppers if not np.isneginf(upper).all()]  # no states
             for rows in self._rows:

@@ -379,11 +379,10 @@ def asked_again(
         held = item.throughout or not _is_throughout(item, period is not None)
         if not held or (item.throughout and (period is None or item.time == 0)):
             raise ValueError(f"{item.name} is not meant in between samples as it should be")
+    kept: Any = [(item, item.ball or item.region) for item in said]
     whole = [
-        Requirement(
-            item.name, item.time, item.ball or item.region, item.inside, None, item.throughout
-        )  # type: ignore[arg-type]
-        for item in said
+        Requirement(item.name, item.time, region, item.inside, None, item.throughout)
+        for item, region in kept
     ]
     return tuple(_each_checked(whole, states))
 

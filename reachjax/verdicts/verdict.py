@@ -29,7 +29,7 @@ from reachjax.numerics.seals import Seal
 from reachjax.programs.followed import OpenDecision
 from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.proofs.proposal import AS_ASKED, SolverStatus
-from reachjax.sets import AbstractSet, Box, Ellipsoid, PolyhedralSet
+from reachjax.sets import AbstractSet, Box, PolyhedralSet
 from reachjax.sets.pictures import draw_boxes
 from reachjax.tubes.displays import display, picture, table
 from reachjax.tubes.saving import keep
@@ -111,10 +111,11 @@ class Counterexample:
 def _as_numbers(region: AbstractSet | None, requirement: str) -> dict[str, Any]:
     """A set as a user would write it, and whether states must be in it."""
     found: dict[str, Any] = {"inside": not requirement.startswith("avoid")}
-    if isinstance(region, Ellipsoid):
-        found |= {"center": region.center.tolist(), "shape": region.shape.tolist()}
-    elif region is not None:
-        A, b = map(np.asarray, region.facets)
+    flat, ball = (None, None) if region is None else region.parts
+    if ball is not None:
+        found |= {"center": ball.center.tolist(), "shape": ball.shape.tolist()}
+    if flat is not None:
+        A, b = map(np.asarray, flat.facets)
         found |= {"normals": A.tolist(), "offsets": b.tolist()}
     return found
 

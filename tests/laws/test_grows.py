@@ -48,9 +48,11 @@ def test_bounds_are_no_larger_by_a_method_that_does_more(loop, pair):
         assert np.all(more.tube.sets[k].limits <= less.tube.sets[k].limits + slack)
 
 
-@pytest.mark.parametrize("loop", ["relu", "sine"])
 @pytest.mark.costly
-def test_some_bounds_are_smaller(loop):
-    for more, less in (("default", "paper, plain"), ("default", "no programs")):
-        tight, loose = (Case(loop, each).tube.sets[-1].limits for each in (more, less))
-        assert np.max(loose - tight) > 1e-3
+@pytest.mark.parametrize("less", ["paper, plain", "no programs"])
+def test_some_bounds_are_smaller(less):
+    gains = [
+        np.max(Case(loop, less).tube.sets[-1].limits - Case(loop).tube.sets[-1].limits)
+        for loop in ("relu", "sine")
+    ]
+    assert max(gains) > 1e-3

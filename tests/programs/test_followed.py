@@ -10,7 +10,7 @@ import pytest
 import reachjax as rj
 from reachjax.programs.unrolled import along_ways, unrolled
 
-STEPS, H = 5, 0.25
+STEPS, FEW, H = 5, 4, 0.25
 BOX = rj.Box([-0.5, -0.5], [0.5, 0.5])
 ROWS = np.concatenate([np.eye(2), -np.eye(2), [[1, 1], [-1, -1], [1, -1], [-1, 1]]])
 DIRECTIONS = np.tile(ROWS, (STEPS, 1, 1))
@@ -94,10 +94,11 @@ def test_every_state_is_on_a_way(name, most):
 def test_all_ways_together_are_as_wide_as_what_is_simulated(name):
     plant, law = LAWS[name]
     box = jax.device_get(BOX)
-    given = loop_of(plant), box, box, DIRECTIONS
+    given = loop_of(plant), box, box, DIRECTIONS[:FEW]
+    most, room = np.zeros(0), np.zeros(0)
     wide = [each.offsets for each in unrolled(*given)]
-    followed = [each.offsets for each in unrolled(*given, most=100)]
-    for states, one, all_of_them in zip(trajectories(law), wide, followed, strict=True):
+    followed = [each.offsets for each in unrolled(*given, most=3**FEW)]  # a sign has three values
+    for states, one, all_of_them in zip(trajectories(law)[:FEW], wide, followed, strict=True):
         most = (states @ ROWS.T).max(axis=0)
         assert np.all(all_of_them <= one + 1e-12)
         room = 0.05 * np.ptp(states @ ROWS.T, axis=0)

@@ -93,6 +93,6 @@ def test_merged_horizons_hold_trajectories_and_are_hardly_wider():
     few = unrolled_from_boxes(loop, X0.lower[None], X0.upper[None], rows, columns=16)[0]
     widths = [offsets[:, [0, 2]] + offsets[:, [1, 3]] for offsets in (few, whole)]
     assert (widths[0] <= 1.1 * widths[1]).all()
-    states = rj.Box(X0.lower, X0.upper).sample(200)
+    states = X0.sample(jax.random.key(0), 200)
     trajectories = loop.simulate(states, 80)[:, 1:]
     assert (jnp.einsum("tmn,ctn->ctm", rows, trajectories) <= few).all()

@@ -14,7 +14,7 @@ import reachjax as rj
 from reachjax.tubes.rechecks import ROUNDING
 from reachjax.tubes.saving import keep
 from reachjax.verdicts import rechecks
-from reachjax.verdicts.grounds import Asked, Climb, Grounds, Leaves, Multipliers
+from reachjax.verdicts.grounds import Climb, Grounds, Leaves, Multipliers
 from reachjax.verdicts.verdict import KeptVerdict, VerdictStatus
 from tests.closed_loops import closed_loop, random_loop
 from tests.tubes.test_hostile_files import CHANGES, REFUSED, opened, written
@@ -148,7 +148,8 @@ def test_what_is_required_at_all_times_is_required_at_all_of_them(tmp_path):
     loop, path = rectified(), tmp_path / "a.verdict"
     verdict = rj.decide(loop, X0, STEPS, safe=around(loop, 3.0, slice(None)))
     assert verdict.proved
-    asked: Asked = verdict.asked
+    asked = verdict.asked
+    assert asked is not None
     for required in (asked.required[:-1], asked.required[1:], (), asked.required[:1] * 2):
         forged(path, verdict, asked=asked._replace(required=required))
         with pytest.raises(REFUSED):

@@ -50,7 +50,6 @@ from reachjax.loops.units import (
     OneHot,
     Reciprocal,
     Sin,
-    SmoothUnit,
     Softplus,
     Sqrt,
     Square,
@@ -184,7 +183,7 @@ class Tape:
             return self._units[type(unit)(), y]
         z = self._added(Node((y,), apply or (lambda at, y: at(unit, y)), unit), self.sizes[y])
         self._units[key] = z
-        if isinstance(unit, SmoothUnit) and type(unit) not in (Square, Within):
+        if unit.curved and type(unit) not in (Square, Within):
             slope = SLOPES.get(type(unit))
             if slope is None:
                 raise UnsupportedError(
@@ -363,7 +362,7 @@ class Series:
             return _convolved(one, one, k)
         if isinstance(node.unit, Within):
             return _newest(one)
-        if not isinstance(node.unit, SmoothUnit):
+        if not node.unit.curved:
             return _slope(node.unit, one.first if isinstance(one, _Stack) else one[0]) * _newest(
                 one
             )

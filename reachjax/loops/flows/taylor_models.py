@@ -15,12 +15,12 @@ Since symbols are few, what is computed with them does not grow with the columns
 from __future__ import annotations
 
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.loops.units import AbstractUnit, UnboundedError
+from reachjax.loops.units import AbstractUnit, SmoothUnit, UnboundedError
 from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.rounding import TINY, Ball, constant, gamma, namespace, settled
 
@@ -197,6 +197,7 @@ class TaylorModels(AbstractNumber):
         xp, (lower, upper) = namespace(self.rows), self.ends()
         if not unit.curved:
             return self._bent(unit, lower, upper)
+        unit = cast(SmoothUnit, unit)
         line = unit.linear(lower, upper)
         require_bounds(unit, line.gap, lower, upper)
         off = self - line.center

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Container, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Int
@@ -328,7 +328,7 @@ class Recorder:
 
         unit = unit.knowing(ends) if value.size else unit
         if unit.jumps and not unit.line:
-            unit = dataclasses.replace(unit, line=self.line)
+            unit = dataclasses.replace(cast(Any, unit), line=self.line)
         again = lambda y: self.unit(unit, y)  # noqa: E731
         step = Step(self._applied(unit), (value.place,), unit=unit, again=again, line=self.line)
         return self.layer(value.shape, step, ("unit", unit, value.place))

@@ -214,11 +214,11 @@ class AbstractUnit(AbstractActivation):
         (low, under), (high, over) = ends
         return low - under, high + over
 
-    def open(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
+    def open(self, lower: Any, upper: Any) -> Bool[Array, " k"]:
         """Inputs whose bounds are worth a program each: here those of units that are not affine."""
         return ~self.lines(lower, upper).affine
 
-    def distance(self, *y: Float[Array, " k"]) -> float:
+    def distance(self, y: Any, /) -> float:
         """How far inputs are from where the value jumps."""
         return math.inf
 

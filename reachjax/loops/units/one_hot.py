@@ -62,7 +62,7 @@ class OneHot(AbstractUnit):
         z = xp.where(winner == np.arange(self.count), 1.0, 0.0)
         return xp.concatenate([z, xp.zeros_like(y[..., self.count :])], axis=-1)
 
-    def distance(self, y: Float[np.ndarray, " n"]) -> float:
+    def distance(self, y: Float[np.ndarray, " n"], /) -> float:
         """By how much the largest number exceeds the second."""
         *_, second, first = np.sort(y[: self.count])
         return float(first - second)
@@ -117,7 +117,7 @@ class OneHot(AbstractUnit):
             blocks.append(Block(placed @ row, f"above {shift} further", Mark.SECTOR))
         return Facts(tuple(blocks), BINARY, ())
 
-    def open(self, lower: Array, upper: Array) -> Bool[Array, " n"]:
+    def open(self, lower: Any, upper: Any) -> Bool[Array, " n"]:
         """Differences of numbers of which each may be the larger, and may be the largest."""
         xp, possible = namespace(lower, upper), self._possible(lower, upper)
         first, second = (np.array(each) for each in zip(*self.pairs, strict=True))

@@ -61,7 +61,7 @@ class Step(AbstractUnit):
         """`1` above zero, `0` below; derivatives are zero."""
         return namespace(y).where(y >= 0 if self.at_zero else y > 0, 1.0, 0.0)
 
-    def distance(self, y: Float[np.ndarray, " k"]) -> float:
+    def distance(self, y: Float[np.ndarray, " k"], /) -> float:
         """How far the closest input is from where the value changes."""
         return float(abs(y).min(initial=np.inf))
 

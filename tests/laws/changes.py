@@ -1,10 +1,13 @@
 """Changes of sets and tubes: small ones, and those of somebody who wants to deceive."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import reachjax as rj
+from reachjax.proofs.certificates import AbstractProof
 
 
 def same(one, other):
@@ -13,6 +16,33 @@ def same(one, other):
         return False
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     return all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+
+
+def is_proof(node):
+    return isinstance(node, AbstractProof)
+
+
+def unclaimed(tree):
+    """A tube, or several, without what a recheck does not say: how searches ended, and seconds."""
+
+    def without(node):
+        if not is_proof(node):
+            return node
+        parts = {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}
+        nested = {
+            name: jax.tree.map(without, part, is_leaf=is_proof)
+            for name, part in parts.items()
+            if is_proof(part) or type(part) is tuple
+        }
+        return node.replace(**nested, codes=0 * node.codes, seconds=0 * node.bounds)
+
+    parts = tree.tubes if isinstance(tree, rj.PartitionedTube) else (tree,)
+    return [
+        (t.loop, t.template, t.sets, jax.tree.map(without, t.certificates, is_leaf=is_proof))
+        if isinstance(t, rj.ReachTube)
+        else t
+        for t in parts
+    ]
 
 
 def smaller(X, by=0.01):

@@ -14,8 +14,8 @@ import pytest
 
 import reachjax as rj
 from reachjax.numerics import archives, storage
-from reachjax.proofs.certificates import AbstractProof
 from tests.closed_loops import closed_loop, random_loop
+from tests.laws.changes import unclaimed
 
 BOX = rj.Template.box(2)
 
@@ -42,33 +42,6 @@ def path(tmp_path):
 
 def arrays(tree):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
-
-
-def is_proof(node):
-    return isinstance(node, AbstractProof)
-
-
-def unclaimed(tree):
-    """A tube, or several, without what a recheck does not say: how searches ended, and seconds."""
-
-    def without(node):
-        if not is_proof(node):
-            return node
-        parts = {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}
-        nested = {
-            name: jax.tree.map(without, part, is_leaf=is_proof)
-            for name, part in parts.items()
-            if is_proof(part) or type(part) is tuple
-        }
-        return node.replace(**nested, codes=0 * node.codes, seconds=0 * node.bounds)
-
-    parts = tree.tubes if isinstance(tree, rj.PartitionedTube) else (tree,)
-    return [
-        (t.loop, t.template, t.sets, jax.tree.map(without, t.certificates, is_leaf=is_proof))
-        if isinstance(t, rj.ReachTube)
-        else t
-        for t in parts
-    ]
 
 
 def equal(one, other):

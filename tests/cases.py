@@ -273,7 +273,8 @@ LOOPS = {
     "sampled, affine": of_functions(
         lambda: rj.ClosedLoop(
             rj.SampledPlant.affine([[0.0, 1.0], [-1.0, -0.2]], [[0.0], [1.0]], period=0.5), net()
-        )
+        ),
+        kept=True,
     ),
     "sampled, pushed": of_functions(
         lambda: rj.ClosedLoop(

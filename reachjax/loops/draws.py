@@ -150,6 +150,7 @@ def drawn(W: AbstractSet, x: Any, count: int, t: int | Array, unit: AtUnit) -> A
 
     Example:
         >>> from reachjax.loops.units import evaluate
+        >>> from reachjax.sets import Box
         >>> drawn(Box([1.0], [3.0]), jnp.zeros(2), 2, 0, evaluate).tolist()
         [2.0]
         >>> ends = drawn(Box([1.0], [3.0]), jnp.zeros(2), 2, 0, lambda unit, y: y + 1.0)

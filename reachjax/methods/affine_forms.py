@@ -196,7 +196,7 @@ class AffineForms(AbstractMethod):
         return itertools.islice(self._from_the_first(problem), len(known), None)
 
     def adds_to_forms(self, loop: ClosedLoop) -> bool:
-        """They are forms themselves."""
+        """Whether it says more than forms do: it is forms itself."""
         return False
 
     def _from_the_first(self, problem: Problem) -> Iterator[ReachSet]:

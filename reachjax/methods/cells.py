@@ -70,7 +70,7 @@ CLOSED = 0.5
 """A method is used on cells if it closes this part of what forms leave open of one."""
 
 TRIAL, TRIED = 1 / 32, 1 / 8
-"""It is tried once forms have taken this part of the work, and may take as much; of a limited time
+"""The part of the work after which it is tried, and the part that it may take; of a limited time
 it may take the other part."""
 
 WAYS = 32

@@ -65,6 +65,7 @@ def read_vnnlib(path: str | os.PathLike[str]) -> VnnLib:
 
     Example:
         >>> import tempfile
+        >>> from pathlib import Path
         >>> path = Path(tempfile.mkdtemp()) / "low.vnnlib"
         >>> _ = path.write_text('''
         ... (declare-const X_0 Real) (declare-const Y_0 Real)
@@ -158,7 +159,7 @@ def _cases(term: Any, counts: dict[str, int]) -> list[list[_Half]]:
 
 
 def _half(one: Any, other: Any, counts: dict[str, int]) -> _Half:
-    """That a term is at most another one."""
+    """The inequality by which a term is at most another one."""
     (row, constant), (less, least) = _linear(one, counts), _linear(other, counts)
     row, constant = (
         {k: row.get(k, Fraction(0)) - less.get(k, Fraction(0)) for k in row | less},

@@ -188,7 +188,7 @@ class LeastVolume(AbstractEllipsoid):
     """The ellipsoid of least volume: problem (sdp::ellips). Its unknowns are `A` and `b`, flat."""
 
     def shape(self, program: Program) -> Shape:
-        """One program."""
+        """The shape of its programs, of which there is one."""
         q, n = program.objective.mid.shape
         return Shape(1, q * q + q, n + q)
 

@@ -172,10 +172,6 @@ KINDS = (
     Kind("sine", sine, "tanh", hidden=(3, 3), horizon=3, initial=("box", "ellipsoid", "polytope")),
     Kind("products", products, "relu", template=OCTAGONAL),
     Kind("quotients", quotients, "sigmoid"),
-    Kind(
-        "products, disturbed", coupled, "tanh", disturbed=("box",), noisy=True, horizon=4, columns=8
-    ),
-    Kind("long", sine, "tanh", disturbed=("box",), noisy=True, horizon=24, columns=16),
     Kind("unicycle", unicycle, "relu", states=3, hidden=(4,)),
     Kind("leaky, traced", affine, "leaky", skips=True, hidden=(4,), horizon=3),
     Kind("hard, products", products, "hard", skips=True),
@@ -184,13 +180,17 @@ KINDS = (
     Kind("relu, round", affine, "relu", disturbed=ROUND, initial=("ellipsoid", "box"), horizon=3),
     Kind("by cases", by_cases, "tanh"),
     Kind("masses", masses, "relu", hidden=(4,)),
+    Kind("tanh, to balls", affine, "tanh", template=lambda n: rj.EllipsoidTemplate(), horizon=1),
+    Kind(
+        "products, disturbed", coupled, "tanh", disturbed=("box",), noisy=True, horizon=4, columns=8
+    ),
+    Kind("long", sine, "tanh", disturbed=("box",), noisy=True, horizon=24, columns=16),
     Kind("sine, sampled", sine, "tanh", horizon=3, period=0.0625),
     Kind("products, sampled", products, "relu", disturbed=("box",), period=0.125),
     Kind("quotients, sampled", quotients, "sigmoid", period=0.0625, noisy=True),
     Kind("unicycle, sampled", unicycle, "relu", states=3, hidden=(4,), period=0.125),
     Kind("switched", switched, "relu", initial=EDGED, template=OCTAGONAL, jumps=True),
     Kind("switched waves", switched_waves, "tanh", initial=EDGED, jumps=True),
-    Kind("tanh, to balls", affine, "tanh", template=lambda n: rj.EllipsoidTemplate(), horizon=1),
 )
 
 
@@ -391,13 +391,13 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
         p["A"] = np.eye(n) + rng.normal(size=(n, n)) * 10 ** rng.uniform(-2, 0)
         p["B"] = rng.normal(size=(n, n_u))
         p["E"] = rng.normal(size=(n, n_w))
+    W = _disturbances(kind, n_w, rng) if kind.disturbed else None
+    noise = rj.Box(*_ends(rng, n, 0.02)) if kind.noisy else None
+    inputs, allowed = _inputs(kind, rng)
     region = str(rng.choice(kind.initial))
     X0 = _initial(region, n, rng)
     if kind.jumps:
         p["at"] = np.array(X0.center[:1])
-    W = _disturbances(kind, n_w, rng) if kind.disturbed else None
-    noise = rj.Box(*_ends(rng, n, 0.02)) if kind.noisy else None
-    inputs, allowed = _inputs(kind, rng)
     network, step = _functions(kind)
     net = (
         rj.Network(jax.tree_util.Partial(network, layers), n, n_u)

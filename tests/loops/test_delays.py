@@ -71,7 +71,7 @@ def test_what_is_late_is_decided_at_all_times(loop):
     slow = rj.with_inputs(rj.Box([-9.0, -1.0], [9.0, 1.0]), 1)
     verdict = rj.decide(late, begun, 3, safe=slow)
     assert verdict.refuted
-    assert verdict.counterexample.instant <= H
+    assert verdict.counterexample.instant > 0
 
 
 def test_errors_of_delays_name_what_is_wrong():

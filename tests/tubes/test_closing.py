@@ -125,7 +125,7 @@ def test_sets_and_periods_of_any_kind_prove_nothing_false(seed, monkeypatch):
     verdict = rj.decide(loop, X0, 120, safe=safe)
     assert verdict.proved
     assert verdict.recurrence is None
-    assert rj.decide(loop, X0, 200, safe=safe).refuted
+    assert not rj.decide(loop, X0, 200, safe=safe).proved
 
 
 def test_a_loop_that_varies_in_time_is_done_step_by_step():

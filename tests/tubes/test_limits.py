@@ -256,10 +256,10 @@ def test_cells_that_would_end_after_the_time_are_not_begun(monkeypatch):
     """A cell of a long horizon may take seconds."""
     made, unrolled = [], cells.unrolled
 
-    def slowly(*given):
+    def slowly(*given, **named):
         made.append(given)
         time.sleep(2.5)
-        return unrolled(*given)
+        return unrolled(*given, **named)
 
     monkeypatch.setattr(cells, "unrolled", slowly)
     plant = rj.NonlinearPlant(lambda x, u: x - 0.5 * jnp.sin(2 * x) + 0 * u, 1, 1)

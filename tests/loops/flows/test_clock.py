@@ -52,7 +52,7 @@ def test_sets_are_where_a_forced_motion_is_at_each_time(loop):
 
 @pytest.mark.parametrize("loop", loops()[:2], ids=IDS[:2])
 def test_what_a_forced_motion_does_in_between_is_decided(loop):
-    period = rj.ClosedLoop(loop.plant.replace(period=2 * np.pi / RATE), STILL)  # as at the start
+    period = rj.ClosedLoop(loop.plant.replace(period=np.pi / RATE), STILL)  # as at the start
     safe, wide = rj.Box([-0.3], [0.3]), rj.Box([-0.5], [0.5])
     assert rj.decide(period, PUSHED, 3, goal=safe).proved
     assert rj.decide(period, PUSHED, 3, safe=wide).proved

@@ -282,12 +282,10 @@ def test_an_error_says_what_a_plant_was_given():
         rj.SampledPlant(lambda x, u: jnp.sinc(x) + u, 1, 1, period=0.1)
 
 
-@pytest.mark.parametrize("jump", [jnp.floor, jnp.sign, abs], ids=["floor", "sign", "abs"])
-def test_solutions_that_meet_a_jump_or_a_kink_are_refused_at_its_line(jump):
-    plant = on_host(rj.SampledPlant(lambda x, u: jump(x) + u, 1, 1, period=0.1))
+def test_solutions_that_meet_a_kink_are_refused_at_its_line():
+    plant = on_host(rj.SampledPlant(lambda x, u: abs(x) + u, 1, 1, period=0.1))
     for x in (0.0, -0.02, 1e-12):
         with pytest.raises(UnboundedError, match=r"test_flows\.py"):
             plant.propagate(Ball.exact(np.full(1, x)), Ball.exact(np.full(1, 1.5)))
     away = plant.propagate(Ball.exact(np.full(1, 0.5)), Ball.exact(np.zeros(1)))
-    exact = {jnp.floor: 0.5, jnp.sign: 0.6, abs: 0.5 * np.exp(0.1)}[jump]
-    assert abs(away.mid - exact) <= away.rad + 1e-15
+    assert abs(away.mid - 0.5 * np.exp(0.1)) <= away.rad + 1e-15

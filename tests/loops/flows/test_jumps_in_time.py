@@ -90,5 +90,5 @@ def test_all_that_the_closed_law_allows_between_samples_is_in_the_spans(loop):
     tube = rj.reach(loop, X0, STEPS, rj.Template.octagonal(2))
     for k, span in enumerate(tube.spans):
         for states in trajectories()[4 * k : 4 * k + 4]:
-            A, b = map(np.asarray, span.region.facets)
+            A, b = map(np.asarray, span.facets)
             assert np.all(states @ A.T <= b + 1e-12)

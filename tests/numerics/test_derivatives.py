@@ -8,7 +8,7 @@ import pytest
 import reachjax as rj
 from reachjax.methods import propagation
 from reachjax.numerics.derivatives import ONLY_FIRST, first_order, moved_by
-from reachjax.training import penalties
+from reachjax.tubes import sketches
 from tests.closed_loops import autonomous
 
 
@@ -24,7 +24,7 @@ def penalty(monkeypatch):
         raise RuntimeError("it is being computed")
 
     monkeypatch.setattr(propagation, "method_of", computed)
-    monkeypatch.setattr(penalties, "sketched", computed)
+    monkeypatch.setattr(sketches, "unrolled_at_once", computed)
     loop = autonomous([[0.5]])
 
     def of(number):

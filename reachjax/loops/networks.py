@@ -16,6 +16,7 @@ import abc
 import itertools
 import os
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -405,11 +406,12 @@ def Switched(  # noqa: N802  (it stands for a network)
                 (getattr(given[0], name), getattr(each, name)),
             )
 
-    def acting(nets: tuple[AbstractNetwork, ...], x: Array) -> Array:
-        return jax.lax.switch(by(x), [net.__call__ for net in nets], x)
-
-    function = jax.tree_util.Partial(acting, given)
+    function = jax.tree_util.Partial(partial(_acting, by), given)
     return Network(function, given[0].inputs, given[0].outputs)
+
+
+def _acting(by: Callable[[Array], Array], nets: tuple[AbstractNetwork, ...], x: Array) -> Array:
+    return jax.lax.switch(by(x), [net.__call__ for net in nets], x)
 
 
 def one_of(options: Float[ArrayLike, "m n"], w: Float[ArrayLike, " m"]) -> Any:

@@ -2,11 +2,15 @@
 
 import pickle
 
+import numpy as np
 import pytest
 
 import reachjax as rj
 from tests.cases import FEW, HORIZON, Case, each
 from tests.laws.changes import same
+
+GAP = 1e-4
+"""What `reach` may leave open by default, as a part of a facet's range."""
 
 
 class Stopping:
@@ -27,6 +31,15 @@ def claims(tube):
     return tube.sets, [(proof.bounds, proof.witnesses) for proof in tube.certificates[1:]]
 
 
+def as_tight(one, other):
+    """Whether sets are the same, but for what a search may leave open whose witnesses differ."""
+    pairs = zip(one.certificates[1:], other.certificates[1:], strict=True)
+    return all(
+        np.all(abs(a.bounds - b.bounds) <= GAP * (1e-3 + abs(a.bounds) + abs(b.bounds)))
+        for a, b in pairs
+    )
+
+
 @each(lambda case: not case.searches_cells, basic=FEW)
 def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(case):
     with pytest.raises(rj.Interrupted, match=rf"after 1 of {HORIZON} steps") as stopped:
@@ -36,7 +49,7 @@ def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(case):
     tube.require_sealed()
     assert same(claims(pickle.loads(pickle.dumps(stopped.value)).tube), claims(tube))
     rest = tube.extended(HORIZON - 1, **case.options)
-    assert same(claims(rest), claims(case.tube))
+    assert as_tight(rest, case.tube)
 
 
 @each(basic=FEW)

@@ -79,7 +79,7 @@ def loop_of(function, as_plant):
 
 
 WAYS_OUT = re.compile(
-    r"\b(use|write|compute|give|put|multiply|compare|keep|leave|choose|must|take|evaluation)\b"
+    r"\b(use|write|compute|give|put|multiply|compare|keep|leave|choose|must|take|clip|evaluation)\b"
 )
 """What a refusal says if it names something to do."""
 

@@ -376,7 +376,11 @@ def events_of(recorder: Recorder, which: Pick, count: int) -> list[Operand]:
 def chosen_among(
     recorder: Recorder, events: Sequence[Operand], cases: Sequence[Operand], shape: Shape
 ) -> Operand:
-    """The case whose event holds, of events of which one does, all brought to a shape."""
+    """The case whose event holds, of events of which one does, all brought to a shape.
+
+    Raises:
+        UnsupportedError: a case that may hold is infinite or no number.
+    """
     pairs = []
     for event, case in zip(events, cases, strict=True):
         if isinstance(event, Value):
@@ -385,6 +389,7 @@ def chosen_among(
             return shaped(recorder, case, shape)
         elif np.any(event):
             pairs.append((np.broadcast_to(event, shape), shaped(recorder, case, shape)))
+    _require_finite(case for _, case in pairs)
     if len(pairs) == 2 and all(isinstance(event, Value) for event, _ in pairs):
         (_, below), (gate, above) = pairs
         if isinstance(below, Value) or isinstance(above, Value):
@@ -402,8 +407,20 @@ def _weighed(recorder: Recorder, event: Operand, case: Operand) -> Operand:
     return recorder.scaled(event, case)
 
 
+def _require_finite(cases: Iterable[Operand]) -> None:
+    """Raise an error if one of some cases is known to be infinite or no number."""
+    known = (case for case in cases if not isinstance(case, Value) and is_known(case))
+    if not all(np.all(np.isfinite(np.asarray(case, float))) for case in known):
+        raise UnsupportedError(NOT_FINITE)
+
+
 def between(recorder: Recorder, gate: Value, below: Operand, above: Operand) -> Operand:
-    """`above` where a gate is one, else `below`, all of one shape."""
+    """`above` where a gate is one, else `below`, all of one shape.
+
+    Raises:
+        UnsupportedError: one of them is infinite or no number.
+    """
+    _require_finite((below, above))
     if not isinstance(below, Value) and not isinstance(above, Value):
         on, off = recorder.scaled(gate, above), recorder.scaled(opposite(recorder, gate), below)
         return recorder.added(on, off)

@@ -9,7 +9,7 @@ becomes a number that is computed with where it meets others, a sum of gated one
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from typing import Any
 

@@ -60,8 +60,11 @@ def by_cells(proof, axes):
 def test_bounds_by_any_cells_hold(case):
     rng, n = np.random.default_rng(0), case.closed_loop.states
     trees = [[-1], [0, -1, -1], [*rng.integers(n, size=2).tolist(), -1, -1, -1]]
-    for k in range(1, HORIZON + 1):
-        found = [by_cells(case.tube.proof(k), axes) for axes in trees]
+    proofs = [case.tube.proof(k) for k in range(1, HORIZON + 1)]
+    for k, proof in enumerate(proofs, start=1):
+        if not isinstance(proof, rj.CellCertificate):
+            continue  # nothing was left for cells to close
+        found = [by_cells(proof, axes) for axes in trees]
         assert np.all(found >= attained(case, k))
         assert np.isfinite(found[0]).all()
 

@@ -12,7 +12,7 @@ def ranges(case, k):
     return np.ptp(np.asarray(case.tube.sets[k].bounded_values(case.runs[:, k])), axis=0)
 
 
-@each(lambda case: not case.round)
+@each(lambda case: not case.round and case.initial != "thin")  # whose witnesses are samples alone
 def test_a_gap_that_is_open_is_said(case):
     """A search that says it is solved left no more open than was asked for."""
     for k in range(1, HORIZON + 1):
@@ -66,11 +66,10 @@ def test_without_time_sets_hold_and_none_says_that_more_was_done(case):
         assert case.excess(tube.sets[k], case.runs[:, k]) <= ROUNDING
         proof = tube.proof(k)
         assert np.all(np.asarray(proof.recheck()) <= np.asarray(proof.bounds) + 1e-9)
-        closed = np.asarray(proof.gaps) <= 1e-3 * np.ptp(
-            np.asarray(tube.sets[k].bounded_values(case.runs[:, k])), axis=0
-        ) + 1e-9  # fmt: skip
+        with_time = np.asarray(case.tube.proof(k).bounds)
+        closed = np.asarray(proof.bounds) <= with_time + 1e-3 * ranges(case, k) + 1e-9
         for status, is_closed in zip(proof.statuses, closed, strict=True):
-            assert status is not rj.SolverStatus.SOLVED or is_closed
+            assert status is not rj.SolverStatus.SOLVED or is_closed or case.round
 
 
 @each(lambda case: case.method in ("programs", "paper") and case.loop in ("relu", "varying"))

@@ -5,6 +5,7 @@ import inspect
 import numpy as np
 import pytest
 
+import reachjax as rj
 from tests.cases import HORIZON, ROUNDING, each
 
 KINDS = {

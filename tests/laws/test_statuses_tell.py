@@ -69,7 +69,8 @@ def test_without_time_sets_hold_and_none_says_that_more_was_done(case):
         with_time = np.asarray(case.tube.proof(k).bounds)
         closed = np.asarray(proof.bounds) <= with_time + 1e-3 * ranges(case, k) + 1e-9
         for status, is_closed in zip(proof.statuses, closed, strict=True):
-            assert status is not rj.SolverStatus.SOLVED or is_closed or case.round
+            # over a round set programs are solved whose cuts are not all there is to say of it
+            assert status is not rj.SolverStatus.SOLVED or is_closed or case.X0.parts[1] is not None
 
 
 @each(lambda case: case.method in ("programs", "paper") and case.loop in ("relu", "varying"))

@@ -510,7 +510,7 @@ class _Run:
             task, missed = np.array(losses).T
         quiet = not np.any(missed[-max(1, len(losses) // QUIET) :] > 0)
         proved = sum(cell.status is VerdictStatus.PROVED for cell in verdict.cells)
-        least = min((cell.margin for cell in verdict.cells), default=-np.inf)
+        least = min(float(np.nanmin(margins)) for margins in verdict.margins.values())
         means = (
             float(np.mean(part[np.isfinite(part)])) if np.isfinite(part).any() else np.nan
             for part in (task, missed)

@@ -55,7 +55,7 @@ def navigation() -> Problem:
 
 
 def pendulum() -> Problem:
-    """The pendulum of `experiments.sampled`, from a larger set, which its law just keeps upright."""
+    """The pendulum of `experiments.sampled`, from a larger set."""
     given = sampled.pendulum().problem
     return close(dataclasses.replace(given, X0=rj.Box([-0.35, -0.5], [0.35, 0.5])))
 

@@ -161,6 +161,7 @@ class Study:
             margin=MARGIN.get(self.name, SMALL),
             epochs=100_000,
             seed=seed,
+            steps=50,
             time_limit=settings.seconds,
         )
         training, began = time.monotonic() - began, time.monotonic()

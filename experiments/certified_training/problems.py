@@ -14,8 +14,8 @@ from experiments.benchmark.rivals import cruise_control
 from experiments.nonlinear.problems import Problem
 from experiments.sampled import problems as sampled
 
-OBSTACLE = rj.Polytope([[1.0, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0]], [0.4] * 4)
-"""Of the navigation: a square around the origin, in metres."""
+OBSTACLE = 0.4
+"""Half the side of the square around the origin that the navigation avoids, in metres."""
 
 ROOM = 0.01
 """Between what a law attains and what is safe, in parts of how far states move."""
@@ -35,8 +35,9 @@ def navigation() -> Problem:
     def law(x: Float[ndarray, "c 4"]) -> Float[ndarray, "c 2"]:
         near = np.exp(-np.sum((x[:, :2] + [1.0, 0.0]) ** 2, axis=1))
         pull = 0.8 * (goal - x[:, :2]) - 1.6 * x[:, 2:]
-        return pull + 2.0 * near[:, None] * np.array([0.0, 1.0])
+        return pull + 1.85 * near[:, None] * np.array([0.0, 1.0])
 
+    sides = np.kron(np.eye(2, 4), [[1.0], [-1.0]])
     A, B = np.eye(4, k=2), np.eye(4, 2, k=-2)
     plant = rj.SampledPlant.affine(A, B, period=period)
     return Problem(
@@ -47,10 +48,10 @@ def navigation() -> Problem:
         hidden=(32, 32),
         activation="tanh",
         closed=lambda net: rj.ClosedLoop(plant, net),
-        X0=rj.Box([-2.2, 0.0, -0.05, -0.05], [-2.0, 0.2, 0.05, 0.05]),
+        X0=rj.Box([-2.3, -0.1, -0.1, -0.1], [-1.9, 0.3, 0.1, 0.1]),
         horizon=30,
         goal=rj.Box([1.5, -0.5, -0.5, -0.5], [2.5, 0.5, 0.5, 0.5]),
-        avoid=(OBSTACLE,),
+        avoid=(rj.Polytope(sides, [OBSTACLE] * 4),),
     )
 
 

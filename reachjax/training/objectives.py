@@ -133,7 +133,7 @@ class Certified(Replaceable):
 
             def rooms() -> Iterator[tuple[bool, Array]]:
                 for each in rows:
-                    limits = each.limits[: len(each.units)]
+                    limits = jnp.asarray(each.limits[: len(each.units)])
                     reached = bounds[each.item.time, each.proving]
                     yield each.item.inside, (limits - reached) / each.units
 

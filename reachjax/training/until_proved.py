@@ -44,6 +44,7 @@ from reachjax.training.history import Epoch, TrainingHistory
 from reachjax.training.objectives import Certified, Simulated, Stage, TrainingBatch
 from reachjax.training.worst_cells import worst_cells
 from reachjax.verdicts.decide import decide
+from reachjax.verdicts.sieve import smallest
 from reachjax.verdicts.specification import (
     AvoidSets,
     Region,
@@ -74,6 +75,9 @@ QUIET = 5
 LEAST, FIRST = 1.0, 10.0
 """Seconds that a decision may take at least, else it may take as long as the epoch did; and those
 of the first one, or a tenth of all."""
+
+PATIENCE = 3.0
+"""Where the objective is zero it may take so many times as long."""
 
 TaskLoss = Callable[[ClosedLoop, Array], Array]
 """One number from a loop under the controller as it is, and initial states `(b, n_x)`."""
@@ -394,6 +398,12 @@ def _one_number(name: str, value: Any) -> Array:
     return jnp.asarray(value)
 
 
+def _mean(losses: Float[np.ndarray, " s"]) -> float:
+    """The mean of those that are known; NaN of none."""
+    known = losses[np.isfinite(losses)]
+    return float(known.mean()) if len(known) else float("nan")
+
+
 class _Kept(NamedTuple):
     """What a file holds of a training.
 
@@ -505,20 +515,24 @@ class _Run:
             if budget.late:
                 break
         skipped = failures(self._state) - skipped
-        verdict = self.decide(budget, max(LEAST, clock.elapsed), asked, number + 1)
-        with np.errstate(all="ignore"):
-            task, missed = np.array(losses).T
+        task, missed = np.array(losses).T
         quiet = not np.any(missed[-max(1, len(losses) // QUIET) :] > 0)
+        seconds = clock.elapsed * (PATIENCE if quiet else 1.0)
+        verdict = self.decide(budget, max(LEAST, seconds), asked, number + 1)
         proved = sum(cell.status is VerdictStatus.PROVED for cell in verdict.cells)
-        least = min(float(np.nanmin(margins)) for margins in verdict.margins.values())
-        means = (
-            float(np.mean(part[np.isfinite(part)])) if np.isfinite(part).any() else np.nan
-            for part in (task, missed)
-        )
-        seconds = self._before + budget.elapsed
-        counted = len(verdict.cells), proved, seconds
         self.epochs.append(
-            Epoch(self._stage, len(losses), skipped, *means, verdict.status.name, least, *counted)
+            Epoch(
+                stage=self._stage,
+                steps=len(losses),
+                skipped=skipped,
+                task=_mean(task),
+                penalty=_mean(missed),
+                status=verdict.status.name,
+                margin=smallest(verdict.margins),
+                cells=len(verdict.cells),
+                proved=proved,
+                seconds=self._before + budget.elapsed,
+            )
         )
         over = quiet or skipped == len(losses) or number + 1 - self._begun >= stage.epochs
         if over and not verdict.proved and self._stage + 1 < len(self._stages):

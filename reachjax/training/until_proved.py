@@ -398,6 +398,18 @@ def _one_number(name: str, value: Any) -> Array:
     return jnp.asarray(value)
 
 
+def _hashable(function: Any) -> Callable[..., Any]:
+    """A function as compiled steps are told apart by; one that cannot be is another one each time.
+
+    Such as a `jax.tree_util.Partial` of arrays.
+    """
+    try:
+        hash(function)
+    except TypeError:
+        return functools.partial(function)
+    return function
+
+
 def _mean(losses: Float[np.ndarray, " s"]) -> float:
     """The mean of those that are known; NaN of none."""
     known = losses[np.isfinite(losses)]
@@ -454,7 +466,7 @@ class _Run:
         seed: int,
     ):
         self._loop, self._X0, self._spec, self._seed = loop, X0, spec, seed
-        self._task_loss, self._optimizer, self._stages = task_loss, optimizer, stages
+        self._task_loss, self._optimizer, self._stages = _hashable(task_loss), optimizer, stages
         self._weights = _weights_of(loop.controller)
         if not self._weights:
             raise ValueError(
@@ -502,7 +514,11 @@ class _Run:
         count = min(sizes.batch, stage.cells)
         corners = worst_cells(self._X0, self.found.verdict.cells, stage.cells, count, rng)
         program = _Program(
-            self._spec, self._task_loss, stage.objective, self._optimizer, sizes.samples
+            self._spec,
+            self._task_loss,
+            _hashable(stage.objective),
+            self._optimizer,
+            sizes.samples,
         )
         keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), sizes.steps)
         skipped, losses, clock = failures(self._state), list[list[float]](), Budget()

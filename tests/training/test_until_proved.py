@@ -137,26 +137,28 @@ def test_cells_to_train_on_are_those_of_which_least_is_proved(seed):
     assert np.prod((upper - lower)[:, :2], axis=1).sum() <= 2.0 + 1e-9
 
 
-@pytest.mark.parametrize("continuous", [False, True])
-def test_forms_over_a_cell_miss_what_trajectories_from_it_miss(continuous):
+A, B = np.array([[0.0, 1.0], [1.0, -0.5]]), np.array([[0.0], [1.0]])
+PLANTS = {
+    "discrete": lambda: rj.AffinePlant(np.eye(2) + 0.1 * A, 0.1 * B),
+    "linear flow": lambda: rj.SampledPlant.affine(A, B, period=0.1),
+    "flow": lambda: rj.SampledPlant(
+        lambda x, u: jnp.array([x[1], jnp.sin(x[0]) - 0.5 * x[1] + u[0]]), 2, 1, 0.1
+    ),
+}
+
+
+@pytest.mark.costly
+@pytest.mark.parametrize("kind", PLANTS)
+def test_forms_over_a_cell_miss_what_trajectories_from_it_miss(kind):
     """Of sets to be in and to be out of, at all times; the remainder is their difference."""
-    rng = np.random.default_rng(0)
+    rng, plant = np.random.default_rng(0), PLANTS[kind]()
     net = rj.MLP.from_layers(
         [(rng.normal(size=(3, 2)), rng.normal(size=3)), (rng.normal(size=(1, 3)), [0.0])],
         rj.Tanh(),
     )
-
-    def f(x, u):
-        return jnp.array([x[1], jnp.sin(x[0]) + u[0]])
-
-    plant = (
-        rj.SampledPlant(f, 2, 1, 0.1)
-        if continuous
-        else rj.AffinePlant([[1.0, 0.1], [0.1, 1.0]], [[0.0], [0.1]])
-    )
     loop, steps = rj.ClosedLoop(plant, net), 3
     safe, wall = rj.Box([-0.1, -0.1], [0.1, 0.1]), rj.Box([0.2, -1.0], [0.5, 1.0])
-    period = 0.1 if continuous else None
+    period = 0.1 if plant.continuous else None
     required = tuple(requirements(2, steps, None, [wall], safe, period))
 
     @jax.jit

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 from rich.box import SIMPLE_HEAD
@@ -111,7 +112,7 @@ def plain(value: Any) -> Any:
     """
     if isinstance(value, dict):
         return {key: plain(each) for key, each in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
         return plain(value.tolist())
     if isinstance(value, list | tuple):
         return [plain(each) for each in value]

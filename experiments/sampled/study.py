@@ -91,7 +91,7 @@ class Result:
         found |= {"beyond": self.beyond, "cells": len(self.verdict.cells)}
         found["instant"] = None if example is None else example.instant
         found["closed"] = None if closed is None else [closed.step, closed.period]
-        found["at_samples"] = self.at_samples and self.at_samples.status.name
+        found["at_samples"] = None if self.at_samples is None else self.at_samples.status.name
         return found
 
 

@@ -20,6 +20,7 @@ from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
 from reachjax.sets import AbstractSet, Box, Ellipsoid
 from reachjax.sets.balance import balanced
+from reachjax.sets.unusable import ThinSetError
 from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.verdict import Counterexample
 
@@ -102,8 +103,14 @@ def counterexample(
 def _moved_inwards(
     scenarios: Scenarios, scenario: Float[np.ndarray, " s"]
 ) -> Float[np.ndarray, " s"]:
-    """A scenario beside one at the surface of its sets, on the way to the middle of these."""
-    states = np.asarray(scenarios.X0.sample(jax.random.key(0), AROUND))
+    """A scenario beside one at the surface of its sets, on the way to the middle of these.
+
+    A set that is too thin to be sampled has no middle that is known: the scenario stays.
+    """
+    try:
+        states = np.asarray(scenarios.X0.sample(jax.random.key(0), AROUND))
+    except ThinSetError:
+        return scenario
     middle = scenarios.middle(states.mean(axis=0))
     return middle + (1 - INWARDS) * (scenario - middle)
 

@@ -66,7 +66,8 @@ def test_forms_call_nothing_from_compiled_code(case):
 @pytest.mark.costly
 def test_compiled_flows_hold_every_state(case):
     """Their steps are not halved where remainders are large: they may be looser, and no more."""
-    found = np.asarray(jax.jit(lambda X0: limits(case, case.closed_loop, X0))(case.X0))
+    loop = case.closed_loop
+    found = np.asarray(jax.jit(lambda X0: limits(case, loop, X0))(case.X0))
     sets = case.tube.sets[1:3]
     attained = [
         np.asarray(X.bounded_values(case.runs[:, k])).max(axis=0) for k, X in enumerate(sets, 1)

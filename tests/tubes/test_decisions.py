@@ -143,7 +143,7 @@ def test_a_ball_that_touches_what_is_avoided_is_refuted():
 @pytest.mark.costly
 def test_what_cannot_be_decided_soon_leaves_work_for_what_comes_later(monkeypatch):
     """Else the first requirement takes everything, and a later counterexample is not found."""
-    monkeypatch.setattr(rj.tubes.decisions, "WORK", 3e5)
+    monkeypatch.setattr(rj.methods.ladder, "WORK", 3e5)
     loop, X0 = switching_loop(3, seed=23, hidden=(4, 3)), initial_set("box", 3, seed=3)
     tube = rj.reach(loop, X0, 3, rj.Template.box(3), samples=100)
     rows = np.asarray(tube.template.directions)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops.units import AtUnit, Constraint, Disturbance, evaluate
 from reachjax.numerics.checks import within_time_axis
-from reachjax.numerics.rounding import Ball, gamma, namespace
+from reachjax.numerics.rounding import Ball, counting, gamma, namespace
 from reachjax.sets import AbstractSet
 
 EDGES = 16
@@ -72,6 +72,7 @@ class Frame(NamedTuple):
         return np.asarray(self.center) + (s * spread if spread.ndim == 1 else s @ spread.T)
 
 
+@counting
 def framed(W: AbstractSet, t: int | Array = 0) -> Frame:
     """A set at time `t` as a parallelepiped and what is cut off it."""
     flat, ball = W.parts

@@ -198,6 +198,21 @@ def gamma(operations: int) -> Any:
     return count / (1.0 - count)
 
 
+def underflow(matrix: Any, there: Any, count: int = 1) -> Any:
+    """What underflow may take from each row of a matrix times numbers, and from their sums.
+
+    It takes less than `TINY` from a product, or from a sum where tiny numbers count as zeros. A
+    relative error does not see it: of what vanishes nothing is left to be a part of. Nothing is
+    taken where a factor is zero.
+
+    Args:
+        matrix: the factors.
+        there: which numbers are not zero.
+        count: how many of these stand side by side, such as the coefficients of a form.
+    """
+    return 2 * TINY * count * ((matrix != 0) * 1.0 @ (there * 1.0))
+
+
 def exponents(rows) -> Any:
     """Whole numbers `e`, one a row, with the row's largest entry in `[2^e, 2^(e+1))`; -1 for zeros.
 
@@ -282,6 +297,11 @@ class Ball(AbstractNumber):
         rad = (upper - lower) / 2 * (1 + gamma(4)) + gamma(4) * abs(mid)
         return cls(mid, select(lower == upper, 0.0, rad))
 
+    @property
+    def _there(self):
+        """Which numbers are not zero."""
+        return (self.mid != 0) | (self.rad != 0)
+
     def lift(self, other) -> Ball:
         """`other` as a ball of this kind; plain numbers are taken to be exact."""
         return other if isinstance(other, Ball) else type(self).exact(other)
@@ -293,24 +313,23 @@ class Ball(AbstractNumber):
         """`matrix @ self` for an exact matrix."""
         error = gamma(matrix.shape[-1])
         size, weights = abs(self.mid), abs(matrix)
-        return self._rebuilt(
-            matrix @ self.mid, weights @ (self.rad * (1 + error)), error * (weights @ size)
-        )
+        rounding = errors(lambda: error * (weights @ size) + underflow(matrix, self._there))
+        return self._rebuilt(matrix @ self.mid, weights @ (self.rad * (1 + error)), rounding)
 
     def __matmul__(self, matrix) -> Self:
         """`self @ matrix` for an exact matrix."""
         error = gamma(matrix.shape[0])
         size, weights = abs(self.mid), abs(matrix)
-        return self._rebuilt(
-            self.mid @ matrix, (self.rad * (1 + error)) @ weights, error * (size @ weights)
-        )
+        lost = errors(lambda: error * (size @ weights) + underflow(matrix.T, self._there.T).T)
+        return self._rebuilt(self.mid @ matrix, (self.rad * (1 + error)) @ weights, lost)
 
     def __rmul__(self, factors) -> Self:
         """Every entry, or every row, times an exact factor; those of 0, 1 and -1 round nothing."""
         factors = namespace(factors, self.mid).asarray(factors)
         factors = factors.reshape(factors.shape + (1,) * (self.mid.ndim - factors.ndim))
         mid, inexact = factors * self.mid, (factors != 0) & (abs(factors) != 1)
-        return self._rebuilt(mid, abs(factors) * self.rad, gamma(1) * inexact * abs(mid))
+        size = errors(lambda: inexact * (gamma(1) * abs(mid) + 2 * TINY * self._there))
+        return self._rebuilt(mid, abs(factors) * self.rad, size)
 
     def __add__(self, other) -> Self:
         other = self.lift(other)

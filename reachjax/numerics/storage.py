@@ -340,6 +340,10 @@ class Reader:
 
     def _placed(self, where: str, number: int) -> Any:
         array = self._arrays[number]
+        if array.dtype.kind == "f" and array.dtype != np.float64:
+            raise ValueError(
+                f"it has numbers of {array.dtype}, but proofs count float64's rounding"
+            )
         return jax.device_put(array) if where == "on" else array
 
 

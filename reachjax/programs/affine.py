@@ -38,6 +38,7 @@ from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.pytrees import pytree
 from reachjax.numerics.rounding import (
     NOTHING,
+    TINY,
     Ball,
     errors,
     gamma,
@@ -45,6 +46,7 @@ from reachjax.numerics.rounding import (
     larger,
     namespace,
     select,
+    underflow,
 )
 from reachjax.programs.initial import Ends, InitialColumns, met
 
@@ -93,6 +95,11 @@ class AffineForms(AbstractNumber):
         """Coefficients of the columns."""
         return self.rows[:, 2:]
 
+    @property
+    def _there(self) -> Any:
+        """Which numbers are not zero."""
+        return abs(self.rows).sum(axis=1) + self.radii.sum(axis=1) > 0
+
     def within(self, interval: Ball) -> AffineForms:
         """The same forms with other intervals."""
         xp = namespace(self.rows)
@@ -103,7 +110,8 @@ class AffineForms(AbstractNumber):
         """`matrix @ self` for an exact matrix."""
         matrix, count = namespace(self.rows).asarray(matrix), matrix.shape[1]
         error = errors(lambda: gamma(count) * abs(self.rows).sum(axis=1))
-        radii = abs(matrix) @ (self.radii + error[:, None])
+        lost = errors(lambda: underflow(matrix, self._there, self.rows.shape[1] + 2))
+        radii = abs(matrix) @ (self.radii + error[:, None]) + lost[:, None]
         return AffineForms(matrix @ self.rows, radii * (1 + gamma(count + self.rows.shape[1])))
 
     def __add__(self, other) -> AffineForms:
@@ -126,7 +134,9 @@ class AffineForms(AbstractNumber):
         xp = namespace(self.rows)
         factor = xp.broadcast_to(xp.asarray(factor, float), (len(self.rows),))
         error = errors(lambda: gamma(1) * abs(self.rows).sum(axis=1))
-        radii = abs(factor)[:, None] * (self.radii + error[:, None])
+        count = self.rows.shape[1] + 2
+        lost = errors(lambda: 2 * TINY * count * ((factor != 0) & self._there))
+        radii = abs(factor)[:, None] * (self.radii + error[:, None]) + lost[:, None]
         return AffineForms(factor[:, None] * self.rows, radii * (1 + gamma(self.rows.shape[1] + 4)))
 
     def __getitem__(self, index) -> AffineForms:

@@ -331,7 +331,9 @@ def _smooth(
     def size() -> Any:
         size = abs(model.offset) + (abs(model.slope) + 2 * abs(curvature * off)) * abs(off)
         size = size + abs(slope) * (own + rest) + abs(curvature) * own**2 + abs(slope * center)
-        return gamma(rows.shape[1] + 32) * size
+        some = abs(center) + own + rest + abs(off) + abs(model.offset)
+        flushed = TINY * rows.shape[1] * (1 + abs(slope) + abs(curvature)) * (1 + some)
+        return gamma(rows.shape[1] + 32) * size + select(some > 0, 32 * flushed, 0.0)
 
     radius = constant(abs(slope) * y.off * (1 + gamma(4)) + errors(size))
     gap = settled((model.gap + lost) * (1 + gamma(16)))
@@ -422,7 +424,9 @@ def _unit(
     def size() -> Any:  # products with 0 and 1 are exact
         size = abs(constant(rows)).sum(axis=1) + abs(constant(offset))
         rounded = (slope != 0) & (abs(slope) != 1) | (offset != 0)
-        return select(rounded, gamma(4) * size, 0.0)
+        some = abs(y.rows).sum(axis=1) + y.off > 0
+        flushed = select(some, 2 * TINY * (rows.shape[1] + 2), 0.0)
+        return select(rounded, gamma(4) * size + flushed, 0.0)
 
     radius = abs(slope) * y.off + errors(size)
     radius = constant(radius + left) * (1 + gamma(rows.shape[1]))

@@ -278,7 +278,7 @@ def _highest(rows: Rows, pairs: tuple[np.ndarray, np.ndarray]) -> Any:
     q = taken(products, np.flatnonzero(~mixed))
     inside = (q < 0) & (linear < -4 * q)
     depth = select(inside, -q, 1.0)
-    alone = select(inside, linear * linear / (8 * depth) + depth, linear + q)
+    alone = select(inside, linear * (linear / (8 * depth)) + depth, linear + q)
     return abs(taken(products, np.flatnonzero(mixed))).sum(axis=1) + alone.sum(axis=1)
 
 

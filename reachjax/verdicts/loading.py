@@ -83,7 +83,7 @@ def load(
     except Exception as error:  # whoever wrote it may have written anything
         message = f"{path} must hold a tube or a verdict, but something else arrived: {error}"
         raise UnreadableError(message) from error
-    if loop is not None and not kept.is_of(loop):
+    if loop is not None and not all(map(kept.is_of, (loop, *_loops(tube)))):
         raise ValueError(
             f"loop must be that of the tube in {path}, with the same equations and numbers, but "
             "another one arrived (or another version of JAX, which writes its equations otherwise)"
@@ -93,6 +93,13 @@ def load(
     if isinstance(tube, Verdict):
         return rechecked_verdict(tube, progress)
     return rechecked_tube(tube, progress)
+
+
+def _loops(tube: ReachTube | PartitionedTube | Verdict) -> list[ClosedLoop]:
+    """The loops that something is said of, whatever seal it came with."""
+    if isinstance(tube, Verdict):
+        return [] if tube.asked is None else [tube.asked.loop]
+    return [each.loop for each in (tube.tubes if isinstance(tube, PartitionedTube) else (tube,))]
 
 
 def _verdict(file: Kept) -> Verdict:

@@ -1,5 +1,7 @@
 """Rounding is a layer: without it numbers are the same but for rounding, and none of it stays."""
 
+from fractions import Fraction
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,3 +93,52 @@ def test_penalties_without_rounding_have_no_bits_in_their_graph():
     text = str(jax.make_jaxpr(jax.grad(penalty))(loop.controller))
     assert "bitcast" not in text
     assert "callback" not in text
+
+
+def exactly(rows):
+    return [[Fraction(float(entry)) for entry in row] for row in np.asarray(rows)]
+
+
+@pytest.mark.parametrize("kind", ["box", "ellipsoid"])
+def test_supports_that_were_asked_for_without_rounding_are_rounded_later(kind):
+    """What is compiled is kept: whoever asks first must not decide what it is worth."""
+    rng = np.random.default_rng(11)
+    rows, center = rng.normal(size=(23, 3)), rng.normal(size=3)
+    X = rj.Box(center - 0.5, center + 0.5) if kind == "box" else rj.Ellipsoid(center, np.eye(3))
+    with rounding(False):
+        X.support(rows)
+    for row, value in zip(exactly(rows), np.asarray(X.support(rows)).tolist(), strict=True):
+        if kind == "box":
+            both = zip(row, *exactly((X.lower, X.upper)), strict=True)
+            ends = [max(a * lower, a * upper) for a, lower, upper in both]
+            assert Fraction(value) >= sum(ends)
+        else:
+            (middle,) = exactly(X.center[None])
+            room = Fraction(value) - sum(a * b for a, b in zip(row, middle, strict=True))
+            assert room >= 0
+            assert room**2 >= sum(a * a for a in row)
+
+
+DRAWN = {
+    "ellipsoid": lambda size: rj.Ellipsoid(np.zeros(2), 0.01 * size * jnp.eye(2)),
+    "intersection": lambda size: rj.Intersection(
+        rj.Polytope([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], size * jnp.full(3, 0.05)),
+        rj.Ellipsoid(np.zeros(2), 0.01 * jnp.eye(2)),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", DRAWN)
+@pytest.mark.costly
+def test_penalties_of_loops_with_sets_of_noise(kind):
+    """Of any kind of set, and compiled the same as not, up to rounding."""
+    rng = np.random.default_rng(5)
+    layers = [(0.3 * rng.normal(size=(3, 2)), np.zeros(3)), (0.3 * rng.normal(size=(1, 3)), [0.1])]
+    plant = rj.AffinePlant([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
+    loop = rj.ClosedLoop(plant, rj.MLP.from_layers(layers), noise=DRAWN[kind](1.0))
+    X0, safe = rj.Box([-0.1, -0.1], [0.1, 0.1]), rj.Box([-0.12, -0.05], [0.12, 0.05])
+
+    def penalty(loop):
+        return rj.specification_penalty(loop, X0, 2, rj.Template.box(2), safe=safe)
+
+    np.testing.assert_allclose(jax.jit(penalty)(loop), penalty(loop), rtol=1e-9)

@@ -144,6 +144,40 @@ def test_a_status_is_not_believed(tmp_path):
             rj.load(path, recheck=True)
 
 
+@pytest.mark.parametrize("what", ["verdict", "tube", "partition"])
+def test_a_file_of_another_loop_is_not_taken_for_that_of_a_seal(what, tmp_path):
+    """Nor where it has both, the loop that something is proved of and the seal of the one given."""
+    path, mine, net = tmp_path / "a.file", rectified(), rj.MLP.from_layers([([[0.0]], [0.0])])
+    tame, start = rj.ClosedLoop(rj.AffinePlant([[0.5]], [[1.0]]), net), rj.Box([1.0], [2.0])
+    if what == "verdict":
+        found = rj.decide(tame, start, 1, goal=rj.Box([0.0], [1.0]))
+        about = KeptVerdict(found.asked, found.status, None, found.grounds)
+    elif what == "tube":
+        about = rj.reach(tame, start, 1, rj.Template.box(1))
+    else:
+        about = rj.reach_partitioned(tame, start, 1, rj.Template.box(1), cells=2)
+    keep(path, about, mine)
+    rj.load(path, recheck=True)  # it says of which loop
+    for recheck in (False, True):
+        with pytest.raises(ValueError, match="loop must be that of the tube"):
+            rj.load(path, mine, recheck=recheck)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_numbers_whose_rounding_is_not_counted_are_refused(kind, tmp_path):
+    """What is computed in floats of fewer bits is rounded by more than proofs allow for."""
+    path = tmp_path / "a.verdict"
+    decided("forms")[1].save(path)
+    head, arrays = opened(path)
+    for number, array in enumerate(arrays):
+        if array.dtype == float:
+            few = [array.astype(kind) if k == number else each for k, each in enumerate(arrays)]
+            written(path, head, few)
+            for recheck in (False, True):
+                with pytest.raises(rj.UnreadableError, match="numbers of float"):
+                    rj.load(path, recheck=recheck)
+
+
 def test_what_is_required_at_all_times_is_required_at_all_of_them(tmp_path):
     loop, path = rectified(), tmp_path / "a.verdict"
     verdict = rj.decide(loop, X0, STEPS, safe=around(loop, 3.0, slice(None)))

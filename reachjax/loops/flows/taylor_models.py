@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops.units import AbstractUnit, SmoothUnit, UnboundedError
 from reachjax.numerics.numbers import AbstractNumber
-from reachjax.numerics.rounding import TINY, Ball, constant, gamma, namespace, settled
+from reachjax.numerics.rounding import TINY, Ball, constant, gamma, namespace, settled, underflow
 
 SQUARE = 0.5
 """`w^2` is half of one and of `2 w^2 - 1`."""
@@ -143,7 +143,9 @@ class TaylorModels(AbstractNumber):
         matrix = namespace(self.rows).asarray(matrix)
         weights, error = abs(matrix), gamma(matrix.shape[1])
         return self._with(
-            matrix @ self.rows, weights @ self.radii * (1 + error), error * (weights @ self._size)
+            matrix @ self.rows,
+            weights @ self.radii * (1 + error),
+            error * (weights @ self._size) + underflow(matrix, self._size > 0, self.rows.shape[1]),
         )
 
     def __add__(self, other: Any) -> TaylorModels:

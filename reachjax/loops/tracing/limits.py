@@ -15,7 +15,7 @@ from reachjax.loops.tracing.values import Parameter
 from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.numbers import AbstractNumber
-from reachjax.numerics.rounding import TINY, gamma
+from reachjax.numerics.rounding import TINY, gamma, underflow
 
 
 class Limits(AbstractNumber):
@@ -115,7 +115,8 @@ class Limits(AbstractNumber):
         for one, other in ((self.least, self.most), (self.most, self.least)):
             terms = _times(over, one) + _times(under, other)
             ends.append(terms.sum(axis=1))
-            off.append(error * abs(terms).sum(axis=1))
+            lost = underflow(matrix, one != 0) + underflow(matrix, other != 0)
+            off.append(error * abs(terms).sum(axis=1) + np.where(picking, 0.0, lost))
         return self._outward(*ends, *off)
 
     def meeting(self, other: Limits) -> Limits:

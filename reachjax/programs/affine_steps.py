@@ -127,9 +127,11 @@ def _count(layers: Sequence[UnitLayer]) -> int:
 def step_columns(loop: ClosedLoop) -> tuple[int, int]:
     """How many columns a step adds, and how many it needs in between.
 
-    Those of the states' radii are among them where rounding is counted.
+    Those of the states' radii are among them where rounding is counted, and of what a flow leaves
+    out.
     """
-    kept, between = loop.units + (loop.states if is_counted() else 0), 0
+    spilled = is_counted() or loop.plant.continuous
+    kept, between = loop.units + (loop.states if spilled else 0), 0
     parts = (loop.controller_layers, loop.plant.inputs), (loop.plant_layers, loop.states)
     for layers, outputs in parts:
         if merges(layers, outputs):
@@ -230,6 +232,8 @@ def step_forms(
         successor = successor.padded(width)
     if successor.off is not NOTHING:
         successor = _spilled(successor, free)
+        if not is_counted():  # nothing is left of a flow's radii
+            successor = AffineForms(successor.rows, successor.radii[:, -1:])
     ends = successor.ends(start)
     if known is not None:
         ends = met(ends, (known.lower, known.upper))

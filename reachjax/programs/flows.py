@@ -86,7 +86,7 @@ def _condensed(
     """Forms as numbers of the initial columns, and of a symbol each for all the rest."""
     xp, first = namespace(forms.rows), 2 + start.count
     rest = abs(forms.rows[:, first:]).sum(axis=1) * (1 + gamma(forms.rows.shape[1]))
-    radii = (rest + forms.radii[:, 0]) * (1 + gamma(2))
+    radii = (rest + forms.off) * (1 + gamma(2))
     symbols = Symbols(len(start.spread), start.curved, radii)
     rows = xp.concatenate([forms.rows[:, :1], forms.rows[:, 2:first], xp.eye(len(radii))], axis=1)
     whole, parts = TaylorModels(rows, xp.zeros_like(radii), symbols), list[TaylorModels]()
@@ -96,10 +96,13 @@ def _condensed(
 
 
 def _expanded(found: TaylorModels, forms: AffineForms, symbols: Symbols) -> AffineForms:
-    """Numbers of such symbols as forms over all columns."""
+    """Numbers of such symbols as forms over all columns.
+
+    They have radii also where rounding is not counted: what the flow leaves out.
+    """
     xp, count = namespace(forms.rows), symbols.own
-    first = xp.zeros((len(forms.rows), 2 + count))
-    radii = xp.stack([forms.radii[:, 0], xp.zeros_like(forms.radii[:, 0])], axis=1)
+    first, none = xp.zeros((len(forms.rows), 2 + count)), xp.zeros(len(forms.rows))
+    radii = xp.stack([none + forms.off, none], axis=1)
     rest = AffineForms(xp.concatenate([first, forms.rows[:, 2 + count :]], axis=1), radii)
     rest = found.rows[:, 1 + count :] @ rest
     interval = found.ball

@@ -177,6 +177,11 @@ COLUMNS, MEMORY = 96, 12
 more: old ones are merged."""
 
 
+def columns_kept(loop: ClosedLoop) -> int:
+    """How many columns of earlier steps are kept where many cells are bounded."""
+    return max(COLUMNS, MEMORY * step_columns(loop)[0])
+
+
 @partial(Compiled, static_argnames=("t", "between", "counted", "columns"))
 def unrolled_at_once(
     loop: ClosedLoop,
@@ -199,12 +204,12 @@ def unrolled_at_once(
         directions: one row a facet, for each step.
         t: the time of the initial set.
         between: whether bounds at all times are asked for, of a differential equation.
-        counted: whether rounding is: what is found without it is no bound, and takes a fraction of
-            the time. Of differential equations it always is.
+        counted: whether rounding is, and what polynomials leave out of a flow: what is found
+            without it is no bound, and takes a fraction of the time.
         columns: how many are kept of all steps before, into which old ones are merged; None for all
             that there are.
     """
-    with rounding(counted or loop.plant.continuous):
+    with rounding(counted):
         return _at_once(loop, X0, box, directions, t, between, columns)
 
 
@@ -261,7 +266,7 @@ def unrolled_from_boxes(
         t: the time of the boxes.
         columns: as of `unrolled_at_once`; None for as many as a dozen steps add.
     """
-    most = columns or max(COLUMNS, MEMORY * step_columns(loop)[0])
+    most = columns or columns_kept(loop)
 
     def one(lower: Float[Array, " n_x"], upper: Float[Array, " n_x"]) -> Float[Array, "N m"]:
         box = Box(lower, upper)

@@ -182,3 +182,29 @@ def _axes(ax: Axes | None) -> Axes:
     import matplotlib.pyplot as plt
 
     return plt.subplots()[1]
+
+
+def draw_curves(
+    curves: Mapping[str, tuple[str, Sequence[float]]],
+    marks: Mapping[str, tuple[str, Sequence[float]]],
+    ax: Axes | None,
+    label: str,
+) -> Axes:
+    """Draw numbers that follow one another, on a logarithmic axis, and where something happens.
+
+    Args:
+        curves: of each name a color, and its numbers; what is not positive is left out.
+        marks: of each name a color, and the places of vertical lines.
+        ax: where to draw; a new figure by default.
+        label: of the horizontal axis.
+    """
+    ax = _axes(ax)
+    for name, (color, values) in curves.items():
+        shown = np.where(np.asarray(values) > 0, values, np.nan)
+        ax.plot(shown, ".-", color=color, label=name)
+    for name, (color, places) in marks.items():
+        for k, place in enumerate(places):
+            ax.axvline(place, color=color, linewidth=0.8, label=name if k == 0 else None)
+    ax.set(yscale="log", xlabel=label)
+    ax.legend(**ABOVE)
+    return ax

@@ -26,7 +26,7 @@ from reachjax.numerics.rounding import gamma
 from reachjax.programs.followed import OpenDecision
 from reachjax.programs.unrolled import ByForms, along_ways, unrolled, unrolled_from_boxes
 from reachjax.sets import AbstractSet, Box
-from reachjax.sets.balance import balanced
+from reachjax.verdicts.facet_rows import FacetRowsByTime
 from reachjax.verdicts.grounds import Leaves
 from reachjax.verdicts.specification import Requirement
 
@@ -99,60 +99,6 @@ class Outcome(NamedTuple):
         return smallest(self.margins)
 
 
-class _Rows(NamedTuple):
-    """Directions whose upper bounds decide a requirement, and the limits of these.
-
-    To be inside, all of `C x <= d`; to be outside, one of `-C x < -d`. The other way round, by
-    limits that are rounded the other way, it surely fails.
-
-    Attributes:
-        item: the requirement.
-        first: the number of its first direction among those of its time.
-        directions: `(2 k, n_x)`, those that prove it, then those that refute it.
-        limits: `(2 k,)`.
-        units: `(k,)`, what a distance of 1 in the units of the state changes the first by.
-    """
-
-    item: Requirement
-    first: int
-    directions: Float[np.ndarray, "2k n_x"]
-    limits: Float[np.ndarray, " 2k"]
-    units: Float[np.ndarray, " k"]
-
-    @classmethod
-    def of(cls, item: Requirement, first: int) -> _Rows:
-        """The rows of a requirement."""
-        C, d, norms = (np.asarray(part) for part in item.region.facets_in_units(item.inside))
-        facets = (np.asarray(part) for part in item.looser.facets)
-        D, e = balanced(*facets, inner=not item.inside)
-        sign = 1.0 if item.inside else -1.0
-        directions, limits = (
-            np.concatenate([sign * proving, -sign * refuting])
-            for proving, refuting in ((C, D), (d, e))
-        )
-        return cls(item, first, directions, limits, norms)
-
-    @property
-    def end(self) -> int:
-        """The number of the first direction after its own."""
-        return self.first + len(self.limits)
-
-    def judged(self, uppers: Float[np.ndarray, " m"]) -> tuple[bool, bool, float]:
-        """Whether it surely holds, or surely fails, and its margin, given bounds at its time."""
-        found, k = uppers[self.first : self.end], len(self.units)
-        room = (self.limits - found)[:k] / self.units
-        known = np.isfinite(found)
-        if self.item.inside:
-            holds = known[:k].all() and (found[:k] <= self.limits[:k]).all()
-            fails = (known & (found < self.limits))[k:].any()
-            margin = room.min(initial=np.inf)
-        else:
-            holds = (known & (found < self.limits))[:k].any()
-            fails = known[k:].all() and (found[k:] <= self.limits[k:]).all()
-            margin = np.fmax.reduce(room)
-        return bool(holds), bool(fails), float(np.nan_to_num(margin, nan=-np.inf))
-
-
 class Sieve:
     """Affine forms over many cells, and what they decide.
 
@@ -165,16 +111,7 @@ class Sieve:
 
     def __init__(self, loop: ClosedLoop, horizon: int, start: int, required: Sequence[Requirement]):
         self._loop, self._on_host, self._start = jax.device_put(loop), in_numpy(loop), start
-        ends = np.zeros(horizon + 1, dtype=int)
-        self._rows: list[_Rows] = []
-        for item in required:
-            self._rows.append(_Rows.of(item, int(ends[item.time])))
-            ends[item.time] = self._rows[-1].end
-        directions = np.zeros((horizon + 1, int(ends.max()), loop.states))
-        whole = np.zeros(directions.shape[:2], dtype=bool)
-        for rows in self._rows:
-            directions[rows.item.time, rows.first : rows.end] = rows.directions
-            whole[rows.item.time, rows.first : rows.end] = rows.item.throughout
+        self._rows, directions, whole = FacetRowsByTime.of(required, horizon, loop.states)
         self._directions, self._later = directions, jnp.asarray(directions[1:])
         self._whole = jnp.asarray(whole[1:]) if whole.any() else None
 

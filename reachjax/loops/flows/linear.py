@@ -47,7 +47,8 @@ def exponential(M: Float[Array | np.ndarray, "k k"]) -> Ball:
     for k in range(DEGREE, 0, -1):
         found, sizes = eye + part @ found / k, eye + abs(part) @ sizes / k
     rest = xp.where(norm <= 0.5, 2 * 0.5 ** (DEGREE + 1) / math.factorial(DEGREE + 1), xp.inf)
-    radii = constant(gamma(DEGREE * (size + 8)) * sizes + rest + size * TINY)
+    left = xp.full((size, size), rest)  # of this shape also where rounding is not counted
+    radii = constant(gamma(DEGREE * (size + 8)) * sizes + left + size * TINY)
     for _ in range(count):
         weights = abs(found)
         error = weights @ radii + radii @ weights + radii @ radii

@@ -36,10 +36,18 @@ from reachjax.loops.flows.enclosures import constant_ball, enclosed
 from reachjax.loops.flows.series import Series, Solution, Tape, solved
 from reachjax.loops.flows.taylor_models import Symbols, TaylorModels, joined, zeros
 from reachjax.loops.units import Origin, UnboundedError, Within
-from reachjax.numerics.rounding import Ball, constant, gamma, larger, namespace, smaller
+from reachjax.numerics.rounding import (
+    Ball,
+    constant,
+    gamma,
+    is_counted,
+    larger,
+    namespace,
+    smaller,
+)
 
-ORDER = 6
-"""The order of compiled steps, where none is given."""
+ORDER, SKETCHED = 6, 4
+"""The order of compiled steps, where none is given; and where nothing is proved."""
 
 HIGHEST = 20
 """The highest order that is chosen on the host: beyond, a step is better halved."""
@@ -156,7 +164,10 @@ def flowed(
         # a signal may have taken states away from where its mean has
         X = here.widened(within).ball if done else here.ball.meeting(box)
         boxes = [each.ball for each in given]
-        piece, holds = _enclosed(tape, X, boxes, h, part, settings, between)
+        if is_counted():
+            piece, holds = _enclosed(tape, X, boxes, h, part, settings, between)
+        else:
+            piece, holds = _sketched(X, settings.order), True
         if piece is None or (piece.excess > 1 and count < MOST and part / 2 >= SHORTEST):
             todo, count = [*todo, part / 2, part / 2], count + 1
             continue
@@ -180,6 +191,12 @@ def flowed(
         for each in controls
     ]
     return Flowed(state.widened(end + lost), tuple(controls))
+
+
+def _sketched(X: Ball, order: int | None) -> _Piece:
+    """A step of which nothing is proved: as if polynomials left nothing out, nor cubics."""
+    nothing = zeros(X)
+    return _Piece(X, nothing, nothing.rad, order or SKETCHED, 0.0)
 
 
 def _sum(numbers: list[TaylorModels]) -> TaylorModels:

@@ -1,0 +1,4 @@
+"""Training until proved: five loops, four ways, equal time.
+
+`python -m experiments.certified_training` trains and decides; interrupted, it continues.
+"""

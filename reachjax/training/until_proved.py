@@ -1,0 +1,596 @@
+"""Training that ends when the controller is proved.
+
+An epoch lowers the task's loss plus an objective over the worst cells of the initial set; then
+`decide` says what is proved. What it finds is what is trained on next: cells that it could not
+prove, and the initial states of counterexamples. Nothing rests on training: the verdict is that of
+`decide`, on the controller that is returned.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.loops import AbstractNetwork, ClosedLoop
+from reachjax.methods.propagation import Progress, known_numbers, require_kinds
+from reachjax.numerics.archives import writable
+from reachjax.numerics.budget import Budget, Interrupted
+from reachjax.numerics.checks import (
+    described,
+    real_number,
+    require_bar,
+    require_double_precision,
+    require_kind,
+    same_size,
+    whole_number,
+    wrapped,
+)
+from reachjax.numerics.flags import lenient
+from reachjax.numerics.logs import logged
+from reachjax.numerics.seals import Seal, seal_of
+from reachjax.numerics.storage import read, write
+from reachjax.sets import Box, PolyhedralSet
+from reachjax.training.failures import FOREVER, failures, skip_failures
+from reachjax.training.history import Epoch, TrainingHistory
+from reachjax.training.objectives import Certified, Simulated, Stage, TrainingBatch
+from reachjax.training.worst_cells import worst_cells
+from reachjax.verdicts.decide import decide
+from reachjax.verdicts.sieve import smallest
+from reachjax.verdicts.specification import (
+    AvoidSets,
+    Region,
+    Requirement,
+    Timed,
+    period_of,
+    requirements,
+)
+from reachjax.verdicts.verdict import Verdict, VerdictStatus
+
+if TYPE_CHECKING:
+    import optax
+
+STAGES = (
+    Stage(Simulated(), epochs=5),
+    Stage(Certified(), cells=16),
+    Stage(Certified(), cells=128),
+    Stage(Certified(), cells=1024),
+)
+"""From what costs least to what proves most: forms over smaller and smaller cells."""
+
+REMEMBERED = 16
+"""So many counterexamples are trained on, the last ones that were found."""
+
+QUIET = 5
+"""The objective is zero if it is in the last one of so many parts of an epoch."""
+
+LEAST, FIRST = 1.0, 10.0
+"""Seconds that a decision may take at least, else it may take as long as the epoch did; and those
+of the first one, or a tenth of all."""
+
+PATIENCE = 3.0
+"""Where the objective is zero it may take so many times as long."""
+
+TaskLoss = Callable[[ClosedLoop, Array], Array]
+"""One number from a loop under the controller as it is, and initial states `(b, n_x)`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """What came of training.
+
+    Attributes:
+        loop: the loop under the trained controller.
+        verdict: of `decide` on this loop.
+        history: what happened in each epoch.
+    """
+
+    loop: ClosedLoop
+    verdict: Verdict
+    history: TrainingHistory
+
+    @property
+    def controller(self) -> AbstractNetwork:
+        """The trained controller."""
+        return self.loop.controller
+
+    @property
+    def proved(self) -> bool:
+        """Whether the loop surely does what is required."""
+        return self.verdict.proved
+
+    def __repr__(self) -> str:
+        return f"Trained({self.verdict.status.name}, epochs={len(self.history)})"
+
+
+@logged
+@lenient
+def train(
+    loop: ClosedLoop,
+    X0: Box,
+    horizon: int,
+    task_loss: TaskLoss,
+    goal: Timed | None = None,
+    safe: Region | None = None,
+    avoid: AvoidSets | None = None,
+    *,
+    optimizer: optax.GradientTransformation | None = None,
+    stages: Sequence[Stage] = STAGES,
+    weight: float = 1.0,
+    margin: float = 0.0,
+    batch: int = 16,
+    samples: int = 64,
+    steps: int = 100,
+    epochs: int = 100,
+    cells: int = 1000,
+    start: int = 0,
+    seed: int = 0,
+    time_limit: float | None = None,
+    path: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> Trained:
+    """Train a loop's controller until a specification is proved.
+
+    Its loss is that of the task plus a weight times an objective, which is zero where nothing is
+    missed. Stages make it sharper: simulated trajectories, then affine forms over few cells of the
+    initial set, then over many. Between epochs `decide` looks whether all is proved, and says where
+    it is not.
+
+    Args:
+        loop: the closed loop, whose controller is where training begins: an `MLP`, or a `Network`
+            around any pytree, such as a module of flax or equinox. Its floating-point arrays are
+            trained.
+        X0: the box of initial states.
+        horizon: the number of steps.
+        task_loss: of a loop and initial states `(b, n_x)` one number, in functions of JAX.
+        goal: as of `decide`; of a loop in continuous time, what is required is meant at all times
+            as there.
+        safe: as of `decide`.
+        avoid: as of `decide`.
+        optimizer: of optax, for the list of the controller's arrays; None for Adam with a rate of
+            1e-3. Steps without a finite gradient are skipped.
+        stages: what is lowered beside the task's loss, one after the other.
+        weight: of the objective.
+        margin: how far requirements should be from failing, in the units of the state: a little
+            more than zero helps `decide`.
+        batch: how many cells are trained on at a step, at most.
+        samples: how many initial states are drawn from these at each step.
+        steps: of an epoch.
+        epochs: at most.
+        cells: into how many cells `decide` may cut the initial set: few make a controller that is
+            proved quickly.
+        start: the time of `X0`, for time-varying loops.
+        seed: of all that is drawn.
+        time_limit: seconds for the whole call, decisions and compiling included; a compilation that
+            has begun is waited for.
+        path: of a file that is written after each epoch; if it is there, training goes on from it.
+        progress: wraps the iteration over epochs to show a progress bar, such as `tqdm.tqdm`.
+
+    Returns:
+        The loop under its controller, its verdict, and what happened. If nothing is proved by the
+        end, the controller is the last one.
+
+    Raises:
+        ImportError: optax is not installed.
+        Interrupted: Ctrl-C; its `found` is what `train` would return for the last epoch.
+        RuntimeError: JAX's 64-bit floats are off.
+        TypeError, ValueError: as `decide`; an argument is of another kind; the controller has no
+            arrays; the file is of another training.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from reachjax import MLP, AffinePlant
+        >>> begun = MLP.from_layers([([[0.0]], [0.0])])  # x+ = x + u, u = -0.5 x is wanted
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), begun)
+        >>> def task(loop, states):
+        ...     return 0.1 * jnp.mean(loop.simulate(states, 3) ** 2)
+        >>> found = train(loop, Box([1.0], [2.0]), 3, task, goal=Box([-0.6], [0.6]), margin=0.05)
+        >>> found.proved, len(found.history) > 1
+        (True, True)
+    """
+    require_kinds(loop=loop, X0=X0)
+    require_kind("X0", X0, Box, "a Box, whose halves are boxes")
+    require_double_precision(loop=loop, X0=X0)
+    same_size(
+        "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)
+    )
+    loop.check_horizon(horizon, start)
+    if not callable(task_loss):
+        raise TypeError(
+            "task_loss must be a function of a loop and initial states, but "
+            f"{described(task_loss)} arrived"
+        )
+    if not stages or not all(isinstance(stage, Stage) for stage in stages):
+        raise TypeError(
+            f"stages must be some of type Stage, such as Stage(Certified()), but {stages} arrived"
+        )
+    counts = {"batch": batch, "samples": samples, "steps": steps, "epochs": epochs, "cells": cells}
+    for name, count in counts.items():
+        whole_number(name, count, 1)
+    whole_number("seed", seed, 0)
+    real_number("weight", weight, 0.0)
+    require_bar(progress)
+    loop, X0 = known_numbers("train", loop, X0, "X0")
+    required = tuple(requirements(loop.states, horizon, goal, avoid, safe, period_of(loop)))
+    spec = _Specification(horizon, start, required, real_number("margin", margin, 0.0))
+    chosen = _skipping(_adam() if optimizer is None else optimizer, FOREVER - 1)
+    run = _Run(loop, X0, spec, task_loss, chosen, tuple(stages), seed)
+    kept = None if path is None else writable("path", path)
+    if kept is not None and kept.exists():
+        run.resume(kept)
+    budget = Budget.of(time_limit)
+    asked = {"goal": goal, "safe": safe, "avoid": avoid, "cells": cells, "start": start}
+    sizes = _Sizes(batch, samples, steps, weight)
+    try:
+        first = min(FIRST, budget.left / 10) if budget.timed else FIRST
+        run.decide(budget, max(LEAST, first), asked, after=len(run.epochs))
+        for _ in wrapped(progress, range(len(run.epochs), epochs)):
+            if run.found.proved or budget.late:
+                break
+            run.epoch(sizes, budget, asked)
+            if kept is not None:
+                run.keep(kept)
+        return run.found
+    except KeyboardInterrupt:
+        if run.known is None:
+            raise
+        message = "interrupted: this exception's `found` has the controller of the last epoch"
+        raise Interrupted(message, run.found) from None
+
+
+@functools.lru_cache(maxsize=1)
+def _adam() -> Any:
+    """The optimizer where none is given; the same one, so that steps are compiled once."""
+    import optax
+
+    return optax.adam(1e-3)
+
+
+_skipping = functools.lru_cache(maxsize=64)(skip_failures)
+
+
+class _Sizes(NamedTuple):
+    """How much is done at a step and in an epoch: arguments of `train`."""
+
+    batch: int
+    samples: int
+    steps: int
+    weight: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Specification:
+    """What is required, as what compiled steps are told apart by.
+
+    Attributes:
+        horizon: the number of steps of the loop.
+        start: the time of the initial states.
+        required: the requirements.
+        margin: how far they should be from failing.
+    """
+
+    horizon: int
+    start: int
+    required: tuple[Requirement, ...]
+    margin: float
+
+    @functools.cached_property
+    def key(self) -> tuple[Any, ...]:
+        """Plain data that say the same."""
+
+        def bits(region: PolyhedralSet) -> bytes:
+            return b"".join(np.asarray(part).tobytes() for part in region.facets)
+
+        each = [
+            (item.name, item.time, item.inside, item.throughout, bits(item.region))
+            for item in self.required
+        ]
+        return self.horizon, self.start, self.margin, *each
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Specification) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
+class _Program(NamedTuple):
+    """What a compiled step is made for.
+
+    Attributes:
+        spec: what is required.
+        task_loss: of the user.
+        objective: of the stage.
+        optimizer: which skips failures.
+        samples: how many states are drawn.
+    """
+
+    spec: _Specification
+    task_loss: TaskLoss
+    objective: Any
+    optimizer: Any
+    samples: int
+
+
+def _weights_of(controller: Any) -> list[Array]:
+    """The arrays of a controller that are trained."""
+    leaves = map(jnp.asarray, jax.tree.leaves(controller))
+    return [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+
+
+def _under(loop: ClosedLoop, weights: Sequence[Array]) -> ClosedLoop:
+    """The loop whose controller has these arrays."""
+    leaves, structure = jax.tree.flatten(loop.controller)
+    left = iter(weights)
+    floating = (jnp.issubdtype(jnp.result_type(leaf), jnp.floating) for leaf in leaves)
+    parts = zip(leaves, floating, strict=True)
+    found = [next(left) if trained else leaf for leaf, trained in parts]
+    return loop.replace(controller=jax.tree.unflatten(structure, found))
+
+
+QUICKLY = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+"""How steps are compiled for processors: a pendulum's in 7 s instead of more than 60, and they take
+0.18 s instead of 0.11."""
+
+
+@functools.cache
+def _compiled_step() -> Callable[..., Any]:
+    """The step as it is compiled for the default device."""
+    options = QUICKLY if jax.default_backend() == "cpu" else None
+    return jax.jit(_advanced, static_argnames="program", compiler_options=options)
+
+
+def _advanced(
+    program: _Program,
+    loop: ClosedLoop,
+    weights: list[Array],
+    state: Any,
+    key: Array,
+    lower: Float[Array, "c n_x"],
+    upper: Float[Array, "c n_x"],
+    examples: Float[Array, "e n_x"],
+    weight: Array,
+) -> tuple[list[Array], Any, Array, Array]:
+    """One step: new weights, the optimizer's state, the task's loss and the objective before it.
+
+    Every second state that is drawn is a corner of its cell.
+    """
+    import optax
+
+    spec, (at, inside) = program.spec, jax.random.split(key)
+    which = jax.random.randint(at, (program.samples,), 0, len(lower))
+    part = jax.random.uniform(inside, (program.samples, lower.shape[1]))
+    part = jnp.where(jnp.arange(program.samples)[:, None] % 2 == 0, jnp.round(part), part)
+    states = lower[which] + part * (upper - lower)[which]
+    states = jnp.concatenate([states, examples])
+
+    def loss(weights: list[Array]) -> tuple[Array, tuple[Array, Array]]:
+        trained = _under(loop, weights)
+        task = _one_number("task_loss", program.task_loss(trained, states))
+        given = spec.horizon, spec.start, spec.required, spec.margin
+        asked = TrainingBatch(trained, lower, upper, states, *given)
+        missed = _one_number("a stage's objective", program.objective(asked))
+        return task + weight * missed, (task, missed)
+
+    (_, losses), slopes = jax.value_and_grad(loss, has_aux=True)(weights)
+    updates, state = program.optimizer.update(slopes, state, weights)
+    moved: Any = optax.apply_updates(weights, updates)
+    return moved, state, *losses
+
+
+def _one_number(name: str, value: Any) -> Array:
+    """A loss, if it is one.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if value is None or jnp.shape(value) != ():
+        arrived = "None" if value is None else f"an array of shape {jnp.shape(value)}"
+        raise ValueError(f"{name} must give one number, but {arrived} arrived")
+    return jnp.asarray(value)
+
+
+def _hashable(function: Any) -> Callable[..., Any]:
+    """A function as compiled steps are told apart by; one that cannot be is another one each time.
+
+    Such as a `jax.tree_util.Partial` of arrays.
+    """
+    try:
+        hash(function)
+    except TypeError:
+        return functools.partial(function)
+    return function
+
+
+def _mean(losses: Float[np.ndarray, " s"]) -> float:
+    """The mean of those that are known; NaN of none."""
+    known = losses[np.isfinite(losses)]
+    return float(known.mean()) if len(known) else float("nan")
+
+
+class _Kept(NamedTuple):
+    """What a file holds of a training.
+
+    Attributes:
+        seal: of the loop as it was given, the initial set and what is required.
+        weights: the controller's arrays.
+        optimizer: the arrays of the optimizer's state.
+        examples: initial states of counterexamples.
+        stage: the number of the stage.
+        begun: the epoch that it began with.
+        epochs: so far.
+    """
+
+    seal: Any
+    weights: tuple[Any, ...]
+    optimizer: tuple[Any, ...]
+    examples: Any
+    stage: int
+    begun: int
+    epochs: tuple[Epoch, ...]
+
+
+class _Run:
+    """A training as far as it has come.
+
+    Args:
+        loop: as it was given.
+        X0: the initial set.
+        spec: what is required.
+        task_loss: of the user.
+        optimizer: which skips failures.
+        stages: of the training.
+        seed: of all that is drawn.
+
+    Attributes:
+        epochs: so far.
+        known: the controller that was decided last, with its verdict; None before.
+    """
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        X0: Box,
+        spec: _Specification,
+        task_loss: TaskLoss,
+        optimizer: Any,
+        stages: tuple[Stage, ...],
+        seed: int,
+    ):
+        self._loop, self._X0, self._spec, self._seed = loop, X0, spec, seed
+        self._task_loss, self._optimizer, self._stages = _hashable(task_loss), optimizer, stages
+        self._weights = _weights_of(loop.controller)
+        if not self._weights:
+            raise ValueError(
+                "loop.controller has no floating-point arrays to train: give a Network around a "
+                "pytree of parameters, such as jax.tree_util.Partial(f, params)"
+            )
+        self._state = optimizer.init(self._weights)
+        self._examples = np.tile(np.asarray(X0.center), (REMEMBERED, 1))
+        self._stage = self._begun = 0
+        self._before = 0.0
+        self.epochs: list[Epoch] = []
+        self.known: Trained | None = None
+
+    @property
+    def found(self) -> Trained:
+        """The controller that was decided last."""
+        assert self.known is not None  # it is decided before anything else
+        return dataclasses.replace(self.known, history=TrainingHistory(tuple(self.epochs)))
+
+    @property
+    def _seal(self) -> Seal:
+        spec, regions = self._spec, [item.region.facets for item in self._spec.required]
+        numbers = jnp.array([spec.horizon, spec.start, spec.margin], float)
+        return seal_of(self._loop, self._X0, numbers, regions)
+
+    def decide(self, budget: Budget, seconds: float, asked: dict[str, Any], after: int) -> Verdict:
+        """The verdict on the controller as it is, whose counterexample is remembered.
+
+        After so many epochs it is the same, also where a file was gone on from.
+        """
+        loop = _under(self._loop, self._weights)
+        limit = min(seconds, budget.left) if budget.timed else seconds
+        given = loop, self._X0, self._spec.horizon
+        verdict = decide(*given, **asked, seed=self._seed + after, time_limit=limit)
+        if verdict.counterexample is not None and (after == 0 or after > len(self.epochs)):
+            begun = np.asarray(verdict.counterexample.states[0])[None]
+            self._examples = np.concatenate([self._examples[1:], begun])
+        self.known = Trained(loop, verdict, TrainingHistory())
+        return verdict
+
+    def epoch(self, sizes: _Sizes, budget: Budget, asked: dict[str, Any]) -> None:
+        """Some steps on the cells that are worst, and what is decided then."""
+        number, stage = len(self.epochs), self._stages[self._stage]
+        rng = np.random.default_rng((self._seed, number))
+        count = min(sizes.batch, stage.cells)
+        corners = worst_cells(self._X0, self.found.verdict.cells, stage.cells, count, rng)
+        program = _Program(
+            self._spec,
+            self._task_loss,
+            _hashable(stage.objective),
+            self._optimizer,
+            sizes.samples,
+        )
+        keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), sizes.steps)
+        skipped, losses, clock = failures(self._state), list[list[float]](), Budget()
+        for key in keys:
+            given = self._weights, self._state, key, *corners, self._examples, sizes.weight
+            self._weights, self._state, *found = _compiled_step()(program, self._loop, *given)
+            losses.append([float(each) for each in found])
+            if len(losses) == 1:  # which may have been compiled
+                clock = Budget()
+            if budget.late:
+                break
+        skipped = failures(self._state) - skipped
+        task, missed = np.array(losses).T
+        quiet = not np.any(missed[-max(1, len(losses) // QUIET) :] > 0)
+        seconds = clock.elapsed * (PATIENCE if quiet else 1.0)
+        verdict = self.decide(budget, max(LEAST, seconds), asked, number + 1)
+        proved = sum(cell.status is VerdictStatus.PROVED for cell in verdict.cells)
+        self.epochs.append(
+            Epoch(
+                stage=self._stage,
+                steps=len(losses),
+                skipped=skipped,
+                task=_mean(task),
+                penalty=_mean(missed),
+                status=verdict.status.name,
+                margin=smallest(verdict.margins),
+                cells=len(verdict.cells),
+                proved=proved,
+                seconds=self._before + budget.elapsed,
+            )
+        )
+        over = quiet or skipped == len(losses) or number + 1 - self._begun >= stage.epochs
+        if over and not verdict.proved and self._stage + 1 < len(self._stages):
+            self._stage, self._begun = self._stage + 1, number + 1
+
+    def keep(self, path: Path) -> None:
+        """Write what has been done to a file."""
+        state = tuple(jax.tree.leaves(self._state))
+        kept = _Kept(
+            np.asarray(self._seal),
+            tuple(self._weights),
+            state,
+            self._examples,
+            self._stage,
+            self._begun,
+            tuple(self.epochs),
+        )
+        write(path, kept, outside=ClosedLoop)
+
+    def resume(self, path: Path) -> None:
+        """Go on from a file.
+
+        Raises:
+            UnreadableError: it is none of such files.
+            ValueError: it is of another training.
+        """
+        kept = read(path, None, "holds no training")
+        structure = jax.tree.structure(self._state)
+        fits = (
+            isinstance(kept, _Kept)
+            and np.array_equal(kept.seal, self._seal)
+            and len(kept.optimizer) == structure.num_leaves
+            and kept.stage < len(self._stages)
+        )
+        if not fits:
+            raise ValueError(
+                f"path must be that of a training of this loop, from this X0, for these "
+                f"requirements, by this optimizer in these stages, but {path} is of another one: "
+                "name another file, or remove it"
+            )
+        self._weights = [jnp.asarray(each) for each in kept.weights]
+        self._state = jax.tree.unflatten(structure, kept.optimizer)
+        self._examples, self._stage, self._begun = kept.examples, kept.stage, kept.begun
+        self.epochs = [*kept.epochs]
+        self._before = self.epochs[-1].seconds if self.epochs else 0.0

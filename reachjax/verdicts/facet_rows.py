@@ -1,0 +1,105 @@
+"""Rows that decide requirements: directions, and what their upper bounds are compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from reachjax.sets.balance import balanced
+from reachjax.verdicts.specification import Requirement
+
+
+class FacetRows(NamedTuple):
+    """Directions whose upper bounds decide a requirement, and the limits of these.
+
+    To be inside, all of `C x <= d`; to be outside, one of `-C x < -d`. The other way round, by
+    limits that are rounded the other way, it surely fails.
+
+    Attributes:
+        item: the requirement.
+        first: the number of its first direction among those of its time.
+        directions: `(2 k, n_x)`, those that prove it, then those that refute it.
+        limits: `(2 k,)`.
+        units: `(k,)`, what a distance of 1 in the units of the state changes the first by.
+    """
+
+    item: Requirement
+    first: int
+    directions: Float[np.ndarray, "2k n_x"]
+    limits: Float[np.ndarray, " 2k"]
+    units: Float[np.ndarray, " k"]
+
+    @classmethod
+    def of(cls, item: Requirement, first: int) -> FacetRows:
+        """The rows of a requirement."""
+        C, d, norms = (np.asarray(part) for part in item.region.facets_in_units(item.inside))
+        facets = (np.asarray(part) for part in item.looser.facets)
+        D, e = balanced(*facets, inner=not item.inside)
+        sign = 1.0 if item.inside else -1.0
+        directions, limits = (
+            np.concatenate([sign * proving, -sign * refuting])
+            for proving, refuting in ((C, D), (d, e))
+        )
+        return cls(item, first, directions, limits, norms)
+
+    @property
+    def proving(self) -> slice:
+        """Which directions of its time prove it."""
+        return slice(self.first, self.first + len(self.units))
+
+    @property
+    def end(self) -> int:
+        """The number of the first direction after its own."""
+        return self.first + len(self.limits)
+
+    def judged(self, uppers: Float[np.ndarray, " m"]) -> tuple[bool, bool, float]:
+        """Whether it surely holds, or surely fails, and its margin, given bounds at its time."""
+        found, k = uppers[self.first : self.end], len(self.units)
+        room = (self.limits - found)[:k] / self.units
+        known = np.isfinite(found)
+        if self.item.inside:
+            holds = known[:k].all() and (found[:k] <= self.limits[:k]).all()
+            fails = (known & (found < self.limits))[k:].any()
+            margin = room.min(initial=np.inf)
+        else:
+            holds = (known & (found < self.limits))[:k].any()
+            fails = known[k:].all() and (found[k:] <= self.limits[k:]).all()
+            margin = np.fmax.reduce(room)
+        return bool(holds), bool(fails), float(np.nan_to_num(margin, nan=-np.inf))
+
+
+class FacetRowsByTime(NamedTuple):
+    """The rows of all requirements, time by time, filled up with zeros to arrays.
+
+    Attributes:
+        each: the rows of each requirement.
+        directions: `(h + 1, m, n_x)`.
+        whole: `(h + 1, m)`, which are bounded at all times since the sample before.
+    """
+
+    each: tuple[FacetRows, ...]
+    directions: Float[np.ndarray, "h+1 m n_x"]
+    whole: Bool[np.ndarray, "h+1 m"]
+
+    @classmethod
+    def of(cls, required: Sequence[Requirement], horizon: int, states: int) -> FacetRowsByTime:
+        """The rows of requirements.
+
+        Args:
+            required: the requirements.
+            horizon: the number of steps.
+            states: of the loop.
+        """
+        ends, each = np.zeros(horizon + 1, dtype=int), list[FacetRows]()
+        for item in required:
+            each.append(FacetRows.of(item, int(ends[item.time])))
+            ends[item.time] = each[-1].end
+        directions = np.zeros((horizon + 1, int(ends.max()), states))
+        whole = np.zeros(directions.shape[:2], dtype=bool)
+        for rows in each:
+            directions[rows.item.time, rows.first : rows.end] = rows.directions
+            whole[rows.item.time, rows.first : rows.end] = rows.item.throughout
+        return cls(tuple(each), directions, whole)

@@ -1,0 +1,209 @@
+"""Training until a controller is proved: what it trains on, when it ends, and that it goes on."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import linen, nnx
+
+import reachjax as rj
+from reachjax.training.worst_cells import worst_cells
+from reachjax.verdicts.specification import requirements
+
+PLANT = rj.AffinePlant([[1.0]], [[1.0]])
+X0, GOAL = rj.Box([1.0], [2.0]), rj.Box([-0.6], [0.6])
+LAYERS = [([[1.0], [-1.0]], [0.0, 0.0]), ([[0.0, 0.1]], [0.0])]
+TRACED = []
+
+
+def task(loop, states):
+    TRACED.append(1)
+    return 0.01 * jnp.mean(loop.simulate(states, 2) ** 2)
+
+
+def loop_of(controller=None):
+    return rj.ClosedLoop(PLANT, controller or rj.MLP.from_layers(LAYERS))
+
+
+trained = partial(rj.train, horizon=2, task_loss=task, goal=GOAL, margin=0.02, steps=25, epochs=20)
+
+
+def leaves(loop):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(loop.controller)]
+
+
+def test_a_refuted_controller_is_trained_until_it_is_proved():
+    loop = loop_of()
+    assert rj.decide(loop, X0, 2, goal=GOAL).refuted
+    found = trained(loop, X0, optimizer=optax.adam(2e-2))
+    assert found.proved
+    assert rj.decide(found.loop, X0, 2, goal=GOAL).proved
+    statuses = [epoch.status for epoch in found.history.epochs]
+    assert statuses.index("PROVED") == len(statuses) - 1  # it ends with the first proof
+    assert leaves(loop)[2].tolist() == LAYERS[1][0]  # what was given is as it was
+
+
+def test_a_proved_controller_is_left_as_it_is():
+    loop = loop_of(rj.MLP.from_layers([([[-0.6]], [0.0])]))
+    found = trained(loop, X0)
+    assert (found.proved, len(found.history)) == (True, 0)
+    assert leaves(found.loop)[0].tolist() == [[-0.6]]
+
+
+def test_what_cannot_be_is_not_proved():
+    safe = rj.Box([-1.0], [1.5])  # where it begins outside
+    found = rj.train(loop_of(), X0, 2, task, safe=safe, steps=3, epochs=2)
+    assert found.verdict.refuted
+    assert len(found.history) == 2
+
+
+class Nnx(nnx.Module):
+    def __init__(self):
+        self.layer = nnx.Linear(1, 1, rngs=nnx.Rngs(0), param_dtype=float)
+
+    def __call__(self, x):
+        return 0.1 * self.layer(x)
+
+
+def of_linen():
+    dense = linen.Dense(1, param_dtype=float)
+    params = dense.init(jax.random.key(0), jnp.zeros(1))
+    return jax.tree_util.Partial(dense.apply, params)
+
+
+CONTROLLERS = {
+    "nnx": Nnx,
+    "linen": of_linen,
+    "equinox": lambda: eqx.nn.Linear(1, 1, key=jax.random.key(1)),
+    "a function of arrays": lambda: jax.tree_util.Partial(lambda w, x: w * x, jnp.array([0.1])),
+}
+
+
+@pytest.mark.parametrize("kind", CONTROLLERS)
+def test_any_tree_of_arrays_is_trained(kind):
+    loop = loop_of(rj.Network(CONTROLLERS[kind](), 1, 1))
+    found = rj.train(
+        loop, X0, 2, task, goal=GOAL, margin=0.02, steps=40, optimizer=optax.adam(3e-2)
+    )
+    assert found.proved
+    assert rj.decide(found.loop, X0, 2, goal=GOAL).proved
+
+
+def test_a_training_goes_on_from_its_file(tmp_path):
+    slow = {"optimizer": optax.adam(1e-3), "stages": (rj.Stage(rj.Certified(), cells=2),)}
+    whole = trained(loop_of(), X0, **slow | {"epochs": 4})
+    path = tmp_path / "pendulum.training"
+    first = trained(loop_of(), X0, **slow | {"epochs": 2, "path": path})
+    second = trained(loop_of(), X0, **slow | {"epochs": 4, "path": path})
+    assert [len(run.history) for run in (whole, first, second)] == [4, 2, 4]
+    assert not first.proved
+    for one, other in zip(leaves(whole.loop), leaves(second.loop), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert second.history.epochs[:2] == first.history.epochs
+    with pytest.raises(ValueError, match="path must be that of a training of this loop"):
+        trained(loop_of(), rj.Box([1.0], [2.5]), **slow | {"path": path})
+
+
+def test_steps_are_compiled_once_for_all_initial_sets_and_weights():
+    same = {"optimizer": optax.sgd(1e-9), "stages": (rj.Stage(rj.Simulated()),), "epochs": 2}
+    trained(loop_of(), X0, **same)
+    TRACED.clear()
+    trained(loop_of(rj.MLP.from_layers([(2 * np.array(W), b) for W, b in LAYERS])), X0, **same)
+    trained(loop_of(), rj.Box([1.1], [2.0]), **same)
+    assert TRACED == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cells_to_train_on_are_those_of_which_least_is_proved(seed):
+    rng, box = np.random.default_rng(seed), rj.Box([0.0, -1.0, 2.0], [1.0, 1.0, 2.0])
+    lower, upper = worst_cells(box, (), 32, 32, rng)
+    assert np.prod((upper - lower)[:, :2], axis=1).sum() == pytest.approx(2.0)
+    statuses = rng.choice([*rj.VerdictStatus], len(lower))
+    parts = zip(lower, upper, statuses, rng.normal(size=len(lower)), strict=True)
+    known = [rj.DecidedCell(*each) for each in parts]
+    lower, upper = worst_cells(box, known, 32, 32, rng)
+    middles = (lower + upper) / 2
+    rank = []
+    for middle in middles:
+        of = [c for c in known if ((c.lower <= middle) & (middle <= c.upper)).all()]
+        rank.append(
+            (min(c.status is rj.VerdictStatus.PROVED for c in of), min(c.margin for c in of))
+        )
+    assert rank[:24] == sorted(rank[:24])
+    assert np.prod((upper - lower)[:, :2], axis=1).sum() <= 2.0 + 1e-9
+
+
+A, B = np.array([[0.0, 1.0], [1.0, -0.5]]), np.array([[0.0], [1.0]])
+PLANTS = {
+    "discrete": lambda: rj.AffinePlant(np.eye(2) + 0.1 * A, 0.1 * B),
+    "linear flow": lambda: rj.SampledPlant.affine(A, B, period=0.1),
+    "flow": lambda: rj.SampledPlant(
+        lambda x, u: jnp.array([x[1], jnp.sin(x[0]) - 0.5 * x[1] + u[0]]), 2, 1, 0.1
+    ),
+}
+
+
+@pytest.mark.costly
+@pytest.mark.parametrize("kind", PLANTS)
+def test_forms_over_a_cell_miss_what_trajectories_from_it_miss(kind):
+    """Of sets to be in and to be out of, at all times; the remainder is their difference."""
+    rng, plant = np.random.default_rng(0), PLANTS[kind]()
+    net = rj.MLP.from_layers(
+        [(rng.normal(size=(3, 2)), rng.normal(size=3)), (rng.normal(size=(1, 3)), [0.0])],
+        rj.Tanh(),
+    )
+    loop, steps = rj.ClosedLoop(plant, net), 3
+    safe, wall = rj.Box([-0.1, -0.1], [0.1, 0.1]), rj.Box([0.2, -1.0], [0.5, 1.0])
+    period = 0.1 if plant.continuous else None
+    required = tuple(requirements(2, steps, None, [wall], safe, period))
+
+    @jax.jit
+    def both(lower, upper, states):
+        batch = rj.TrainingBatch(loop, lower, upper, states, steps, 0, required, 0.3)
+        objectives = rj.Certified(), rj.Certified(remainder=1.0), rj.Simulated()
+        return [objective(batch) for objective in objectives]
+
+    slopes = jax.jit(jax.grad(lambda *given: both(*given)[0]))
+    for _ in range(5):
+        lower = rng.uniform(-0.5, 0.5, size=(1, 2))
+        upper = lower + rng.uniform(0.0, 0.2, size=(1, 2))
+        states = lower + rng.uniform(size=(50, 2)) * (upper - lower)
+        certified, wider, simulated = map(float, both(lower, upper, states))
+        assert 0 < simulated <= certified * (1 + 1e-9)
+        assert certified <= wider
+        assert np.isfinite(slopes(lower, upper, states)).all()
+    point = rng.uniform(-0.5, 0.5, size=(1, 2))
+    certified, wider, simulated = map(float, both(point, point, point.repeat(50, axis=0)))
+    assert certified == pytest.approx(wider, rel=1e-4)
+    assert certified == pytest.approx(simulated, rel=0.1)
+
+
+def test_a_history_is_told_and_drawn():
+    found = trained(loop_of(), X0, optimizer=optax.adam(2e-2))
+    assert str(found.history).count("\n") == min(len(found.history), 12)
+    ax = found.history.plot()
+    assert [line.get_label() for line in ax.lines][:3] == ["task", "penalty", "cells not proved"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "match"),
+    [
+        ({"task_loss": 3.0}, TypeError, "task_loss must be a function"),
+        ({"task_loss": lambda loop, states: states}, ValueError, "task_loss must give one number"),
+        ({"stages": (rj.Certified(),)}, TypeError, "stages must be some of type Stage"),
+        ({"X0": rj.Polytope([[1.0], [-1.0]], [2.0, -1.0])}, TypeError, "X0 must be a Box"),
+        ({"margin": -1.0}, ValueError, "margin must be finite and at least 0"),
+        ({"steps": 0}, ValueError, "steps must be at least 1"),
+        ({"loop": loop_of(rj.Network(lambda x: x, 1, 1))}, ValueError, "no floating-point arrays"),
+    ],
+)
+def test_a_wrong_argument_is_named(wrong, error, match):
+    given = {"loop": loop_of(), "X0": X0} | wrong
+    with pytest.raises(error, match=match):
+        trained(given.pop("loop"), given.pop("X0"), **given)
+    with pytest.raises(TypeError, match=r"Stage.objective must be a function"):
+        rj.Stage(3.0)

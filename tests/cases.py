@@ -534,6 +534,17 @@ BASIC = (
 )
 """Rows of which a law is checked wherever one case of each claim is."""
 
+LONGEST = (
+    *(Case("sine, tanh", "default", initial) for initial in ("polytope", "simplex")),
+    *(Case("disturbed", method) for method in ("few programs", "no programs", "cuts")),
+    *(Case("sine, tanh", "programs", "own", template) for template in ("ellipsoids", "mixed")),
+    Case("disturbed in a polytope", "programs"),
+    Case("inputs in a pentagon", "no programs"),
+    Case("three states", "programs", "own", "mixed"),
+    Case("six states", "programs", "ellipsoid", "ellipsoids"),
+)
+"""Rows that take longest, and whose parts other rows have."""
+
 FEW = Case("relu"), Case("disturbed", "forms"), Case("sampled", "forms")
 """The rows for laws that bound several tubes of each."""
 
@@ -542,11 +553,26 @@ def each(
     where: Callable[[Case], bool] = lambda case: True,
     rows: Iterable[Case] = CASES,
     basic: Iterable[Case] = BASIC,
+    every: int = 1,
 ) -> pytest.MarkDecorator:
-    """The rows of which a law speaks."""
+    """The rows of which a law speaks.
+
+    Args:
+        where: which rows.
+        rows: out of these.
+        basic: those that are taken wherever one case of each claim is.
+        every: of laws that bound much anew, whose row is taken besides; a person runs the rest by
+            `-m long`, and those that take longest.
+    """
+
+    def marks(case: Case, number: int) -> list[pytest.MarkDecorator]:
+        if case in basic:
+            return [pytest.mark.basic]
+        return [pytest.mark.long] * bool(number % every or case in LONGEST)
+
+    chosen = filter(where, rows)
     found = [
-        pytest.param(case, id=case.name, marks=[pytest.mark.basic] * (case in basic))
-        for case in rows
-        if where(case)
+        pytest.param(case, id=case.name, marks=marks(case, number))
+        for number, case in enumerate(chosen)
     ]
     return pytest.mark.parametrize("case", found)

@@ -121,7 +121,7 @@ def test_derivatives_of_all_kinds_are_differences(case):
 
 
 @pytest.mark.costly
-@each(rows=SOME)
+@each(rows=SOME, every=2)
 def test_what_is_differentiated_is_what_is_called(case):
     of, args = size(case), (case.closed_loop, case.X0)
     value, _ = jax.value_and_grad(of, argnums=(0, 1))(*args)

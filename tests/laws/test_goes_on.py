@@ -40,7 +40,7 @@ def as_tight(one, other):
     )
 
 
-@each(lambda case: not case.searches_cells, basic=FEW)
+@each(lambda case: not case.searches_cells, basic=FEW, every=3)
 def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(case):
     with pytest.raises(rj.Interrupted, match=rf"after 1 of {HORIZON} steps") as stopped:
         case.reach(progress=Stopping(1))
@@ -52,19 +52,19 @@ def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(case):
     assert as_tight(rest, case.tube)
 
 
-@each(basic=FEW)
+@each(basic=FEW, every=3)
 def test_nothing_is_left_of_a_call_that_proved_nothing(case):
     with pytest.raises(KeyboardInterrupt) as stopped:
         case.reach(progress=Stopping(0))
     assert not isinstance(stopped.value, rj.Interrupted)
 
 
-@each(basic=FEW)
+@each(basic=FEW, every=3)
 def test_the_same_call_gives_the_same_tube(case):
     assert same(claims(case.reach()), claims(case.tube))
 
 
-@each(lambda case: case.template != "varying" and not case.searches_cells, basic=FEW)
+@each(lambda case: case.template != "varying" and not case.searches_cells, basic=FEW, every=3)
 def test_the_first_step_is_that_of_a_call_for_one_step(case):
     assert same(claims(case.reach(steps=1))[0][1], case.tube.sets[1])
 

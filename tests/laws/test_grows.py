@@ -17,7 +17,9 @@ def room(case, k):
     return case.options.get("gap", GAP) * np.ptp(values, axis=0) + ACCURACY * (1 + abs(limits))
 
 
-@each(lambda case: (case.by.closes or case.by.grows) and case.template == "axes", basic=FEW)
+@each(
+    lambda case: (case.by.closes or case.by.grows) and case.template == "axes", basic=FEW, every=2
+)
 def test_bounds_are_no_larger_of_a_smaller_set(case):
     small = case.reach(X0=smaller(case.X0, 0.2))
     for k in range(HORIZON + 1):

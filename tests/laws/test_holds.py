@@ -33,7 +33,11 @@ def test_no_state_is_outside_in_between_samples(case):
             assert case.excess(span, inner) <= ROUNDING
 
 
-@each(lambda case: case.method in ("forms", "programs") and case.template == "axes", basic=FEW)
+@each(
+    lambda case: case.method in ("forms", "programs") and case.template == "axes",
+    basic=FEW,
+    every=2,
+)
 def test_no_state_is_outside_of_all_cells(case):
     options = {"start": case.of.start, **case.options}
     cells = rj.reach_partitioned(
@@ -64,7 +68,7 @@ BY_PROGRAMS = [
 
 @pytest.mark.costly
 @pytest.mark.parametrize("fault", FAULTS)
-@each(rows=BY_PROGRAMS, basic=())
+@each(rows=BY_PROGRAMS, basic=(), every=2)
 def test_no_state_is_outside_whatever_a_solver_answers(case, fault):
     tube = case.reach(steps=2, solver=Faulty(rj.Clarabel(), fault))
     assert outside(case, tube) <= ROUNDING

@@ -63,7 +63,7 @@ def genuine(case, example, goal=None, safe=None, avoid=()):
         assert any(bool(region.contains(at)) for region in avoid)
 
 
-@each(lambda case: case.method in ("default", "forms", "programs"), basic=FEW)
+@each(lambda case: case.method in ("default", "forms", "programs"), basic=FEW, every=2)
 def test_what_trajectories_leave_is_refuted_and_nothing_proves_it(case):
     if case.initial in ("point", "flat", "thin"):
         return
@@ -75,7 +75,7 @@ def test_what_trajectories_leave_is_refuted_and_nothing_proves_it(case):
     assert found[0].refuted
 
 
-@each(lambda case: case.method in ("default", "forms", "programs"), basic=FEW)
+@each(lambda case: case.method in ("default", "forms", "programs"), basic=FEW, every=2)
 def test_what_sets_stay_in_is_proved_and_nothing_refutes_it(case):
     boxes = [X.bounding_box() for X in case.tube.sets]
     if case.continuous:

@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
 
 from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.pytrees import pytree
@@ -87,14 +88,20 @@ NOTHING, WHOLE = Nothing(), Whole()
 def rounding(counted: bool) -> Iterator[None]:
     """A scope in which errors of rounding are counted, or are not: then nothing in it is a bound.
 
+    What JAX compiles is kept for each kind of scope apart: else whoever calls a function first
+    would decide whether its later values are bounds.
+
     Example:
         >>> with rounding(False):
         ...     2.0 * (1 + gamma(3)) + gamma(3) * 5.0
         2.0
     """
+    same = counted is is_counted()
+    told_apart = nullcontext() if same else set_xla_metadata(rounding=str(counted))
     token = _COUNTED.set(counted)
     try:
-        yield
+        with told_apart:
+            yield
     finally:
         _COUNTED.reset(token)
 
@@ -105,10 +112,7 @@ def is_counted() -> bool:
 
 
 def counting(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with errors of rounding counted, wherever it is called.
-
-    What is traced is kept, and used where they are counted.
-    """
+    """The function with errors of rounding counted, wherever it is called."""
 
     @functools.wraps(function)
     def counted(*given: Any, **named: Any) -> Any:

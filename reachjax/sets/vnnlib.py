@@ -3,8 +3,9 @@
 A file declares numbers `X_0 .. X_(n-1)` and `Y_0 .. Y_(m-1)` and asserts inequalities that are
 linear in them, joined by `and` and `or`. It describes what would be a violation. Those of `X` are
 the initial set; those of `Y` are a union of polytopes to be avoided. Sets are closed, whether an
-inequality is strict or not: what is proved is proved of both. Decimals are computed with exactly;
-what bounds a linear form is rounded outwards, and factors of numbers to the nearest float.
+inequality is strict or not: what is proved is proved of both. Decimals are computed with exactly:
+inequalities are multiplied until their factors are whole numbers, and what bounds a linear form is
+rounded outwards. Only factors of which that makes numbers beyond 2^53 are the nearest floats.
 
 Source: VNN-LIB 1.0 (Tacchella, Demarchi, Guidotti, Pulina), as competitions use it.
 """
@@ -12,6 +13,7 @@ Source: VNN-LIB 1.0 (Tacchella, Demarchi, Guidotti, Pulina), as competitions use
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -21,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from reachjax.numerics.archives import existing_file
+from reachjax.numerics.checks import EXACT
 from reachjax.sets.base import Box, PolyhedralSet
 from reachjax.sets.polytope import Polytope
 
@@ -101,6 +104,8 @@ def _read(text: str) -> VnnLib:
         if command[0] == "assert":
             cases.append(_cases(command[1], counts))
     every = [[half for part in case for half in part] for case in _products(cases)]
+    if not every:
+        raise ValueError("it has a disjunction of nothing, which never holds")
     initial, avoided = [], []
     for case in every:
         initial.append([half for half in case if half.letter == "X"])
@@ -235,8 +240,19 @@ def _set(halves: Sequence[_Half]) -> PolyhedralSet:
 
 
 def _polytope(halves: Sequence[_Half]) -> Polytope:
-    rows = np.array([[float(factor) for factor in half.row] for half in halves])
-    return Polytope(rows, [_above(half.offset) for half in halves])
+    whole = [_whole(half) for half in halves]
+    rows = np.array([[float(factor) for factor in half.row] for half in whole])
+    return Polytope(rows, [_above(half.offset) for half in whole])
+
+
+def _whole(half: _Half) -> _Half:
+    """The same inequality with whole factors, if floats hold these: then it is exactly that."""
+    times = math.lcm(*(factor.denominator for factor in half.row))
+    times = Fraction(times, math.gcd(*(int(factor * times) for factor in half.row)))
+    row = tuple(factor * times for factor in half.row)
+    if max(map(abs, row)) > EXACT:
+        return half
+    return half._replace(row=row, offset=half.offset * times)
 
 
 def _above(number: Fraction) -> float:

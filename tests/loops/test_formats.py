@@ -438,6 +438,15 @@ def test_a_matlab_file_without_a_network(layers, tmp_path):
         rj.Network.from_file(path)
 
 
+def test_a_row_of_weights_is_of_one_neuron_or_of_one_input(tmp_path):
+    """Four numbers for two neurons may be two of each, but which ones the file does not say."""
+    path = tmp_path / "row.mat"
+    held = {"W": cells([np.ones((1, 4)), np.ones((1, 2))]), "b": cells([[1, 1], [1]])}
+    scipy.io.savemat(path, held | {"act_fcns": ["relu", "relu"]})
+    with pytest.raises(ValueError, match="do not chain"):
+        rj.Network.from_file(path)
+
+
 def test_an_ending_that_is_not_known_names_those_that_are(tmp_path):
     path = tmp_path / "net.pt"
     path.write_bytes(b"PK\x03\x04\x80\xff")

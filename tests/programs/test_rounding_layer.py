@@ -95,6 +95,22 @@ def test_penalties_without_rounding_have_no_bits_in_their_graph():
     assert "callback" not in text
 
 
+@pytest.mark.parametrize("first", [True, False])
+def test_what_is_compiled_in_one_scope_does_not_serve_the_other(first):
+    """However deep it is, and whoever asks for it first."""
+    inner = jax.jit(lambda x: x + gamma(5) * 1e16)
+    outer = jax.jit(lambda x: 2.0 * inner(x))
+
+    def found(counted, within=True):
+        with rounding(within), rounding(counted):
+            return [float(each(1.0)) for each in (inner, outer)]
+
+    for counted in (first, not first, first):
+        for within in (first, not first):
+            once, twice = found(counted, within)
+            assert (once > 1.5, twice > 3.0) == (counted, counted)
+
+
 def exactly(rows):
     return [[Fraction(float(entry)) for entry in row] for row in np.asarray(rows)]
 

@@ -1,5 +1,7 @@
 """Specifications in VNN-LIB are the sets that they describe, or are refused by what is wrong."""
 
+from fractions import Fraction
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -56,8 +58,6 @@ def test_initial_sets_that_are_no_boxes_are_polytopes(tmp_path):
 def test_decimals_are_rounded_outwards(tmp_path):
     text = "(assert (>= X_0 0.1))(assert (<= X_0 0.3))(assert (>= X_1 0))(assert (<= X_1 0))"
     found = read(tmp_path, text + "(assert (<= Y_0 0.7))")
-    from fractions import Fraction
-
     assert Fraction(float(found.X0.lower[0])) <= Fraction("0.1")
     assert Fraction(float(found.X0.upper[0])) >= Fraction("0.3")
     assert Fraction(float(found.avoid[0].b[0])) >= Fraction("0.7")
@@ -78,12 +78,28 @@ def test_decimals_are_rounded_outwards(tmp_path):
         ("(declare-const Y_5 Real)", "not declared in order"),
         ("(launch)", "is not known"),
         ("", "nothing of what to avoid"),
+        ("(assert (or))(assert (<= Y_0 1))", "disjunction of nothing"),
         ("(assert (or (<= X_0 0.5) (<= Y_0 1)))", "several initial sets"),
     ],
 )
 def test_what_is_something_else_is_refused(tmp_path, text, said):
     with pytest.raises(ValueError, match=said):
         read(tmp_path, BOX + text)
+
+
+@pytest.mark.parametrize("digits", [1, 4, 12])
+def test_factors_are_the_decimals_that_are_written(digits, tmp_path):
+    """Half-planes hold each violation exactly, and no more than their offsets are rounded by."""
+    rng = np.random.default_rng(digits)
+    for _ in range(20):
+        one, other, least = (f"{each:.{digits}f}" for each in rng.uniform(0.1, 9, size=3))
+        text = f"(assert (<= (- (* {one} Y_0) (* {other} Y_1)) {least}))"
+        (region,) = read(tmp_path, BOX + text).avoid
+        row = [Fraction(float(each)) for each in region.A[0]]
+        times = row[0] / Fraction(one)
+        assert row == [times * Fraction(one), -times * Fraction(other)]
+        offset = times * Fraction(least)
+        assert offset <= Fraction(float(region.b[0])) <= offset * (1 + Fraction(1, 2**52))
 
 
 def test_a_loop_is_decided_from_a_file(tmp_path):

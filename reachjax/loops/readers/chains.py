@@ -139,8 +139,8 @@ def _joined(pairs: Sequence[tuple[Any, Any]]) -> Layers:
 
 
 def _is_line(W: np.ndarray, b: np.ndarray) -> bool:
-    """Whether weights are a row or a column, which may lie either way, of so many neurons."""
-    return W.size > 0 and W.size == max(W.shape) and len(b) > 0 and W.size % len(b) == 0
+    """Whether weights are those of one neuron, or of one input, which may lie either way."""
+    return W.size > 0 and W.size == max(W.shape) and len(b) in (1, W.size)
 
 
 def _matlab(content: bytes) -> Chain:

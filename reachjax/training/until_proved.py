@@ -84,6 +84,9 @@ LEAST, FIRST = 1.0, 10.0
 """Seconds that a decision may take at least, else it may take as long as the epoch did; and those
 of the first one, or a tenth of all."""
 
+FOR_STEPS = 0.5
+"""The part of the time left that the steps of an epoch may take: the rest is for its decision."""
+
 PATIENCE = 3.0
 """Where the objective is zero it may take so many times as long."""
 
@@ -383,18 +386,21 @@ class _Run:
         )
         keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), sizes.steps)
         skipped, losses, clock = failures(self._state), list[list[float]](), Budget()
+        share = budget.share(FOR_STEPS)
         for key in keys:
             given = self._weights, self._state, key, *corners, self._examples, sizes.weight
             self._weights, self._state, *found = compiled_step()(program, self._loop, *given)
             losses.append([float(each) for each in found])
             if len(losses) == 1:  # which may have been compiled
                 clock = Budget()
-            if budget.late:
+            if share.late:
                 break
         skipped = failures(self._state) - skipped
         task, missed = np.array(losses).T
         quiet = not np.any(missed[-max(1, len(losses) // QUIET) :] > 0)
         seconds = clock.elapsed * (PATIENCE if quiet else 1.0)
+        if share.late:  # it may be the last one
+            seconds = max(seconds, share.elapsed)
         verdict = self.decide(budget, max(LEAST, seconds), asked, number + 1)
         proved = sum(cell.status is VerdictStatus.PROVED for cell in verdict.cells)
         self.epochs.append(

@@ -11,14 +11,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from reachjax.loops import AbstractNetwork, ClosedLoop
 from reachjax.methods.propagation import Progress, known_numbers, require_kinds
@@ -38,17 +38,25 @@ from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.numerics.seals import Seal, seal_of
 from reachjax.numerics.storage import read, write
-from reachjax.sets import Box, PolyhedralSet
+from reachjax.sets import Box
 from reachjax.training.failures import FOREVER, failures, skip_failures
 from reachjax.training.history import Epoch, TrainingHistory
-from reachjax.training.objectives import Certified, Simulated, Stage, TrainingBatch
+from reachjax.training.objectives import Certified, Simulated, Stage
+from reachjax.training.steps import (
+    Program,
+    Specification,
+    TaskLoss,
+    compiled_step,
+    hashable,
+    under,
+    weights_of,
+)
 from reachjax.training.worst_cells import worst_cells
 from reachjax.verdicts.decide import decide
 from reachjax.verdicts.sieve import smallest
 from reachjax.verdicts.specification import (
     AvoidSets,
     Region,
-    Requirement,
     Timed,
     period_of,
     requirements,
@@ -76,11 +84,11 @@ LEAST, FIRST = 1.0, 10.0
 """Seconds that a decision may take at least, else it may take as long as the epoch did; and those
 of the first one, or a tenth of all."""
 
+FOR_STEPS = 0.5
+"""The part of the time left that the steps of an epoch may take: the rest is for its decision."""
+
 PATIENCE = 3.0
 """Where the objective is zero it may take so many times as long."""
-
-TaskLoss = Callable[[ClosedLoop, Array], Array]
-"""One number from a loop under the controller as it is, and initial states `(b, n_x)`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,7 +228,7 @@ def train(
     require_bar(progress)
     loop, X0 = known_numbers("train", loop, X0, "X0")
     required = tuple(requirements(loop.states, horizon, goal, avoid, safe, period_of(loop)))
-    spec = _Specification(horizon, start, required, real_number("margin", margin, 0.0))
+    spec = Specification(horizon, start, required, real_number("margin", margin, 0.0))
     chosen = _skipping(_adam() if optimizer is None else optimizer, FOREVER - 1)
     run = _Run(loop, X0, spec, task_loss, chosen, tuple(stages), seed)
     kept = None if path is None else writable("path", path)
@@ -264,150 +272,6 @@ class _Sizes(NamedTuple):
     samples: int
     steps: int
     weight: float
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Specification:
-    """What is required, as what compiled steps are told apart by.
-
-    Attributes:
-        horizon: the number of steps of the loop.
-        start: the time of the initial states.
-        required: the requirements.
-        margin: how far they should be from failing.
-    """
-
-    horizon: int
-    start: int
-    required: tuple[Requirement, ...]
-    margin: float
-
-    @functools.cached_property
-    def key(self) -> tuple[Any, ...]:
-        """Plain data that say the same."""
-
-        def bits(region: PolyhedralSet) -> bytes:
-            return b"".join(np.asarray(part).tobytes() for part in region.facets)
-
-        each = [
-            (item.name, item.time, item.inside, item.throughout, bits(item.region))
-            for item in self.required
-        ]
-        return self.horizon, self.start, self.margin, *each
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Specification) and self.key == other.key
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-
-class _Program(NamedTuple):
-    """What a compiled step is made for.
-
-    Attributes:
-        spec: what is required.
-        task_loss: of the user.
-        objective: of the stage.
-        optimizer: which skips failures.
-        samples: how many states are drawn.
-    """
-
-    spec: _Specification
-    task_loss: TaskLoss
-    objective: Any
-    optimizer: Any
-    samples: int
-
-
-def _weights_of(controller: Any) -> list[Array]:
-    """The arrays of a controller that are trained."""
-    leaves = map(jnp.asarray, jax.tree.leaves(controller))
-    return [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
-
-
-def _under(loop: ClosedLoop, weights: Sequence[Array]) -> ClosedLoop:
-    """The loop whose controller has these arrays."""
-    leaves, structure = jax.tree.flatten(loop.controller)
-    left = iter(weights)
-    floating = (jnp.issubdtype(jnp.result_type(leaf), jnp.floating) for leaf in leaves)
-    parts = zip(leaves, floating, strict=True)
-    found = [next(left) if trained else leaf for leaf, trained in parts]
-    return loop.replace(controller=jax.tree.unflatten(structure, found))
-
-
-QUICKLY = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-"""How steps are compiled for processors: a pendulum's in 7 s instead of more than 60, and they take
-0.18 s instead of 0.11."""
-
-
-@functools.cache
-def _compiled_step() -> Callable[..., Any]:
-    """The step as it is compiled for the default device."""
-    options = QUICKLY if jax.default_backend() == "cpu" else None
-    return jax.jit(_advanced, static_argnames="program", compiler_options=options)
-
-
-def _advanced(
-    program: _Program,
-    loop: ClosedLoop,
-    weights: list[Array],
-    state: Any,
-    key: Array,
-    lower: Float[Array, "c n_x"],
-    upper: Float[Array, "c n_x"],
-    examples: Float[Array, "e n_x"],
-    weight: Array,
-) -> tuple[list[Array], Any, Array, Array]:
-    """One step: new weights, the optimizer's state, the task's loss and the objective before it.
-
-    Every second state that is drawn is a corner of its cell.
-    """
-    import optax
-
-    spec, (at, inside) = program.spec, jax.random.split(key)
-    which = jax.random.randint(at, (program.samples,), 0, len(lower))
-    part = jax.random.uniform(inside, (program.samples, lower.shape[1]))
-    part = jnp.where(jnp.arange(program.samples)[:, None] % 2 == 0, jnp.round(part), part)
-    states = lower[which] + part * (upper - lower)[which]
-    states = jnp.concatenate([states, examples])
-
-    def loss(weights: list[Array]) -> tuple[Array, tuple[Array, Array]]:
-        trained = _under(loop, weights)
-        task = _one_number("task_loss", program.task_loss(trained, states))
-        given = spec.horizon, spec.start, spec.required, spec.margin
-        asked = TrainingBatch(trained, lower, upper, states, *given)
-        missed = _one_number("a stage's objective", program.objective(asked))
-        return task + weight * missed, (task, missed)
-
-    (_, losses), slopes = jax.value_and_grad(loss, has_aux=True)(weights)
-    updates, state = program.optimizer.update(slopes, state, weights)
-    moved: Any = optax.apply_updates(weights, updates)
-    return moved, state, *losses
-
-
-def _one_number(name: str, value: Any) -> Array:
-    """A loss, if it is one.
-
-    Raises:
-        ValueError: it is not.
-    """
-    if value is None or jnp.shape(value) != ():
-        arrived = "None" if value is None else f"an array of shape {jnp.shape(value)}"
-        raise ValueError(f"{name} must give one number, but {arrived} arrived")
-    return jnp.asarray(value)
-
-
-def _hashable(function: Any) -> Callable[..., Any]:
-    """A function as compiled steps are told apart by; one that cannot be is another one each time.
-
-    Such as a `jax.tree_util.Partial` of arrays.
-    """
-    try:
-        hash(function)
-    except TypeError:
-        return functools.partial(function)
-    return function
 
 
 def _mean(losses: Float[np.ndarray, " s"]) -> float:
@@ -459,15 +323,15 @@ class _Run:
         self,
         loop: ClosedLoop,
         X0: Box,
-        spec: _Specification,
+        spec: Specification,
         task_loss: TaskLoss,
         optimizer: Any,
         stages: tuple[Stage, ...],
         seed: int,
     ):
         self._loop, self._X0, self._spec, self._seed = loop, X0, spec, seed
-        self._task_loss, self._optimizer, self._stages = _hashable(task_loss), optimizer, stages
-        self._weights = _weights_of(loop.controller)
+        self._task_loss, self._optimizer, self._stages = hashable(task_loss), optimizer, stages
+        self._weights = weights_of(loop.controller)
         if not self._weights:
             raise ValueError(
                 "loop.controller has no floating-point arrays to train: give a Network around a "
@@ -497,7 +361,7 @@ class _Run:
 
         After so many epochs it is the same, also where a file was gone on from.
         """
-        loop = _under(self._loop, self._weights)
+        loop = under(self._loop, self._weights)
         limit = min(seconds, budget.left) if budget.timed else seconds
         given = loop, self._X0, self._spec.horizon
         verdict = decide(*given, **asked, seed=self._seed + after, time_limit=limit)
@@ -513,27 +377,30 @@ class _Run:
         rng = np.random.default_rng((self._seed, number))
         count = min(sizes.batch, stage.cells)
         corners = worst_cells(self._X0, self.found.verdict.cells, stage.cells, count, rng)
-        program = _Program(
+        program = Program(
             self._spec,
             self._task_loss,
-            _hashable(stage.objective),
+            hashable(stage.objective),
             self._optimizer,
             sizes.samples,
         )
         keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), sizes.steps)
         skipped, losses, clock = failures(self._state), list[list[float]](), Budget()
+        share = budget.share(FOR_STEPS)
         for key in keys:
             given = self._weights, self._state, key, *corners, self._examples, sizes.weight
-            self._weights, self._state, *found = _compiled_step()(program, self._loop, *given)
+            self._weights, self._state, *found = compiled_step()(program, self._loop, *given)
             losses.append([float(each) for each in found])
             if len(losses) == 1:  # which may have been compiled
                 clock = Budget()
-            if budget.late:
+            if share.late:
                 break
         skipped = failures(self._state) - skipped
         task, missed = np.array(losses).T
         quiet = not np.any(missed[-max(1, len(losses) // QUIET) :] > 0)
         seconds = clock.elapsed * (PATIENCE if quiet else 1.0)
+        if share.late:  # it may be the last one
+            seconds = max(seconds, share.elapsed)
         verdict = self.decide(budget, max(LEAST, seconds), asked, number + 1)
         proved = sum(cell.status is VerdictStatus.PROVED for cell in verdict.cells)
         self.epochs.append(

@@ -1,0 +1,165 @@
+"""One step of training, compiled once for all weights and cells of the same shapes."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from reachjax.loops import ClosedLoop
+from reachjax.sets import PolyhedralSet
+from reachjax.training.objectives import TrainingBatch
+from reachjax.verdicts.specification import Requirement
+
+TaskLoss = Callable[[ClosedLoop, Array], Array]
+"""One number from a loop under the controller as it is, and initial states `(b, n_x)`."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Specification:
+    """What is required, as what compiled steps are told apart by.
+
+    Attributes:
+        horizon: the number of steps of the loop.
+        start: the time of the initial states.
+        required: the requirements.
+        margin: how far they should be from failing.
+    """
+
+    horizon: int
+    start: int
+    required: tuple[Requirement, ...]
+    margin: float
+
+    @functools.cached_property
+    def key(self) -> tuple[Any, ...]:
+        """Plain data that say the same."""
+
+        def bits(region: PolyhedralSet) -> bytes:
+            return b"".join(np.asarray(part).tobytes() for part in region.facets)
+
+        each = [
+            (item.name, item.time, item.inside, item.throughout, bits(item.region))
+            for item in self.required
+        ]
+        return self.horizon, self.start, self.margin, *each
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Specification) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
+class Program(NamedTuple):
+    """What a compiled step is made for.
+
+    Attributes:
+        spec: what is required.
+        task_loss: of the user.
+        objective: of the stage.
+        optimizer: which skips failures.
+        samples: how many states are drawn.
+    """
+
+    spec: Specification
+    task_loss: TaskLoss
+    objective: Any
+    optimizer: Any
+    samples: int
+
+
+def weights_of(controller: Any) -> list[Array]:
+    """The arrays of a controller that are trained."""
+    leaves = map(jnp.asarray, jax.tree.leaves(controller))
+    return [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+
+
+def under(loop: ClosedLoop, weights: Sequence[Array]) -> ClosedLoop:
+    """The loop whose controller has these arrays."""
+    leaves, structure = jax.tree.flatten(loop.controller)
+    left = iter(weights)
+    floating = (jnp.issubdtype(jnp.result_type(leaf), jnp.floating) for leaf in leaves)
+    parts = zip(leaves, floating, strict=True)
+    found = [next(left) if trained else leaf for leaf, trained in parts]
+    return loop.replace(controller=jax.tree.unflatten(structure, found))
+
+
+QUICKLY = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+"""How steps are compiled for processors: a pendulum's in 7 s instead of more than 60, and they take
+0.18 s instead of 0.11."""
+
+
+@functools.cache
+def compiled_step() -> Callable[..., Any]:
+    """The step as it is compiled for the default device."""
+    options = QUICKLY if jax.default_backend() == "cpu" else None
+    return jax.jit(_advanced, static_argnames="program", compiler_options=options)
+
+
+def _advanced(
+    program: Program,
+    loop: ClosedLoop,
+    weights: list[Array],
+    state: Any,
+    key: Array,
+    lower: Float[Array, "c n_x"],
+    upper: Float[Array, "c n_x"],
+    examples: Float[Array, "e n_x"],
+    weight: Array,
+) -> tuple[list[Array], Any, Array, Array]:
+    """One step: new weights, the optimizer's state, the task's loss and the objective before it.
+
+    Every second state that is drawn is a corner of its cell.
+    """
+    import optax
+
+    spec, (at, inside) = program.spec, jax.random.split(key)
+    which = jax.random.randint(at, (program.samples,), 0, len(lower))
+    part = jax.random.uniform(inside, (program.samples, lower.shape[1]))
+    part = jnp.where(jnp.arange(program.samples)[:, None] % 2 == 0, jnp.round(part), part)
+    states = lower[which] + part * (upper - lower)[which]
+    states = jnp.concatenate([states, examples])
+
+    def loss(weights: list[Array]) -> tuple[Array, tuple[Array, Array]]:
+        trained = under(loop, weights)
+        task = _one_number("task_loss", program.task_loss(trained, states))
+        given = spec.horizon, spec.start, spec.required, spec.margin
+        asked = TrainingBatch(trained, lower, upper, states, *given)
+        missed = _one_number("a stage's objective", program.objective(asked))
+        return task + weight * missed, (task, missed)
+
+    (_, losses), slopes = jax.value_and_grad(loss, has_aux=True)(weights)
+    updates, state = program.optimizer.update(slopes, state, weights)
+    moved: Any = optax.apply_updates(weights, updates)
+    return moved, state, *losses
+
+
+def _one_number(name: str, value: Any) -> Array:
+    """A loss, if it is one.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if value is None or jnp.shape(value) != ():
+        arrived = "None" if value is None else f"an array of shape {jnp.shape(value)}"
+        raise ValueError(f"{name} must give one number, but {arrived} arrived")
+    return jnp.asarray(value)
+
+
+def hashable(function: Any) -> Callable[..., Any]:
+    """A function as compiled steps are told apart by; one that cannot be is another one each time.
+
+    Such as a `jax.tree_util.Partial` of arrays.
+    """
+    try:
+        hash(function)
+    except TypeError:
+        return functools.partial(function)
+    return function

@@ -106,6 +106,7 @@ def test_disturbances_that_never_end_are_in_the_set():
     assert S.contains(runs[:, -1], 1e-9).all()
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("seed", range(8))
 def test_sets_and_periods_of_any_kind_prove_nothing_false(seed, monkeypatch):
     """A growing spiral breaks what is required at the end; no set makes that a proof."""

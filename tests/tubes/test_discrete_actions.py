@@ -101,6 +101,7 @@ class Policy:
         return -found.fun
 
 
+@pytest.mark.costly
 @pytest.mark.parametrize("seed", range(6))
 def test_bounds_are_those_of_a_mixed_integer_program(seed):
     policy = Policy(seed)

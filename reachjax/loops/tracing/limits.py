@@ -115,7 +115,7 @@ class Limits(AbstractNumber):
         for one, other in ((self.least, self.most), (self.most, self.least)):
             terms = _times(over, one) + _times(under, other)
             ends.append(terms.sum(axis=1))
-            lost = underflow(matrix, one != 0) + underflow(matrix, other != 0)
+            lost = underflow(over, one != 0) + underflow(under, other != 0)
             off.append(error * abs(terms).sum(axis=1) + np.where(picking, 0.0, lost))
         return self._outward(*ends, *off)
 

@@ -248,6 +248,7 @@ def test_disturbances_take_states_nowhere_else_than_is_said(held, steps):
     assert np.all(most >= (0.9 if held else 0.8))  # nor is much more said
 
 
+@pytest.mark.costly
 def test_compiled_flows_hold_what_flows_in_numpy_do():
     rng = np.random.default_rng(5)
     own = field(rng, "trigonometric", 2)

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 
+from reachjax.numerics.checks import floats_of, is_concrete
 from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.pytrees import pytree
 
@@ -215,6 +216,17 @@ def underflow(matrix: Any, there: Any, count: int = 1) -> Any:
         count: how many of these stand side by side, such as the coefficients of a form.
     """
     return 2 * TINY * count * ((matrix != 0) * 1.0 @ (there * 1.0))
+
+
+def holds_subnormals(tree: Any) -> bool:
+    """Whether a known number of a tree is not zero, but XLA takes it for zero.
+
+    Example:
+        >>> holds_subnormals([1.0, 1e-310]), holds_subnormals([1.0, 0.0])
+        (True, False)
+    """
+    sizes = (abs(np.asarray(leaf)) for leaf in floats_of(tree) if is_concrete(leaf))
+    return any(bool(((size > 0) & (size < TINY)).any()) for size in sizes)
 
 
 def exponents(rows) -> Any:

@@ -18,11 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.tracing.functions import with_constants
 from reachjax.loops.units import UnboundedError
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.compilations import CompiledBeside
 from reachjax.numerics.host import in_numpy
-from reachjax.numerics.rounding import gamma
+from reachjax.numerics.rounding import gamma, holds_subnormals
 from reachjax.programs.followed import OpenDecision
 from reachjax.programs.unrolled import ByForms, along_ways, unrolled, unrolled_from_boxes
 from reachjax.sets import AbstractSet, Box
@@ -118,13 +119,18 @@ class Sieve:
     def pays(self, cells: Sequence[Ends], budget: Budget) -> bool:
         """Whether the compiled call is there, and faster than what these cells take one by one.
 
+        It takes numbers that are no normal ones for zero, so it is not for cells or loops of these.
+
         Args:
             cells: that may be bounded so, or else will be one by one.
             budget: of the whole call.
         """
+        given = self._given(cells)
+        if holds_subnormals(with_constants(given)):
+            return False
         steps = max(len(self._directions) - 1, 1)
         return SIFT.pays(
-            *self._given(cells),
+            *given,
             seconds=lambda: self._measured(cells[0]),
             evaluations=TOGETHER * steps,
             left=budget.left,

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.numerics.budget import Budget
 from reachjax.verdicts.sieve import TOGETHER, Sieve
 from reachjax.verdicts.specification import requirements
 from tests.closed_loops import closed_loop, random_loop
@@ -62,6 +63,21 @@ def test_what_is_decided_of_cells_is_true(kind):
             assert found.margins[item.name][item.time] <= row.min() + 1e-12
         assert not (found.proved and found.refuted)
     assert np.any(decided, axis=0).any()
+
+
+@pytest.mark.parametrize("where", ["weights", "cells"])
+def test_what_compiled_code_takes_for_zero_is_not_sifted(where, monkeypatch):
+    """`1e-310 x` is not zero: a later layer may multiply it by a large number."""
+    monkeypatch.setattr("reachjax.numerics.compilations.CompiledBeside.pays", lambda *_, **__: True)
+
+    def pays(weight, lower):
+        net = rj.MLP.from_layers([([[weight]], [0.0]), ([[1e300]], [0.0])])
+        loop = rj.ClosedLoop(rj.AffinePlant([[0.5]], [[1.0]]), net)
+        sieve = Sieve(loop, 1, 0, requirements(1, 1, None, None, rj.Box([-9.0], [9.0])))
+        return sieve.pays([(np.array([lower]), np.array([1.0]))], Budget())
+
+    assert pays(1e-300, 0.0)
+    assert not (pays(1e-310, 0.0) if where == "weights" else pays(1e-300, 1e-310))
 
 
 @pytest.mark.costly

@@ -105,7 +105,7 @@ REST = [
 
 
 @pytest.mark.costly
-@each(rows=SOME)
+@each(rows=SOME, every=2)
 def test_a_derivative_is_the_difference(case):
     found = errors(case, range(2))
     assert found, "no generic point"

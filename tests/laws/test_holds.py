@@ -68,7 +68,7 @@ BY_PROGRAMS = [
 
 @pytest.mark.costly
 @pytest.mark.parametrize("fault", FAULTS)
-@each(rows=BY_PROGRAMS, basic=(), every=2)
+@each(rows=BY_PROGRAMS, basic=(), every=4)
 def test_no_state_is_outside_whatever_a_solver_answers(case, fault):
     tube = case.reach(steps=2, solver=Faulty(rj.Clarabel(), fault))
     assert outside(case, tube) <= ROUNDING

@@ -102,7 +102,9 @@ class Policy:
 
 
 @pytest.mark.costly
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [*range(3), *(pytest.param(k, marks=pytest.mark.long) for k in range(3, 6))]
+)
 def test_bounds_are_those_of_a_mixed_integer_program(seed):
     policy = Policy(seed)
     tube = rj.reach(policy.loop, rj.Box(policy.lower, policy.upper), STEPS, rj.Template.box(2),

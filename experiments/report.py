@@ -17,6 +17,9 @@ import reachjax as rj
 COLOURS = {"PROVED": "green", "REFUTED": "red", "UNKNOWN": "yellow"}
 """Of verdicts."""
 
+WITHIN = 1.02
+"""Errors up to so many times that of plain training are called as good."""
+
 
 def table(title: str, left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence]) -> Table:
     """A table in the style of all experiments.
@@ -84,6 +87,30 @@ def draw_tube(
         ax.plot(*path, ".-", color="tab:orange", linewidth=1, label="counterexample")
     ax.margins(0.05)
     ax.autoscale_view()
+
+
+def ratios(outcomes: Sequence[Any], plain: Sequence[Any] | None) -> Float[np.ndarray, " seeds"]:
+    """Errors over those of plain training, network by network; NaN without any."""
+    if not plain:
+        return np.full(len(outcomes), np.nan)
+    pairs = zip(outcomes, plain, strict=True)
+    return np.array([each.error / other.error for each, other in pairs])
+
+
+def draw_networks(ax, at: tuple, proved: np.ndarray, label: str, colour: str) -> None:
+    """Networks of one way of training as points, filled where they are proved."""
+    style = {"color": colour, "s": 36, "linewidths": 1.4}
+    ax.scatter(*(part[proved] for part in at), label=label, **style)
+    hollow = style | {"color": "none", "edgecolors": colour}
+    ax.scatter(*(part[~proved] for part in at), **hollow)
+
+
+def over_plain(ax, title: str, label: str) -> None:
+    """Title and axis of errors over those of plain training, and up to where they are as good."""
+    ax.axvline(WITHIN, color="black", linewidth=1, linestyle=":")
+    ax.set(title=title, xscale="log", xlabel=label)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter("")
 
 
 def save(figure, *paths: Path) -> None:

@@ -20,19 +20,11 @@ COLOURS = {
     "forms": "tab:orange",
     "sharper": "tab:blue",
 }
-WITHIN = 1.02
-"""Errors up to so many times that of plain training are called as good."""
 
 NOTE = f"""\
-P / R / U: proved, refuted, unknown;  as good: proved, error within {WITHIN - 1:.0%} of plain
+P / R / U: proved, refuted, unknown;  as good: proved, error within {report.WITHIN - 1:.0%} of plain
 error: on held-out states, over that of plain training, median;  cells, seconds: of the decision,
 medians;  training: seconds until it ended, compilation included, median;  epochs: median"""
-
-
-def ratios(outcomes: Sequence[Outcome], plain: Sequence[Outcome] | None) -> np.ndarray:
-    """Errors over those of plain training, network by network; NaN without any."""
-    errors = np.array([each.error for each in outcomes])
-    return errors / ([each.error for each in plain] if plain else np.nan)
 
 
 def table(loop: str, group: dict[str, list[Outcome]]) -> Table:
@@ -41,7 +33,7 @@ def table(loop: str, group: dict[str, list[Outcome]]) -> Table:
     for way, outcomes in group.items():
         proved = np.array([each.verdict == "PROVED" for each in outcomes])
         verdicts = [sum(each.verdict == name for each in outcomes) for name in report.COLOURS]
-        error = ratios(outcomes, group.get("plain"))
+        error = report.ratios(outcomes, group.get("plain"))
 
         def median(name: str, outcomes: Sequence[Outcome] = outcomes) -> float:
             return float(np.median([getattr(each, name) for each in outcomes]))
@@ -50,7 +42,7 @@ def table(loop: str, group: dict[str, list[Outcome]]) -> Table:
             (
                 way,
                 " / ".join(map(str, verdicts)),
-                int(np.sum(proved & (error <= WITHIN))),
+                int(np.sum(proved & (error <= report.WITHIN))),
                 f"{np.median(error):.2f}",
                 f"{median('cells'):.0f}",
                 f"{median('deciding'):.1f}",
@@ -69,16 +61,10 @@ def draw(found: dict[str, dict[str, list[Outcome]]], path: Path) -> None:
     for ax, (loop, group) in zip(axes, found.items(), strict=True):
         for way, outcomes in group.items():
             proved = np.array([each.verdict == "PROVED" for each in outcomes])
-            error = ratios(outcomes, group.get("plain") or next(iter(group.values())))
+            error = report.ratios(outcomes, group.get("plain") or next(iter(group.values())))
             at = error, np.array([each.training for each in outcomes])
-            style = {"color": COLOURS[way], "s": 36, "linewidths": 1.4}
-            ax.scatter(*(part[proved] for part in at), label=way, **style)
-            hollow = style | {"color": "none", "edgecolors": COLOURS[way]}
-            ax.scatter(*(part[~proved] for part in at), **hollow)
-        ax.axvline(WITHIN, color="black", linewidth=1, linestyle=":")
-        ax.set(title=loop, xscale="log", xlabel="error / that of plain training")
-        ax.xaxis.set_major_formatter("{x:g}")
-        ax.xaxis.set_minor_formatter("")
+            report.draw_networks(ax, at, proved, way, COLOURS[way])
+        report.over_plain(ax, loop, "error / that of plain training")
     axes[0].set_ylabel("seconds of training")
     report.legend_below(figure, title="way (filled: proved, hollow: not)")
     report.save(figure, path)

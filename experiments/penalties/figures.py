@@ -18,19 +18,11 @@ COLOURS = {
     "LocalBounds": "tab:purple",
     "default": "tab:blue",
 }
-WITHIN = 1.02
-"""Imitation errors up to so many times that of plain training are called as good."""
 NOTE = f"""\
-P / R / U: proved, refuted, unknown;  as good: proved, error within {WITHIN - 1:.0%} of plain
+P / R / U: proved, refuted, unknown;  as good: proved, error within {report.WITHIN - 1:.0%} of plain
 error: on held-out samples, over that of plain training, median
 sets, hulls: certified and simulated widths over those of plain training, medians
 penalties: steps that had one, of all, medians;  first: seconds of first calls, largest"""
-
-
-def ratios(outcomes: Sequence[Outcome], plain: Sequence[Outcome]) -> Float[ndarray, " seeds"]:
-    """Imitation errors over those of plain training, network by network."""
-    pairs = zip(outcomes, plain, strict=True)
-    return np.array([each.error / other.error for each, other in pairs])
 
 
 def shrunk(
@@ -49,7 +41,7 @@ def table(loop: str, group: dict[str, list[Outcome]]) -> Table:
     for way, outcomes in group.items():
         proved = np.array([each.verdict == "PROVED" for each in outcomes])
         verdicts = [sum(each.verdict == name for each in outcomes) for name in report.COLOURS]
-        error = ratios(outcomes, plain)
+        error = report.ratios(outcomes, plain)
         certified = shrunk(outcomes, plain, lambda each: each.certified)
         simulated = shrunk(outcomes, plain, lambda each: each.simulated)
         penalised, steps = (
@@ -59,7 +51,7 @@ def table(loop: str, group: dict[str, list[Outcome]]) -> Table:
             (
                 way,
                 " / ".join(map(str, verdicts)),
-                int(np.sum(proved & (error <= WITHIN))),
+                int(np.sum(proved & (error <= report.WITHIN))),
                 f"{np.median(error):.2f}",
                 f"{np.median(certified):.2f}",
                 f"{np.median(simulated):.2f}",
@@ -82,16 +74,12 @@ def draw(found: dict[str, dict[str, list[Outcome]]], path: Path) -> None:
         plain = group["none"]
         for way, outcomes in group.items():
             proved = np.array([each.verdict == "PROVED" for each in outcomes])
-            at = ratios(outcomes, plain), shrunk(outcomes, plain, lambda each: each.certified)
-            style = {"color": COLOURS[way], "s": 36, "linewidths": 1.4}
-            ax.scatter(*(part[proved] for part in at), label=way, **style)
-            hollow = style | {"color": "none", "edgecolors": COLOURS[way]}
-            ax.scatter(*(part[~proved] for part in at), **hollow)
-        ax.axvline(WITHIN, color="black", linewidth=1, linestyle=":")
-        ax.set(title=loop, xscale="log")
-        ax.xaxis.set_major_formatter("{x:g}")
-        ax.xaxis.set_minor_formatter("")
-        ax.set_xlabel("imitation error / that of plain training")
+            at = (
+                report.ratios(outcomes, plain),
+                shrunk(outcomes, plain, lambda each: each.certified),
+            )
+            report.draw_networks(ax, at, proved, way, COLOURS[way])
+        report.over_plain(ax, loop, "imitation error / that of plain training")
     axes[0].set_ylabel("certified widths / those of plain training")
     report.legend_below(figure, title="penalty (filled: proved, hollow: not)")
     report.save(figure, path)

@@ -22,7 +22,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.closed_loop import UnitLayer
 from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Line
-from reachjax.numerics.rounding import Ball, counting, gamma
+from reachjax.numerics.rounding import Ball, gamma
 from reachjax.programs.basis import Rows, columns, loop_rows
 from reachjax.programs.bounds import LoopBounds, loop_bounds
 from reachjax.sets import AbstractSet, Box
@@ -164,7 +164,6 @@ def first_rows(loop: ClosedLoop) -> Rows | None:
 
 
 @jax.jit  # so that the interval arithmetic is compiled as one
-@counting
 def first_inputs(
     rows: Rows, lower: Float[Array, " k"], upper: Float[Array, " k"], box: Box
 ) -> Ball:

@@ -27,7 +27,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units import Facts
 from reachjax.numerics.pytrees import Replaceable, pytree, static
-from reachjax.numerics.rounding import Ball, counting
+from reachjax.numerics.rounding import Ball
 from reachjax.programs.basis import Rows, columns, loop_rows, picking
 from reachjax.programs.bounds import LoopBounds, loop_bounds
 from reachjax.programs.lmi import Origin, Program
@@ -234,7 +234,6 @@ class Window(Replaceable):
 
 
 @jax.jit
-@counting
 def _first(
     cone_facts: Float[Array, "r n_x+1"], box: Box, ball: Ellipsoid | None
 ) -> tuple[Rows, Rows, Float[Array, "n_x+1 n_x+1"]]:
@@ -275,7 +274,6 @@ def _extended(
 
 
 @jax.jit
-@counting
 def _facts(
     X: AbstractSet, state: Rows, units: tuple[Facts, ...], T: Float[Array, "n n"]
 ) -> tuple[Rows, Rows]:
@@ -285,7 +283,6 @@ def _facts(
 
 
 @jax.jit
-@counting
 def _ends(
     directions: Float[Array, "f n_x"], state: Rows, T: Float[Array, "n n"]
 ) -> tuple[Rows, Rows]:

@@ -30,7 +30,7 @@ from reachjax.numerics.checks import (
     within_time_axis,
 )
 from reachjax.numerics.pytrees import Replaceable, converted, pytree
-from reachjax.numerics.rounding import TINY, counting, exponents, gamma, lengths, raised, shifted
+from reachjax.numerics.rounding import TINY, exponents, gamma, lengths, raised, shifted
 from reachjax.sets import outlines, supports
 from reachjax.sets.balance import balanced
 from reachjax.sets.unusable import UnusableSetError
@@ -538,7 +538,6 @@ class Box(PolyhedralSet):
 
 
 @jax.jit
-@counting
 def _support(
     lower: Float[Array, " n"], upper: Float[Array, " n"], directions: Float[Array, "m n"]
 ) -> Float[Array, " m"]:

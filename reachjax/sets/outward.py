@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from reachjax.numerics.rounding import TINY, counting, exponents, gamma, lengths, raised, shifted
+from reachjax.numerics.rounding import TINY, exponents, gamma, lengths, raised, shifted
 
 Matrix = Float[Array | np.ndarray, "n n"]
 Vector = Float[Array | np.ndarray, " n"]
@@ -76,7 +76,6 @@ def surely_inside(A: Matrix, q: Vector, Q: Matrix, x: Vector) -> Bool[Array, ""]
 
 
 @jax.jit
-@counting
 def support(q: Vector, Q: Matrix, directions: Float[Array, "m n"]) -> Float[Array, " m"]:
     """Upper bounds of `a . q + sqrt(a' Q a)`, whatever the size of the numbers."""
     n, some = len(q), jnp.any(directions != 0, axis=1)

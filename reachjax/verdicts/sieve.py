@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -125,17 +126,21 @@ class Sieve:
             cells: that may be bounded so, or else will be one by one.
             budget: of the whole call.
         """
-        given = self._given(cells)
-        if holds_subnormals(with_constants(given)):
+        if self._of_subnormals or holds_subnormals(cells):
             return False
         steps = max(len(self._directions) - 1, 1)
         return SIFT.pays(
-            *given,
+            *self._given(cells),
             seconds=lambda: self._measured(cells[0]),
             evaluations=TOGETHER * steps,
             left=budget.left,
             t=self._start,
         )
+
+    @cached_property
+    def _of_subnormals(self) -> bool:
+        """Whether the loop, or what is required, has numbers that compiled code takes for zero."""
+        return holds_subnormals(with_constants((self._loop, self._later)))
 
     def _measured(self, cell: Ends) -> float | None:
         """The seconds that a call takes one by one; None where this cell has no bounds."""

@@ -22,7 +22,16 @@ from jaxtyping import Array, Float
 
 from reachjax.loops.units import AbstractUnit, SmoothUnit, UnboundedError
 from reachjax.numerics.numbers import AbstractNumber
-from reachjax.numerics.rounding import TINY, Ball, constant, gamma, namespace, settled, underflow
+from reachjax.numerics.rounding import (
+    TINY,
+    Ball,
+    constant,
+    errors,
+    gamma,
+    namespace,
+    settled,
+    underflow,
+)
 
 SQUARE = 0.5
 """`w^2` is half of one and of `2 w^2 - 1`."""
@@ -141,12 +150,12 @@ class TaylorModels(AbstractNumber):
 
     def __rmatmul__(self, matrix: Any) -> TaylorModels:
         matrix = namespace(self.rows).asarray(matrix)
-        weights, error = abs(matrix), gamma(matrix.shape[1])
-        return self._with(
-            matrix @ self.rows,
-            weights @ self.radii * (1 + error),
-            error * (weights @ self._size) + underflow(matrix, self._size > 0, self.rows.shape[1]),
-        )
+        weights, error, count = abs(matrix), gamma(matrix.shape[1]), self.rows.shape[1]
+
+        def lost() -> Any:
+            return error * (weights @ self._size) + underflow(matrix, self._size > 0, count)
+
+        return self._with(matrix @ self.rows, weights @ self.radii * (1 + error), errors(lost))
 
     def __add__(self, other: Any) -> TaylorModels:
         xp = namespace(self.rows)

@@ -1,12 +1,16 @@
 """A mountain car and a cart-pole under trained policies: the action of the largest score."""
 
+from pathlib import Path
+
 import jax
 import numpy as np
 import pytest
 
 import reachjax as rj
-from experiments.nonlinear.actions import INITIAL, PERIODS, widths
-from tests.tubes.discrete_policies import loop_of
+from experiments.nonlinear.choices import INITIAL, PERIODS, closed, widths
+
+KEPT = Path(__file__).parents[1] / "data" / "discrete_policies.npz"
+"""As `python -m experiments.nonlinear.actions` trains them."""
 
 SAMPLES, SECONDS = 40_000, 60.0
 
@@ -14,7 +18,10 @@ SAMPLES, SECONDS = 40_000, 60.0
 @pytest.fixture(scope="module", params=INITIAL)
 def bounded(request):
     """A loop, its samples, and its sets."""
-    loop, X0 = loop_of(request.param), INITIAL[request.param]
+    with np.load(KEPT) as file:
+        kept = {name: file[name] for name in file}
+    name, X0 = request.param, INITIAL[request.param]
+    loop = closed(name, [(kept[f"{name} {k} weight"], kept[f"{name} {k} bias"]) for k in range(3)])
     states = np.asarray(loop.simulate(X0.sample(jax.random.key(1), SAMPLES), PERIODS))
     template = rj.Template.box(loop.states)
     return loop, states, rj.reach(loop, X0, PERIODS, template, time_limit=SECONDS)

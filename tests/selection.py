@@ -2,8 +2,8 @@
 
 `python -m pytest` takes one case of each claim, of laws the basic ones: what somebody needs to
 trust an installation, in minutes. With a path, or `--every-case`, all cases are taken; with
-`--other-cases` those of the library that it leaves out; with `--experiments` those about
-experiments, notebooks and site.
+`--other-cases`, of those of the library that it leaves out, `OTHERS` of each claim; with
+`--experiments` those about experiments, notebooks and site.
 """
 
 from collections import defaultdict
@@ -23,6 +23,9 @@ ELSEWHERE = (
 )
 """Claims about experiments, notebooks and site, and comparisons with a library of `[dev]`."""
 
+OTHERS = 16
+"""So many other cases of a claim are taken at most, all over the range of its cases."""
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Whether all cases are taken."""
@@ -34,7 +37,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--other-cases",
         action="store_true",
-        help="the cases of the library that are not taken by default, for after those",
+        help=f"{OTHERS} cases of each claim about the library that are not taken by default",
     )
     parser.addoption(
         "--experiments",
@@ -103,7 +106,13 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def _taken(cases: list[pytest.Item]) -> list[pytest.Item]:
     """Of a claim's cases the basic ones, or the one in the middle."""
     basic = [item for item in cases if item.get_closest_marker("basic")]
-    return basic or [cases[len(cases) // 2]]
+    return basic or cases[len(cases) // 2 :][:1]
+
+
+def _spread(cases: list[pytest.Item]) -> list[pytest.Item]:
+    """`OTHERS` of these at most, as far apart as they can be."""
+    count = min(len(cases), OTHERS)
+    return [cases[(2 * k + 1) * len(cases) // (2 * count)] for k in range(count)]
 
 
 @pytest.hookimpl(trylast=True)
@@ -111,12 +120,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Leave one case of each claim, the middle one, or basic ones, unless all are asked for."""
     if _everything(config):
         return
-    cases = defaultdict(list)
+    every, others = defaultdict(list), config.getoption("other_cases")
     for item in items:
-        if not (item.get_closest_marker("costly") or _is_elsewhere(item.path, config)):
-            cases[item.nodeid.partition("[")[0]].append(item)
-    first = {id(item) for each in cases.values() for item in _taken(each)}
-    others = config.getoption("other_cases")
-    left = [item for item in items if (id(item) in first) == others]
-    items[:] = [item for item in items if (id(item) in first) != others]
+        every[item.nodeid.partition("[")[0]].append(item)
+    chosen = set[int]()
+    for cases in every.values():
+        first = _taken([item for item in cases if not item.get_closest_marker("costly")])
+        if others:
+            known = set(map(id, first))
+            first = _spread([item for item in cases if id(item) not in known])
+        chosen |= set(map(id, first))
+    left = [item for item in items if id(item) not in chosen]
+    items[:] = [item for item in items if id(item) in chosen]
     config.hook.pytest_deselected(items=left)

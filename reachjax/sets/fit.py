@@ -13,6 +13,9 @@ from reachjax.sets.balance import exponents, lengths
 LEAST_SPREAD = 1e-6
 """Points are taken to spread by at least this part of their widest spread in every direction."""
 
+ROUNDED = 2.0**-48
+"""Points that spread by a smaller part of their size may be on a line: some roundings of theirs."""
+
 
 def signed(rows: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "2m n"]:
     """Each row followed by its negative."""
@@ -48,7 +51,8 @@ def axes(points: Float[np.ndarray, "c n"], facets: int) -> Float[np.ndarray, "f 
         raise ValueError(
             f"facets must be an even number of {2 * n} to {len(rows)}, but {facets} arrived"
         )
-    return _unit(rows[:facets] @ _whitening(points))
+    W, _ = _whitening(points)
+    return _unit(rows[:facets] @ W)
 
 
 def edges(points: Float[np.ndarray, "c 2"], facets: int) -> Float[np.ndarray, "f 2"]:
@@ -58,11 +62,14 @@ def edges(points: Float[np.ndarray, "c 2"], facets: int) -> Float[np.ndarray, "f
     areas do not depend on the coordinates, so points are whitened.
     """
     points = _about_one(points)
-    W = _whitening(points)
+    W, spreads = _whitening(points)
+    on_a_line = _unit(plane(facets) @ W)
+    if spreads[1] < ROUNDED * np.linalg.norm(points):  # rounding makes edges of a line
+        return on_a_line
     try:
         hull = ConvexHull(points @ W.T)
-    except QhullError:  # all on one line
-        return _unit(plane(facets) @ W)
+    except QhullError:
+        return on_a_line
     corners = hull.points[hull.vertices]  # counterclockwise
     steps = np.roll(corners, -1, axis=0) - corners
     normals = _unit(np.stack([steps[:, 1], -steps[:, 0]], axis=1))
@@ -70,7 +77,7 @@ def edges(points: Float[np.ndarray, "c 2"], facets: int) -> Float[np.ndarray, "f
     while len(normals) > facets:
         growth = [_growth(normals, offsets, i) for i in range(len(normals))]
         if not np.isfinite(growth).any():  # without any edge it opens, as a parallelogram does
-            return _unit(plane(facets) @ W)
+            return on_a_line
         left_out = int(np.argmin(growth))
         normals, offsets = np.delete(normals, left_out, 0), np.delete(offsets, left_out)
     while len(normals) < facets:
@@ -98,12 +105,14 @@ def _growth(normals: np.ndarray, offsets: np.ndarray, i: int) -> float:
     return abs(p * s - q * r) / 2
 
 
-def _whitening(points: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "n n"]:
-    """A matrix that gives points unit spread in all directions, the widest axis first."""
+def _whitening(
+    points: Float[np.ndarray, "c n"],
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+    """A matrix that gives points unit spread in all directions, and spreads, widest axis first."""
     _, spreads, rows = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     if not spreads[0] > 0:
-        return np.eye(points.shape[1])
-    return rows / np.maximum(spreads, LEAST_SPREAD * spreads[0])[:, None]
+        return np.eye(points.shape[1]), spreads
+    return rows / np.maximum(spreads, LEAST_SPREAD * spreads[0])[:, None], spreads
 
 
 def _about_one(points: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n"]:

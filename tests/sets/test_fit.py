@@ -82,6 +82,17 @@ def test_edges_of_a_polygon_are_found():
     np.testing.assert_allclose(found[order], normals, atol=1e-9)
 
 
+def test_points_on_a_line_far_from_zero_have_directions_that_bound_a_set():
+    # rounding makes a hull of them, whose edges nearly are the line
+    rng = np.random.default_rng(5)
+    for facets in (3, 4, 6, 12):
+        for _ in range(25):
+            at, along = rng.normal(size=2), rng.normal(size=2) * 10 ** rng.uniform(-9, -3)
+            points = at + rng.uniform(-1, 1, size=(50, 1)) * along
+            box = rj.Template(fit.edges(points, facets)).polytope(np.ones(facets)).bounding_box()
+            assert np.isfinite(box.widths).all()
+
+
 def test_the_edges_left_out_are_those_that_cost_least():
     # a square with one corner cut off a little
     points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.9], [0.9, 1.0], [0.0, 1.0]])

@@ -18,10 +18,10 @@ SAMPLES, SECONDS = 40_000, 60.0
 @pytest.fixture(scope="module", params=INITIAL)
 def bounded(request):
     """A loop, its samples, and its sets."""
-    with np.load(KEPT) as file:
-        kept = {name: file[name] for name in file}
     name, X0 = request.param, INITIAL[request.param]
-    loop = closed(name, [(kept[f"{name} {k} weight"], kept[f"{name} {k} bias"]) for k in range(3)])
+    with np.load(KEPT) as kept:
+        layers = [(kept[f"{name} {k} weight"], kept[f"{name} {k} bias"]) for k in range(3)]
+    loop = closed(name, layers)
     states = np.asarray(loop.simulate(X0.sample(jax.random.key(1), SAMPLES), PERIODS))
     template = rj.Template.box(loop.states)
     return loop, states, rj.reach(loop, X0, PERIODS, template, time_limit=SECONDS)

@@ -96,11 +96,27 @@ QUICKLY = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_pass
 0.18 s instead of 0.11."""
 
 
+def _options() -> dict[str, Any] | None:
+    """How code is compiled for the default device."""
+    return QUICKLY if jax.default_backend() == "cpu" else None
+
+
 @functools.cache
 def compiled_step() -> Callable[..., Any]:
     """The step as it is compiled for the default device."""
-    options = QUICKLY if jax.default_backend() == "cpu" else None
-    return jax.jit(_advanced, static_argnames="program", compiler_options=options)
+    return jax.jit(_advanced, static_argnames="program", compiler_options=_options())
+
+
+@functools.cache
+def compiled_loss() -> Callable[..., Any]:
+    """The task's loss of a loop under weights, as it is compiled for the default device."""
+
+    def loss(
+        task_loss: TaskLoss, loop: ClosedLoop, weights: list[Array], states: Float[Array, "b n_x"]
+    ) -> Array:
+        return _one_number("task_loss", task_loss(under(loop, weights), states))
+
+    return jax.jit(loss, static_argnames="task_loss", compiler_options=_options())
 
 
 def _advanced(

@@ -93,7 +93,7 @@ def under(loop: ClosedLoop, weights: Sequence[Array]) -> ClosedLoop:
 
 QUICKLY = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 """How steps are compiled for processors: those of twenty periods of an affine loop with 2-32-32-1
-neurons in 8 CPU seconds, and they take 0.11 s. Without any optimisation that is 4 and 0.25 s; by the
+neurons in 8 CPU seconds, and they take 0.11 s. Without optimisation that is 4 and 0.25 s; by the
 newer emitters of fused code 9 and 0.42 s, and 15 and 0.14 s with it. The default takes minutes."""
 
 

@@ -439,7 +439,7 @@ class _Run:
         seconds = clock.elapsed * (PATIENCE if quiet else 1.0)
         if share.late:  # it may be the last one
             seconds = max(seconds, share.elapsed)
-        before, clock = self.known, Budget()
+        before, clock = self.found, Budget()
         verdict = self.decide(budget, max(LEAST, seconds), asked, number + 1)
         if verdict.proved or before.proved:
             limit = max(LEAST, PATIENCE * clock.elapsed)

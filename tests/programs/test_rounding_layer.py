@@ -1,5 +1,6 @@
 """Rounding is a layer: without it numbers are the same but for rounding, and none of it stays."""
 
+import itertools
 from fractions import Fraction
 
 import jax
@@ -63,19 +64,22 @@ def test_sets_without_rounding_are_the_certified_ones_but_for_rounding(kind):
 
 
 def random_layers(rng, *sizes):
-    pairs = zip(sizes[:-1], sizes[1:], strict=True)
-    return [(rng.normal(size=(k, n)) / np.sqrt(n), 0.1 * rng.normal(size=k)) for n, k in pairs]
+    return [
+        (rng.normal(size=(k, n)) / np.sqrt(n), 0.1 * rng.normal(size=k))
+        for n, k in itertools.pairwise(sizes)
+    ]
+
+
+def branches(parameters, x):
+    """A controller of two branches, whose units are multiplied."""
+    (W, b), (V, c) = parameters
+    y, z = jnp.tanh(W @ x + b), jnp.maximum(V @ x + c, 0.0)
+    return jnp.sum(y * jnp.maximum(z - 0.5 * y, 0.0), keepdims=True) - x[:1]
 
 
 def of_products(rng):
-    """A controller of two branches, whose units are multiplied."""
-    (W, b), (V, c) = (layer for _ in range(2) for layer in random_layers(rng, 2, 3))
-
-    def f(x):
-        y, z = jnp.tanh(W @ x + b), jnp.maximum(V @ x + c, 0.0)
-        return jnp.sum(y * jnp.maximum(z - 0.5 * y, 0.0), keepdims=True) - jnp.sum(x[:1])
-
-    return rj.Network(f, 2, 1)
+    parameters = [random_layers(rng, 2, 3)[0] for _ in range(2)]
+    return rj.Network(jax.tree_util.Partial(branches, jax.tree.map(jnp.asarray, parameters)), 2, 1)
 
 
 OF_ONE_OUTPUT = {

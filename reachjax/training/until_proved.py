@@ -96,7 +96,8 @@ FOR_STEPS = 0.5
 """The part of the time left that the steps of an epoch may take: the rest is for its decision."""
 
 PATIENCE = 3.0
-"""Where the objective is zero it may take so many times as long."""
+"""Where the objective is zero it may take so many times as long; and so many times as long as the
+last proof, where one is known."""
 
 HALVINGS = 6
 """So often the way between a controller that is proved and one that is not is halved."""
@@ -359,7 +360,7 @@ class _Run:
         self._state = optimizer.init(self._weights)
         self._examples = np.tile(np.asarray(X0.center), (REMEMBERED, 1))
         self._stage = self._begun = 0
-        self._before, self._fruitless = 0.0, False
+        self._before, self._proof, self._fruitless = 0.0, 0.0, False
         self.epochs: list[Epoch] = []
         self.known: Trained | None = None
 
@@ -405,8 +406,10 @@ class _Run:
         """A controller with its verdict, found in so many seconds."""
         loop = under(self._loop, weights)
         limit = min(seconds, budget.left) if budget.timed else seconds
-        given = loop, self._X0, self._spec.horizon
+        given, clock = (loop, self._X0, self._spec.horizon), Budget()
         verdict = decide(*given, **asked, seed=self._seed + after, time_limit=limit)
+        if verdict.proved:
+            self._proof = clock.elapsed
         return Trained(loop, verdict, TrainingHistory())
 
     def epoch(self, sizes: _Sizes, budget: Budget, asked: dict[str, Any]) -> None:
@@ -439,11 +442,9 @@ class _Run:
         seconds = clock.elapsed * (PATIENCE if quiet else 1.0)
         if share.late:  # it may be the last one
             seconds = max(seconds, share.elapsed)
-        before, clock = self.found, Budget()
-        verdict = self.decide(budget, max(LEAST, seconds), asked, number + 1)
+        before, verdict = self.found, self.decide(budget, max(LEAST, seconds), asked, number + 1)
         if verdict.proved or before.proved:
-            limit = max(LEAST, PATIENCE * clock.elapsed)
-            verdict = self._lowest(before, sizes, budget, limit, asked, number + 1)
+            verdict = self._lowest(before, sizes, budget, asked, number + 1)
         proved = sum(cell.status is VerdictStatus.PROVED for cell in verdict.cells)
         self.epochs.append(
             Epoch(
@@ -468,7 +469,6 @@ class _Run:
         before: Trained,
         sizes: _Sizes,
         budget: Budget,
-        seconds: float,
         asked: dict[str, Any],
         after: int,
     ) -> Verdict:
@@ -478,7 +478,6 @@ class _Run:
             before: the controller that the epoch began with.
             sizes: how many states the loss is of.
             budget: of the whole call.
-            seconds: that a decision may take.
             asked: of `decide`.
             after: how many epochs.
         """
@@ -489,26 +488,25 @@ class _Run:
         def loss(weights: Sequence[Array]) -> float:
             return float(compiled_loss()(self._task_loss, self._loop, [*weights], states))
 
-        best, weights, other = now, self._weights, given
-        if before.proved and not now.proved:
-            best, weights, other = before, first, self._weights
-        elif before.proved:  # both are, and there is nothing between them to be found
-            best, weights = min((before, first), (now, self._weights), key=lambda one: loss(one[1]))
-            other = weights
-        least = loss(weights)
+        reached, other = math.inf, given
+        if before.proved:
+            reached, other = loss(first), self._weights
+            if not now.proved or not loss(self._weights) < reached:
+                self.known, self._weights = before, first
+        least = loss(self._weights)
         for _ in range(HALVINGS):
-            middle = [(one + another) / 2 for one, another in zip(weights, other, strict=True)]
+            pairs = zip(self._weights, other, strict=True)
+            middle = [(one + another) / 2 for one, another in pairs]
             if budget.late or not loss(middle) < least:
                 break
-            tried = self._decided(middle, budget, seconds, asked, after)
+            limit = max(LEAST, PATIENCE * self._proof)
+            tried = self._decided(middle, budget, limit, asked, after)
             if tried.proved:
-                best, weights, least = tried, middle, loss(middle)
+                self.known, self._weights, least = tried, middle, loss(middle)
             else:
                 other = middle
-        reached = loss(first) if before.proved else math.inf
         self._fruitless = reached - least <= LITTLE * abs(least)
-        self.known, self._weights = best, [*weights]
-        return best.verdict
+        return self.found.verdict
 
     def keep(self, path: Path) -> None:
         """Write what has been done to a file."""

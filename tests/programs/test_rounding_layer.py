@@ -1,6 +1,7 @@
 """Rounding is a layer: without it numbers are the same but for rounding, and none of it stays."""
 
 import itertools
+import re
 from fractions import Fraction
 
 import jax
@@ -113,6 +114,24 @@ def test_few_columns_lose_nothing_of_one_input(kind):
         runs = rj.ClosedLoop(plant, net).simulate(states, 3)[:, 1:]
         reached = np.einsum("cti,tmi->ctm", runs, rows).max(axis=0)
         assert (reached <= few + 1e-9).all()
+
+
+@pytest.mark.parametrize("activation", [rj.ReLU(), rj.Tanh()])
+def test_what_few_columns_hand_on_grows_neither_with_neurons_nor_with_the_horizon(activation):
+    plant, X0 = rj.AffinePlant(np.eye(2), [[0.0], [0.1]]), rj.Box([0.0, 0.0], [0.1, 0.1])
+
+    def handed_on(neurons, steps):
+        layers = random_layers(np.random.default_rng(0), 2, neurons, neurons, 1)
+        loop = rj.ClosedLoop(plant, rj.MLP.from_layers(layers, activation))
+        rows = np.broadcast_to(np.eye(2), (steps, 2, 2))
+
+        def offsets(X0):
+            return unrolled_at_once(loop, X0, X0, rows, counted=False, columns=8).offsets
+
+        text = str(jax.make_jaxpr(offsets)(X0))
+        return max(int(size) for size in re.findall(r"f64\[2,(\d+)\]", text))
+
+    assert handed_on(3, 12) == handed_on(20, 12) == handed_on(3, 40)
 
 
 def test_what_is_proved_within_a_scope_without_rounding_counts_it():

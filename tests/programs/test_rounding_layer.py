@@ -1,7 +1,6 @@
 """Rounding is a layer: without it numbers are the same but for rounding, and none of it stays."""
 
 import itertools
-import re
 from fractions import Fraction
 
 import jax
@@ -11,6 +10,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.numerics.rounding import gamma, is_counted, rounding
+from reachjax.programs.affine_steps import step_columns
 from reachjax.programs.unrolled import unrolled_at_once
 from reachjax.training.steps import QUICKLY
 from tests.networks import directions
@@ -117,21 +117,13 @@ def test_few_columns_lose_nothing_of_one_input(kind):
 
 
 @pytest.mark.parametrize("activation", [rj.ReLU(), rj.Tanh()])
-def test_what_few_columns_hand_on_grows_neither_with_neurons_nor_with_the_horizon(activation):
-    plant, X0 = rj.AffinePlant(np.eye(2), [[0.0], [0.1]]), rj.Box([0.0, 0.0], [0.1, 0.1])
-
-    def handed_on(neurons, steps):
+def test_a_step_adds_few_columns_however_many_neurons_there_are(activation):
+    plant = rj.AffinePlant(np.eye(2), [[0.0], [0.1]])
+    for neurons in (3, 20):
         layers = random_layers(np.random.default_rng(0), 2, neurons, neurons, 1)
         loop = rj.ClosedLoop(plant, rj.MLP.from_layers(layers, activation))
-        rows = np.broadcast_to(np.eye(2), (steps, 2, 2))
-
-        def offsets(X0):
-            return unrolled_at_once(loop, X0, X0, rows, counted=False, columns=8).offsets
-
-        text = str(jax.make_jaxpr(offsets)(X0))
-        return max(int(size) for size in re.findall(r"f64\[2,(\d+)\]", text))
-
-    assert handed_on(3, 12) == handed_on(20, 12) == handed_on(3, 40)
+        with rounding(False):
+            assert step_columns(loop, few=True) == (1, 0)
 
 
 def test_what_is_proved_within_a_scope_without_rounding_counts_it():

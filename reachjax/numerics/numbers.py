@@ -6,7 +6,7 @@ Arrays are numbers too, plain ones, which know nothing of errors; the functions 
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Self
 
 
@@ -82,12 +82,16 @@ def part(number: Any, first: int, last: int) -> Any:
     return number[..., first:last]
 
 
+def split(number: Any, count: int) -> list[Any]:
+    """So many parts of equal length that stand one behind the other."""
+    each = size(number) // count
+    return [part(number, k * each, (k + 1) * each) for k in range(count)]
+
+
 def summed(number: Any, count: int) -> Any:
     """The sum of so many parts of equal length that stand one behind the other."""
-    each = size(number) // count
-    parts: Sequence[Any] = [part(number, k * each, (k + 1) * each) for k in range(count)]
-    found = parts[0]
-    for other in parts[1:]:
+    found, *parts = split(number, count)
+    for other in parts:
         found = found + other
     return found
 

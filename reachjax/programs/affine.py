@@ -17,7 +17,8 @@ that it stands for. Behind many layers they grow like the product of their `|W|`
 steps beyond all bounds; so those of a state become columns of their own before the next step.
 
 Where rounding is not counted (`rounding.rounding`) forms have no radii of their own, and say what
-would hold in exact arithmetic, which is no bound.
+would hold in exact arithmetic, which is no bound. Columns that are summed up at the end of a part
+of a step are then kept apart, layer by layer: those of the newest one are a diagonal.
 
 All of it is written over numpy and `jax.numpy` alike (`rounding.namespace`). In numpy, columns are
 appended as they are needed. In compiled code every unit and state has its place, so shapes are
@@ -26,7 +27,8 @@ fixed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -50,8 +52,27 @@ from reachjax.numerics.rounding import (
 )
 from reachjax.programs.initial import Ends, InitialColumns, met
 
-Place = int | Array | None
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    """A place for columns that are summed up at the end of a part of a step.
+
+    Attributes:
+        first: how many units the part has before.
+    """
+
+    first: int
+
+    def __add__(self, count: int) -> Inner:
+        return Inner(self.first + count)
+
+
+Place = int | Array | Inner | None
 """Where new columns begin; None to append those that are needed (numpy)."""
+
+Layers = dict[int, Any]
+"""Coefficients of columns of units of a part, by how many units are before: `(k, units)`, or `(k,)`
+where each number has one of its own."""
 
 
 @pytree
@@ -62,10 +83,12 @@ class AffineForms(AbstractNumber):
         rows: `(k, 2 + n)`, centre of the form, middle of the interval, coefficients of the columns.
         radii: `(k, 2)`, by how much the form may be off, and of the interval. Derivatives take the
             first for a constant. It is missing, `(k, 1)`, where rounding is not counted.
+        inner: columns besides, within a part of a step in compiled code that counts no rounding.
     """
 
     rows: Float[Array | np.ndarray, "k n+2"]
     radii: Float[Array | np.ndarray, "k radii"]
+    inner: Layers = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
         return self.rows.shape[0]
@@ -96,6 +119,37 @@ class AffineForms(AbstractNumber):
         return self.rows[:, 2:]
 
     @property
+    def every(self) -> Any:
+        """Coefficients of all columns, those within a part among them."""
+        if not self.inner:
+            return self.columns
+        return jnp.concatenate([self.columns, *map(_whole, self.inner.values())], axis=1)
+
+    def rest(self, first: int) -> Any:
+        """What all columns from some on are worth to each number, radii left aside."""
+        columns = self.columns[:, first:]
+        found = abs(columns).sum(axis=1) * (1 + gamma(self.rows.shape[1]))
+        return found + self.within_part if self.inner else found
+
+    @property
+    def within_part(self) -> Any:
+        """What the columns within a part are worth to each number."""
+        return sum(abs(each).reshape(len(each), -1).sum(axis=1) for each in self.inner.values())
+
+    def _layers(self, change: Callable[[Any], Any], whole: bool = False) -> Layers:
+        """The columns within a part, changed; all of them as matrices if these are asked for."""
+        each = {key: _whole(part) if whole else part for key, part in self.inner.items()}
+        return {key: change(part) for key, part in each.items()}
+
+    def scaled_layers(self, factor: Any) -> Layers:
+        """The columns within a part, each number times one."""
+        return self._layers(lambda part: factor.reshape(-1, *[1] * (part.ndim - 1)) * part)
+
+    def folded_layers(self, factor: Any, count: int) -> Layers:
+        """Sums of so many parts of the columns within a part of a step, each number times one."""
+        return self._layers(lambda part: folded(factor[:, None] * part, count), whole=True)
+
+    @property
     def _there(self) -> Any:
         """Which numbers are not zero."""
         return abs(self.rows).sum(axis=1) + self.radii.sum(axis=1) > 0
@@ -104,7 +158,8 @@ class AffineForms(AbstractNumber):
         """The same forms with other intervals."""
         xp = namespace(self.rows)
         parts = self.rows[:, :1], interval.mid[:, None], self.rows[:, 2:]
-        return AffineForms(xp.concatenate(parts, axis=1), radii_of(self.off, interval.rad))
+        radii = radii_of(self.off, interval.rad)
+        return AffineForms(xp.concatenate(parts, axis=1), radii, self.inner)
 
     def __rmatmul__(self, matrix) -> AffineForms:
         """`matrix @ self` for an exact matrix."""
@@ -112,22 +167,26 @@ class AffineForms(AbstractNumber):
         error = errors(lambda: gamma(count) * abs(self.rows).sum(axis=1))
         lost = errors(lambda: underflow(matrix, self._there, self.rows.shape[1] + 2))
         radii = abs(matrix) @ (self.radii + error[:, None]) + lost[:, None]
-        return AffineForms(matrix @ self.rows, radii * (1 + gamma(count + self.rows.shape[1])))
+        radii = radii * (1 + gamma(count + self.rows.shape[1]))
+        inner = self._layers(lambda part: matrix * part if part.ndim == 1 else matrix @ part)
+        return AffineForms(matrix @ self.rows, radii, inner)
 
     def __add__(self, other) -> AffineForms:
         xp = namespace(self.rows)
         if isinstance(other, AffineForms):
             rows = _sum(self.rows, other.rows)
             radii, changed = self.radii + other.radii, rows
+            inner = _added(self.inner, other.inner)
         else:  # exact constants, one for each or one for all
             changed = self.rows[:, :2] + xp.asarray(other)[..., None]
             rows = xp.concatenate([changed, self.rows[:, 2:]], axis=1)
-            radii = self.radii
+            radii, inner = self.radii, self.inner
         error = errors(lambda: gamma(1) * abs(changed).sum(axis=1))
-        return AffineForms(rows, (radii + error[:, None]) * (1 + gamma(rows.shape[1] + 4)))
+        radii = (radii + error[:, None]) * (1 + gamma(rows.shape[1] + 4))
+        return AffineForms(rows, radii, inner)
 
     def __neg__(self) -> AffineForms:
-        return AffineForms(-self.rows, self.radii)
+        return AffineForms(-self.rows, self.radii, self._layers(lambda part: -part))
 
     def __rmul__(self, factor) -> AffineForms:
         """Each number times an exact one, or all times one."""
@@ -137,10 +196,12 @@ class AffineForms(AbstractNumber):
         count = self.rows.shape[1] + 2
         lost = errors(lambda: 2 * TINY * count * ((factor != 0) & self._there))
         radii = abs(factor)[:, None] * (self.radii + error[:, None]) + lost[:, None]
-        return AffineForms(factor[:, None] * self.rows, radii * (1 + gamma(self.rows.shape[1] + 4)))
+        radii = radii * (1 + gamma(self.rows.shape[1] + 4))
+        return AffineForms(factor[:, None] * self.rows, radii, self.scaled_layers(factor))
 
     def __getitem__(self, index) -> AffineForms:
-        return AffineForms(self.rows[index], self.radii[index])
+        inner = self._layers(lambda part: part[index], whole=True)
+        return AffineForms(self.rows[index], self.radii[index], inner)
 
     def ends(self, start: InitialColumns, cut: bool = False) -> Ends:
         """Lower and upper bounds `(k,)` by forms or by intervals, whichever is better.
@@ -159,8 +220,7 @@ class AffineForms(AbstractNumber):
         center = self.rows[:, 0]
         lower, upper = start.bounds(self.rows[:, 2 : 2 + own], cut)
         error = errors(lambda: gamma(8) * (abs(center) + larger(-lower, upper)))
-        rest = abs(self.rows[:, 2 + own :]).sum(axis=1) * (1 + gamma(n))
-        slack = rest + (self.off + error) * (1 + gamma(n))
+        slack = self.rest(own) + (self.off + error) * (1 + gamma(n))
         return center + lower - slack, center + upper + slack
 
     def ends_by_interval(self) -> Ends:
@@ -172,7 +232,7 @@ class AffineForms(AbstractNumber):
 
     def widened(self, by) -> AffineForms:
         """The numbers up to an error of so much each."""
-        return AffineForms(self.rows, (self.radii + by[..., None]) * (1 + gamma(4)))
+        return AffineForms(self.rows, (self.radii + by[..., None]) * (1 + gamma(4)), self.inner)
 
     def padded(self, width: int) -> AffineForms:
         """The forms over at least so many columns, the new ones empty (numpy)."""
@@ -190,6 +250,9 @@ class AffineForms(AbstractNumber):
         columns there are: see `padded`.
         """
         k, n = self.rows.shape
+        if isinstance(place, Inner):
+            inner = self.inner | {place.first: by}
+            return AffineForms(self.rows, self.radii, inner), np.full(k, -1)
         if place is not None:
             own = select(np.eye(k, dtype=bool), by[:, None], 0.0)
             rows = jax.lax.dynamic_update_slice(self.rows, own, (0, 2 + place))
@@ -216,7 +279,39 @@ def joined(parts: Sequence[AffineForms]) -> AffineForms:
         return parts[0]
     xp = namespace(parts[0].rows)
     rows, radii = zip(*((part.rows, part.radii) for part in parts), strict=True)
-    return AffineForms(xp.concatenate(rows), xp.concatenate(radii))
+    inner = {key: _stacked(key, parts) for part in parts for key in part.inner}
+    return AffineForms(xp.concatenate(rows), xp.concatenate(radii), inner)
+
+
+def folded(parts: Any, count: int) -> Any:
+    """Sums of so many parts of equal length that stand one behind the other."""
+    if count == 1:
+        return parts
+    return parts.reshape(count, len(parts) // count, *parts.shape[1:]).sum(axis=0)
+
+
+def _stacked(layer: int, parts: Sequence[AffineForms]) -> Any:
+    """The columns of a layer in forms one behind the other, of which some may have none."""
+    known = [_whole(part.inner[layer]) for part in parts if layer in part.inner]
+    left, width = iter(known), known[0].shape[1]
+    none = (jnp.zeros((len(part), width)) for part in parts)
+    pairs = zip(parts, none, strict=True)
+    return jnp.concatenate([next(left) if layer in part.inner else zero for part, zero in pairs])
+
+
+def _whole(part: Any) -> Any:
+    """The columns of a layer as a matrix."""
+    return jnp.diag(part) if part.ndim == 1 else part
+
+
+def _added(one: Layers, other: Layers) -> Layers:
+    """Sums of the columns within a part."""
+    found = one | other
+    for key in one.keys() & other.keys():
+        parts = one[key], other[key]
+        same = parts[0].ndim == parts[1].ndim
+        found[key] = sum(parts if same else map(_whole, parts))
+    return found
 
 
 def _sum(one: Any, other: Any) -> Any:

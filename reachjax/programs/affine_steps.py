@@ -35,7 +35,7 @@ from reachjax.numerics.rounding import (
     rounding,
     select,
 )
-from reachjax.programs.affine import AffineForms, Place, joined, radii_of
+from reachjax.programs.affine import AffineForms, Inner, Place, folded, joined, radii_of
 from reachjax.programs.flows import Between, flowed_forms
 from reachjax.programs.initial import Ends, InitialColumns, constant, met, settled
 from reachjax.sets import Box
@@ -111,12 +111,13 @@ def states_facts(unit: AbstractUnit) -> bool:
     return not (unit.free or unit.curved)
 
 
-def merges(layers: Sequence[UnitLayer], outputs: int) -> bool:
+def merges(layers: Sequence[UnitLayer], outputs: int, few: bool = False) -> bool:
     """Whether what the units of a part leave out is summed up at its outputs.
 
-    That is so if all of them are smooth, and more than the outputs.
+    That is so if all of them are smooth, or columns shall be few, and they are more than the
+    outputs.
     """
-    return all(layer.unit.curved for layer in layers) and _count(layers) > outputs
+    return (few or all(layer.unit.curved for layer in layers)) and _count(layers) > outputs
 
 
 def _count(layers: Sequence[UnitLayer]) -> int:
@@ -124,19 +125,23 @@ def _count(layers: Sequence[UnitLayer]) -> int:
     return sum(layer.size for layer in layers)
 
 
-def step_columns(loop: ClosedLoop) -> tuple[int, int]:
+def step_columns(loop: ClosedLoop, few: bool = False) -> tuple[int, int]:
     """How many columns a step adds, and how many it needs in between.
 
     Those of the states' radii are among them where rounding is counted, and of what a flow leaves
-    out.
+    out. None is needed in between where rounding is not counted.
+
+    Args:
+        loop: the closed loop.
+        few: whether what units of any kind leave out is summed up.
     """
     spilled = is_counted() or loop.plant.continuous
     kept, between = loop.units + (loop.states if spilled else 0), 0
     parts = (loop.controller_layers, loop.plant.inputs), (loop.plant_layers, loop.states)
     for layers, outputs in parts:
-        if merges(layers, outputs):
+        if merges(layers, outputs, few):
             kept, between = kept - _count(layers) + outputs, max(between, _count(layers))
-    return kept, between
+    return kept, between if is_counted() else 0
 
 
 def step_forms(
@@ -151,6 +156,7 @@ def step_forms(
     scratch: int = 0,
     before: int = 0,
     spans: list[Between] | None = None,
+    few: bool = False,
 ) -> StepForms:
     """One step of the loop, whose own forward pass is run over affine forms.
 
@@ -167,6 +173,7 @@ def step_forms(
         scratch: where the columns begin that a step needs in between, if there is a place.
         before: how many steps there were since the initial set.
         spans: gets what is in between the samples, of the flow of a differential equation.
+        few: whether what units of any kind leave out is summed up.
     """
     found: list[UnitForms] = []
     done, width, free = 0, state.columns.shape[1], place
@@ -213,10 +220,11 @@ def step_forms(
     ) -> AffineForms:
         """The outputs of a part of the loop."""
         nonlocal width, free
-        if not merges(layers, outputs):
+        if not merges(layers, outputs, few):
             return run(*given)
         first, kept, own = len(found), free, width
-        free = None if place is None else scratch
+        if place is not None:
+            free = scratch if is_counted() else Inner(0)
         z, gap, places = _merged(run(*given), own, kept, scratch)
         merged.append(PartColumns(z, gap, places, range(first, len(found))))
         width = z.columns.shape[1]
@@ -287,6 +295,10 @@ def _merged(
     forms: AffineForms, width: int, place: Place, scratch: int
 ) -> tuple[AffineForms, Any, Any]:
     """The forms with all columns from some on as one for each number, how much, and where."""
+    if forms.inner:
+        gap = forms.within_part
+        forms, places = AffineForms(forms.rows, forms.radii).with_own(gap, place)
+        return forms, gap, places
     xp, first = namespace(forms.rows), 2 + (width if place is None else scratch)
     last = forms.rows[:, first:]
     gap = abs(last).sum(axis=1) * (1 + gamma(last.shape[1]))
@@ -309,8 +321,7 @@ def _smooth(
     """What a layer of smooth units makes of its inputs, whose bounds and lines are known."""
     xp, (lower, upper), w = namespace(y.rows), ends, start.spread.shape[1]
     values, center, rows = Ball.between(*unit.interval(lower, upper)), y.rows[:, 0], y.rows[:, 2:]
-    own = start.norms(rows[:, :w])
-    rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(rows.shape[1])) + y.off
+    own, rest = start.norms(rows[:, :w]), y.rest(w) + y.off
     model = unit.quadratic(lower, upper, line)
     lost = abs(model.curvature) * (2 * own + rest) * rest
     better = model.gap + lost <= line.gap
@@ -337,7 +348,7 @@ def _smooth(
 
     radius = constant(abs(slope) * y.off * (1 + gamma(4)) + errors(size))
     gap = settled((model.gap + lost) * (1 + gamma(16)))
-    z = AffineForms(rows, radii_of(radius, values.rad))
+    z = AffineForms(rows, radii_of(radius, values.rad), y.scaled_layers(slope))
     z, places = z.with_own(gap, place)
     offset = middle - slope * center
     return z, UnitForms(unit, y, lower, upper, slope, offset, gap, places, z)
@@ -360,45 +371,37 @@ def _bilinear(
     count, values = unit.terms, Ball.between(*unit.interval(lower, upper))
     center, rows, size = y.rows[:, 0], y.rows[:, 2:], y.rows.shape[1]
     planes, offset, gap = unit.planes(lower, upper)
-    rest = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(size)) + y.off
-    own, half = start.norms(rows[:, :w]), len(center) // 2
+    own, rest, half = start.norms(rows[:, :w]), y.rest(w) + y.off, len(center) // 2
     (S, S_other), (R, R_other) = map(unit.halves, (own, rest))
     r, r_other = (y.off, y.off) if y.off is NOTHING else unit.halves(y.off)
-    one, other = rows[:half], rows[half:]
+    one, other = y.every[:half], y.every[half:]
     lost = start.mixed_norms(one, other) + S * r_other + S_other * r + R * R_other
     lost = lost + errors(lambda: gamma(w + 8) * (S * R_other + S_other * R))
     lost = lost * (1 + gamma(size + 16))
     better = lost <= gap
     slope = select(xp.concatenate([better, better]), unit.derivative(center), planes)
-    offset = _folded(select(better, -(center[:half] * center[half:]), offset), count)
+    offset = folded(select(better, -(center[:half] * center[half:]), offset), count)
     slope, offset = settled((slope, offset))
-    gap = settled(_folded(select(better, lost, gap), count) * (1 + gamma(count + 8)))
+    gap = settled(folded(select(better, lost, gap), count) * (1 + gamma(count + 8)))
     level, products = (
-        _folded(select(better.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0), count)
+        folded(select(better.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0), count)
         for part in start.multiplied(one[:, :w], other[:, :w])
     )
-    linear = _folded(slope[:, None] * rows, 2 * count)
-    middle = _folded(slope * center, 2 * count) + offset + level
+    linear = folded(slope[:, None] * rows, 2 * count)
+    middle = folded(slope * center, 2 * count) + offset + level
     parts = linear[:, :w], linear[:, w : start.count] + products, linear[:, start.count :]
     form = xp.concatenate([xp.stack([middle, values.mid], axis=1), *parts], axis=1)
 
     def lose() -> Any:
-        sizes = _folded(abs(slope) * (abs(center) + own + rest), 2 * count)
-        sizes = sizes + _folded(abs(slope[:half] * slope[half:]) + S * S_other, count)
-        flushed = (size + 8) * (w + 1) * TINY * (1 + _folded(abs(center) + own + rest, 2 * count))
+        sizes = folded(abs(slope) * (abs(center) + own + rest), 2 * count)
+        sizes = sizes + folded(abs(slope[:half] * slope[half:]) + S * S_other, count)
+        flushed = (size + 8) * (w + 1) * TINY * (1 + folded(abs(center) + own + rest, 2 * count))
         error = gamma(size + 2 * count + 16) * sizes + count * flushed
-        return error + _folded(abs(slope) * y.off, 2 * count) * (1 + gamma(2 * count + 4))
+        return error + folded(abs(slope) * y.off, 2 * count) * (1 + gamma(2 * count + 4))
 
-    z = AffineForms(form, radii_of(errors(lose), values.rad))
+    z = AffineForms(form, radii_of(errors(lose), values.rad), y.folded_layers(slope, 2 * count))
     z, places = z.with_own(gap, place)
     return z, UnitForms(unit, y, lower, upper, xp.zeros_like(gap), offset, gap, places, z)
-
-
-def _folded(parts: Any, count: int) -> Any:
-    """Sums of so many parts of equal length that stand one behind the other."""
-    if count == 1:
-        return parts
-    return parts.reshape(count, len(parts) // count, *parts.shape[1:]).sum(axis=0)
 
 
 def _unit(
@@ -431,7 +434,7 @@ def _unit(
     radius = abs(slope) * y.off + errors(size)
     radius = constant(radius + left) * (1 + gamma(rows.shape[1]))
     columns = xp.concatenate([constants, rows[:, 2:]], axis=1)
-    z = AffineForms(columns, radii_of(radius, values.rad))
+    z = AffineForms(columns, radii_of(radius, values.rad), y.scaled_layers(slope))
     z, places = z.with_own(gap, place)
     return z, UnitForms(unit, y, lower, upper, slope, offset, gap, places, z)
 

@@ -16,6 +16,8 @@ from jaxtyping import Array, Float
 
 from reachjax.loops.flows.flow import AbstractFlow
 from reachjax.loops.flows.taylor_models import Symbols, TaylorModels
+from reachjax.loops.flows.taylor_models import joined as together
+from reachjax.numerics.numbers import split
 from reachjax.numerics.rounding import Ball, gamma, larger, namespace
 from reachjax.programs.affine import AffineForms, joined
 from reachjax.programs.initial import InitialColumns
@@ -50,7 +52,8 @@ class Between(NamedTuple):
             directions: one row each.
             start: what the first columns are.
         """
-        return reduce(larger, (forms.ends(start, True)[1] for forms in self.values(directions)))
+        each = self.values(directions)
+        return reduce(larger, split(joined(each).ends(start, True)[1], len(each)))
 
 
 def flowed_forms(
@@ -72,12 +75,12 @@ def flowed_forms(
     box = Ball.between(*given[0].ends(start, cut))
     symbols, models = _condensed(forms, [len(each) for each in given], start)
     found = flow.followed(models, box, between)
-    points = (
-        tuple(_expanded(point, forms, symbols) for point in each.points) for each in found.controls
-    )
+    states = [found.state, *(point for each in found.controls for point in each.points)]
+    state, *points = split(_expanded(together(states), forms, symbols), len(states))
     parts = [each.part for each in found.controls]
     ends = tuple(sum(parts[: k + 1]) for k in range(len(parts)))
-    return _expanded(found.state, forms, symbols), Between(tuple(points), ends)
+    fours = tuple(tuple(points[k : k + 4]) for k in range(0, len(points), 4))
+    return state, Between(fours, ends)
 
 
 def _condensed(

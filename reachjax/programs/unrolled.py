@@ -19,7 +19,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units.smooth import EXTREMES
 from reachjax.numerics.host import in_numpy
-from reachjax.numerics.rounding import rounding
+from reachjax.numerics.rounding import is_counted, rounding
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
 from reachjax.programs.flows import Between
@@ -207,7 +207,7 @@ def unrolled_at_once(
         counted: whether rounding is, and what polynomials leave out of a flow: what is found
             without it is no bound, and takes a fraction of the time.
         columns: how many are kept of all steps before, into which old ones are merged; None for all
-            that there are.
+            that there are. Where rounding is not counted either, units of any kind get few.
     """
     with rounding(counted):
         return _at_once(loop, X0, box, directions, t, between, columns)
@@ -224,7 +224,8 @@ def _at_once(
 ) -> ByForms:
     """Bounds for all steps, as one scan."""
     start = InitialColumns.of(X0, box, loop.curved)
-    (more, scratch), steps = step_columns(loop), len(directions)
+    few = columns is not None and not is_counted()
+    (more, scratch), steps = step_columns(loop, few), len(directions)
     kept = (steps - 1) * more if columns is None else max(columns, 4 * loop.states)
     merges, first = kept < (steps - 1) * more, start.count
     end = first + (kept + more if merges else steps * more)
@@ -235,9 +236,8 @@ def _at_once(
         k, rows = step
         place = first + (kept if merges else k * more)
         spans = [] if between else None
-        state, units, _ = step_forms(
-            loop, state, t + k, start, place=place, scratch=end, spans=spans
-        )
+        given = loop, state, t + k, start
+        state, units, _ = step_forms(*given, place=place, scratch=end, spans=spans, few=few)
         found = _bounds(rows, state, units, start, spans)
         return merged_columns(state, first, kept, end) if merges else state, found
 

@@ -9,21 +9,26 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import real_number, whole_number
 from reachjax.numerics.pytrees import Replaceable
-from reachjax.programs.unrolled import columns_kept, unrolled_at_once
+from reachjax.programs.unrolled import unrolled_at_once
 from reachjax.sets import Box
 from reachjax.verdicts.facet_rows import FacetRowsByTime
 from reachjax.verdicts.specification import Requirement
 
 BETWEEN = 4
 """So many states of a period are simulated where requirements hold at all times."""
+
+COLUMNS = 16
+"""Forms keep so many columns of earlier steps, or four a state where these are more."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,11 +64,12 @@ class TrainingBatch:
         """The sum of `max(0, margin - room)`, where one of a set's facets will do to be outside.
 
         Args:
-            rooms: of each requirement whether it is to be inside, and how far each facet is.
+            rooms: of requirements whether they are to be inside, and how far each facet is, along
+                the last axis those of one set.
         """
         total = jnp.zeros(())
         for inside, room in rooms:
-            least = room if inside else jnp.max(room)
+            least = room if inside else jnp.max(room, axis=-1)
             total += jnp.sum(jnp.maximum(0.0, self.margin - least))
         return total
 
@@ -119,8 +125,17 @@ class Certified(Replaceable):
         loop, steps = batch.loop, batch.horizon
         with jax.ensure_compile_time_eval():  # requirements are known numbers
             rows, directions, whole = FacetRowsByTime.of(batch.required, steps, loop.states)
+        limits, units = np.zeros(whole.shape), np.ones(whole.shape)
+        inside, outside = np.zeros(whole.shape, bool), dict[tuple[int, int], Any]()
+        for each in rows:
+            here, ends = (each.item.time, each.proving), (each.first, each.proving.stop)
+            limits[here], units[here] = each.limits[: len(each.units)], each.units
+            if each.item.inside:
+                inside[here] = True
+            else:
+                outside.setdefault(ends, np.zeros((steps + 1, 1), bool))[each.item.time] = True
         between = bool(whole.any())
-        kept = {"counted": False, "columns": columns_kept(loop)}
+        kept = {"counted": False, "columns": COLUMNS}
 
         def of_cell(lower: Array, upper: Array) -> Array:
             box, later = Box(lower, upper), jnp.asarray(directions[1:])
@@ -132,10 +147,10 @@ class Certified(Replaceable):
             bounds = jnp.concatenate([first[None], bounds])
 
             def rooms() -> Iterator[tuple[bool, Array]]:
-                for each in rows:
-                    limits = jnp.asarray(each.limits[: len(each.units)])
-                    reached = bounds[each.item.time, each.proving]
-                    yield each.item.inside, (limits - reached) / each.units
+                room = (limits - bounds) / units
+                yield True, jnp.where(inside, room, jnp.inf)
+                for (first, last), times in outside.items():
+                    yield False, jnp.where(times, room[:, first:last], jnp.inf)
 
             return batch.missed(rooms()) + self._wider(batch, box, found.offsets, later)
 

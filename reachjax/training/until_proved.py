@@ -4,12 +4,19 @@ An epoch lowers the task's loss plus an objective over the worst cells of the in
 `decide` says what is proved. What it finds is what is trained on next: cells that it could not
 prove, and the initial states of counterexamples. Nothing rests on training: the verdict is that of
 `decide`, on the controller that is returned.
+
+The first controller that is proved often gave up more of the task than it had to, as the rest was
+learned on the way. So the way back is halved, from it to the one that was given, as long as that
+lowers the task's loss and `decide` proves it; and training goes on from there, epoch by epoch, each
+of which is halved in the same way where it lost the proof: what is kept is proved, and its loss
+falls.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from reachjax.loops import AbstractNetwork, ClosedLoop
 from reachjax.methods.propagation import Progress, known_numbers, require_kinds
@@ -46,6 +53,7 @@ from reachjax.training.steps import (
     Program,
     Specification,
     TaskLoss,
+    compiled_loss,
     compiled_step,
     hashable,
     under,
@@ -88,7 +96,14 @@ FOR_STEPS = 0.5
 """The part of the time left that the steps of an epoch may take: the rest is for its decision."""
 
 PATIENCE = 3.0
-"""Where the objective is zero it may take so many times as long."""
+"""Where the objective is zero it may take so many times as long; and so many times as long as the
+last proof, where one is known."""
+
+HALVINGS = 6
+"""So often the way between a controller that is proved and one that is not is halved."""
+
+LITTLE = 0.02
+"""Training ends where an epoch lowers the loss of what is proved by less than this part of it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +165,8 @@ def train(
     Its loss is that of the task plus a weight times an objective, which is zero where nothing is
     missed. Stages make it sharper: simulated trajectories, then affine forms over few cells of the
     initial set, then over many. Between epochs `decide` looks whether all is proved, and says where
-    it is not.
+    it is not. A controller that is proved is led back to the given one as far as that lowers the
+    task's loss and it stays proved, and is trained on while that goes on.
 
     Args:
         loop: the closed loop, whose controller is where training begins: an `MLP`, or a `Network`
@@ -172,7 +188,8 @@ def train(
         batch: how many cells are trained on at a step, at most.
         samples: how many initial states are drawn from these at each step.
         steps: of an epoch.
-        epochs: at most.
+        epochs: at most. After the first one that is proved as many come again at most, as long as
+            they lower the task's loss of what is proved.
         cells: into how many cells `decide` may cut the initial set: few make a controller that is
             proved quickly.
         start: the time of `X0`, for time-varying loops.
@@ -183,8 +200,9 @@ def train(
         progress: wraps the iteration over epochs to show a progress bar, such as `tqdm.tqdm`.
 
     Returns:
-        The loop under its controller, its verdict, and what happened. If nothing is proved by the
-        end, the controller is the last one.
+        The loop under its controller, its verdict, and what happened: of all that is proved the
+        one whose task's loss is least. If nothing is proved by the end, the controller is the last
+        one.
 
     Raises:
         ImportError: optax is not installed.
@@ -241,7 +259,7 @@ def train(
         first = min(FIRST, budget.left / 10) if budget.timed else FIRST
         run.decide(budget, max(LEAST, first), asked, after=len(run.epochs))
         for _ in wrapped(progress, range(len(run.epochs), epochs)):
-            if run.found.proved or budget.late:
+            if run.over or budget.late:
                 break
             run.epoch(sizes, budget, asked)
             if kept is not None:
@@ -291,6 +309,7 @@ class _Kept(NamedTuple):
         stage: the number of the stage.
         begun: the epoch that it began with.
         epochs: so far.
+        fruitless: whether the last one of a proved controller lowered its loss by little.
     """
 
     seal: Any
@@ -300,6 +319,7 @@ class _Kept(NamedTuple):
     stage: int
     begun: int
     epochs: tuple[Epoch, ...]
+    fruitless: bool = False
 
 
 class _Run:
@@ -340,7 +360,7 @@ class _Run:
         self._state = optimizer.init(self._weights)
         self._examples = np.tile(np.asarray(X0.center), (REMEMBERED, 1))
         self._stage = self._begun = 0
-        self._before = 0.0
+        self._before, self._proof, self._fruitless = 0.0, 0.0, False
         self.epochs: list[Epoch] = []
         self.known: Trained | None = None
 
@@ -349,6 +369,13 @@ class _Run:
         """The controller that was decided last."""
         assert self.known is not None  # it is decided before anything else
         return dataclasses.replace(self.known, history=TrainingHistory(tuple(self.epochs)))
+
+    @property
+    def over(self) -> bool:
+        """Whether the controller is proved, and going on is not worth it."""
+        took = (k for k, epoch in enumerate(self.epochs, 1) if epoch.status == "PROVED")
+        longest = 2 * next(took, 0)
+        return self.found.proved and (self._fruitless or len(self.epochs) >= longest)
 
     @property
     def _seal(self) -> Seal:
@@ -361,15 +388,29 @@ class _Run:
 
         After so many epochs it is the same, also where a file was gone on from.
         """
-        loop = under(self._loop, self._weights)
-        limit = min(seconds, budget.left) if budget.timed else seconds
-        given = loop, self._X0, self._spec.horizon
-        verdict = decide(*given, **asked, seed=self._seed + after, time_limit=limit)
+        self.known = self._decided(self._weights, budget, seconds, asked, after)
+        verdict = self.known.verdict
         if verdict.counterexample is not None and (after == 0 or after > len(self.epochs)):
             begun = np.asarray(verdict.counterexample.states[0])[None]
             self._examples = np.concatenate([self._examples[1:], begun])
-        self.known = Trained(loop, verdict, TrainingHistory())
         return verdict
+
+    def _decided(
+        self,
+        weights: Sequence[Array],
+        budget: Budget,
+        seconds: float,
+        asked: dict[str, Any],
+        after: int,
+    ) -> Trained:
+        """A controller with its verdict, found in so many seconds."""
+        loop = under(self._loop, weights)
+        limit = min(seconds, budget.left) if budget.timed else seconds
+        given, clock = (loop, self._X0, self._spec.horizon), Budget()
+        verdict = decide(*given, **asked, seed=self._seed + after, time_limit=limit)
+        if verdict.proved:
+            self._proof = clock.elapsed
+        return Trained(loop, verdict, TrainingHistory())
 
     def epoch(self, sizes: _Sizes, budget: Budget, asked: dict[str, Any]) -> None:
         """Some steps on the cells that are worst, and what is decided then."""
@@ -401,7 +442,9 @@ class _Run:
         seconds = clock.elapsed * (PATIENCE if quiet else 1.0)
         if share.late:  # it may be the last one
             seconds = max(seconds, share.elapsed)
-        verdict = self.decide(budget, max(LEAST, seconds), asked, number + 1)
+        before, verdict = self.found, self.decide(budget, max(LEAST, seconds), asked, number + 1)
+        if verdict.proved or before.proved:
+            verdict = self._lowest(before, sizes, budget, asked, number + 1)
         proved = sum(cell.status is VerdictStatus.PROVED for cell in verdict.cells)
         self.epochs.append(
             Epoch(
@@ -421,6 +464,50 @@ class _Run:
         if over and not verdict.proved and self._stage + 1 < len(self._stages):
             self._stage, self._begun = self._stage + 1, number + 1
 
+    def _lowest(
+        self,
+        before: Trained,
+        sizes: _Sizes,
+        budget: Budget,
+        asked: dict[str, Any],
+        after: int,
+    ) -> Verdict:
+        """The verdict on the proved controller of least loss that is found after an epoch.
+
+        Args:
+            before: the controller that the epoch began with.
+            sizes: how many states the loss is of.
+            budget: of the whole call.
+            asked: of `decide`.
+            after: how many epochs.
+        """
+        states = self._X0.sample(jax.random.key(self._seed), sizes.samples)
+        now = self.found
+        first, given = weights_of(before.controller), weights_of(self._loop.controller)
+
+        def loss(weights: Sequence[Array]) -> float:
+            return float(compiled_loss()(self._task_loss, self._loop, [*weights], states))
+
+        reached, other = math.inf, given
+        if before.proved:
+            reached, other = loss(first), self._weights
+            if not now.proved or not loss(self._weights) < reached:
+                self.known, self._weights = before, first
+        least = loss(self._weights)
+        for _ in range(HALVINGS):
+            pairs = zip(self._weights, other, strict=True)
+            middle = [(one + another) / 2 for one, another in pairs]
+            if budget.late or not loss(middle) < least:
+                break
+            limit = max(LEAST, PATIENCE * self._proof)
+            tried = self._decided(middle, budget, limit, asked, after)
+            if tried.proved:
+                self.known, self._weights, least = tried, middle, loss(middle)
+            else:
+                other = middle
+        self._fruitless = reached - least <= LITTLE * abs(least)
+        return self.found.verdict
+
     def keep(self, path: Path) -> None:
         """Write what has been done to a file."""
         state = tuple(jax.tree.leaves(self._state))
@@ -432,6 +519,7 @@ class _Run:
             self._stage,
             self._begun,
             tuple(self.epochs),
+            self._fruitless,
         )
         write(path, kept, outside=ClosedLoop)
 
@@ -459,5 +547,6 @@ class _Run:
         self._weights = [jnp.asarray(each) for each in kept.weights]
         self._state = jax.tree.unflatten(structure, kept.optimizer)
         self._examples, self._stage, self._begun = kept.examples, kept.stage, kept.begun
+        self._fruitless = kept.fruitless
         self.epochs = [*kept.epochs]
         self._before = self.epochs[-1].seconds if self.epochs else 0.0

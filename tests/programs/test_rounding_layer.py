@@ -1,5 +1,6 @@
 """Rounding is a layer: without it numbers are the same but for rounding, and none of it stays."""
 
+import itertools
 from fractions import Fraction
 
 import jax
@@ -9,7 +10,9 @@ import pytest
 
 import reachjax as rj
 from reachjax.numerics.rounding import gamma, is_counted, rounding
+from reachjax.programs.affine_steps import step_columns
 from reachjax.programs.unrolled import unrolled_at_once
+from reachjax.training.steps import QUICKLY
 from tests.networks import directions
 from tests.programs.test_merging import pendulum
 
@@ -59,6 +62,68 @@ def test_sets_without_rounding_are_the_certified_ones_but_for_rounding(kind):
     np.testing.assert_allclose(plain, proved, rtol=1e-9, atol=1e-9)
     for one, another in zip(jax.tree.leaves(slopes), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(another, one, rtol=1e-6, atol=1e-8)
+
+
+def random_layers(rng, *sizes):
+    return [
+        (rng.normal(size=(k, n)) / np.sqrt(n), 0.1 * rng.normal(size=k))
+        for n, k in itertools.pairwise(sizes)
+    ]
+
+
+def branches(parameters, x):
+    """A controller of two branches, whose units are multiplied."""
+    (W, b), (V, c) = parameters
+    y, z = jnp.tanh(W @ x + b), jnp.maximum(V @ x + c, 0.0)
+    return jnp.sum(y * jnp.maximum(z - 0.5 * y, 0.0), keepdims=True) - x[:1]
+
+
+def of_products(rng):
+    parameters = [random_layers(rng, 2, 3)[0] for _ in range(2)]
+    return rj.Network(jax.tree_util.Partial(branches, jax.tree.map(jnp.asarray, parameters)), 2, 1)
+
+
+OF_ONE_OUTPUT = {
+    "three layers": lambda rng: rj.MLP.from_layers(random_layers(rng, 2, 5, 4, 3, 1)),
+    "tanh": lambda rng: rj.MLP.from_layers(random_layers(rng, 2, 5, 4, 1), rj.Tanh()),
+    "residual": lambda rng: rj.Residual(
+        rj.MLP.from_layers([*random_layers(rng, 2, 4, 4, 1)]), rng.normal(size=(1, 2))
+    ),
+    "products": of_products,
+}
+
+
+@pytest.mark.parametrize("kind", OF_ONE_OUTPUT)
+def test_few_columns_lose_nothing_of_one_input(kind):
+    """What units of any kind leave out of one number is one column of it, however many they are."""
+    rows = np.broadcast_to(directions(2), (3, *directions(2).shape))
+    plant = rj.AffinePlant([[1.0, 0.1], [0.1, 0.9]], [[0.1], [0.3]])
+
+    def offsets(columns, net, X0):
+        given = rj.ClosedLoop(plant, net), X0, X0, rows
+        return unrolled_at_once(*given, counted=False, columns=columns).offsets
+
+    found = jax.jit(offsets, static_argnums=0, compiler_options=QUICKLY)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        net, lower = OF_ONE_OUTPUT[kind](rng), rng.uniform(-0.5, 0.3, 2)
+        X0 = rj.Box(lower, lower + rng.uniform(0.1, 0.5, 2))
+        few = np.asarray(found(1000, net, X0))
+        np.testing.assert_allclose(few, found(None, net, X0), rtol=1e-9, atol=1e-9)
+        states = X0.sample(jax.random.key(seed), 200)
+        runs = rj.ClosedLoop(plant, net).simulate(states, 3)[:, 1:]
+        reached = np.einsum("cti,tmi->ctm", runs, rows).max(axis=0)
+        assert (reached <= few + 1e-9).all()
+
+
+@pytest.mark.parametrize("activation", [rj.ReLU(), rj.Tanh()])
+def test_a_step_adds_few_columns_however_many_neurons_there_are(activation):
+    plant = rj.AffinePlant(np.eye(2), [[0.0], [0.1]])
+    for neurons in (3, 20):
+        layers = random_layers(np.random.default_rng(0), 2, neurons, neurons, 1)
+        loop = rj.ClosedLoop(plant, rj.MLP.from_layers(layers, activation))
+        with rounding(False):
+            assert step_columns(loop, few=True) == (1, 0)
 
 
 def test_what_is_proved_within_a_scope_without_rounding_counts_it():

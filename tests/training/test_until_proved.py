@@ -43,8 +43,34 @@ def test_a_refuted_controller_is_trained_until_it_is_proved():
     assert found.proved
     assert rj.decide(found.loop, X0, 2, goal=GOAL).proved
     statuses = [epoch.status for epoch in found.history.epochs]
-    assert statuses.index("PROVED") == len(statuses) - 1  # it ends with the first proof
+    took = statuses.index("PROVED") + 1
+    assert set(statuses[took:]) <= {"PROVED"}  # what is proved once stays so
+    assert len(statuses) <= 2 * took
     assert leaves(loop)[2].tolist() == LAYERS[1][0]  # what was given is as it was
+
+
+def gained(w):
+    """The loop that multiplies its state by `1 + w`, and how far that is from where it was."""
+
+    def change(loop, states):
+        return jnp.mean((jax.vmap(loop.controller)(states) - w * states) ** 2)
+
+    gain = jax.tree_util.Partial(lambda w, x: w * x, jnp.array([w]))
+    return loop_of(rj.Network(gain, 1, 1)), change
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_proved_is_changed_no_more_than_it_takes(seed):
+    """Steps are so long that the first proof is far from the nearest one."""
+    rng = np.random.default_rng(seed)
+    w, slowest = rng.uniform(-0.3, 0.1), np.sqrt(0.3) - 1  # 2 (1 + w)^2 <= 0.6
+    loop, change = gained(w)
+    assert rj.decide(loop, X0, 2, goal=GOAL).refuted
+    once = {"goal": GOAL, "margin": 0.1, "steps": 3, "weight": 20.0, "optimizer": optax.adam(0.2)}
+    found = rj.train(loop, X0, 2, change, **once)
+    assert found.proved
+    assert rj.decide(found.loop, X0, 2, goal=GOAL).proved
+    assert slowest - 0.03 * abs(w - slowest) <= leaves(found.loop)[0][0] <= slowest
 
 
 def test_a_proved_controller_is_left_as_it_is():
@@ -91,6 +117,22 @@ def test_any_tree_of_arrays_is_trained(kind):
     )
     assert found.proved
     assert rj.decide(found.loop, X0, 2, goal=GOAL).proved
+
+
+def test_a_training_goes_on_from_its_file_after_a_proof(tmp_path):
+    loop, change = gained(-0.1)
+    given = {"goal": GOAL, "margin": 0.1, "steps": 2, "optimizer": optax.adam(0.05)}
+    whole = rj.train(loop, X0, 2, change, **given)
+    took = [epoch.status for epoch in whole.history.epochs].index("PROVED") + 1
+    assert took < len(whole.history)
+    path = tmp_path / "gain.training"
+    first, second, third = (
+        rj.train(loop, X0, 2, change, **given, path=path, epochs=count) for count in (took, 99, 99)
+    )
+    assert len(first.history) == took
+    assert len(second.history) == len(third.history) == len(whole.history)
+    for run in (second, third):
+        np.testing.assert_array_equal(leaves(run.loop)[0], leaves(whole.loop)[0])
 
 
 def test_a_training_goes_on_from_its_file(tmp_path):

@@ -60,7 +60,7 @@ from reachjax.loops.units import (
 )
 from reachjax.loops.units import Step as Jump
 from reachjax.numerics.numbers import AbstractNumber, size, widened
-from reachjax.numerics.rounding import UNIT, Ball, namespace
+from reachjax.numerics.rounding import UNIT, Ball, is_counted, namespace
 
 
 class Node(NamedTuple):
@@ -322,7 +322,7 @@ class Series:
             if node is None:
                 found = inputs[place]
             else:
-                found = self._first(node) if k == 0 else self._next(place, node, k)
+                found = self._first(node) if k == 0 else settled_number(self._next(place, node, k))
             self.columns[place].append(found)
         return self.columns[self._tape.result][k]
 
@@ -437,12 +437,13 @@ def solved(tape: Tape, x: Any, others: Sequence[Any], h: Any, order: int) -> lis
     """Coefficients `h^k x_k` of a solution, `k = 1 .. order`.
 
     In compiled code all but the first are computed by one `scan`: what is written once is compiled
-    once, and what a compiler fuses does not grow with the order.
+    once, and what a compiler fuses does not grow with the order. Where rounding is not counted the
+    order is low, and what a scan hands on takes longer than what it computes.
 
     Raises:
         UnboundedError: a unit has no bounds, in numpy.
     """
-    if namespace(*arrays(x)) is np or order == 1:
+    if namespace(*arrays(x)) is np or order == 1 or not is_counted():
         solution = Solution(tape, x, others, h)
         return [solution.advance() for _ in range(order)]
     series = Series(tape)

@@ -36,6 +36,7 @@ from reachjax.loops.flows.enclosures import constant_ball, enclosed
 from reachjax.loops.flows.series import Series, Solution, Tape, solved
 from reachjax.loops.flows.taylor_models import Symbols, TaylorModels, joined, zeros
 from reachjax.loops.units import Origin, UnboundedError, Within
+from reachjax.numerics.numbers import split
 from reachjax.numerics.rounding import (
     Ball,
     constant,
@@ -179,8 +180,11 @@ def flowed(
             last = h * Series.value(tape, [found, *given])
             inner = here + (1 / 3) * terms[0], found - (1 / 3) * last
             wide = [point.widened(piece.fourth / 16) for point in (here, *inner, found)]
-            controls.append(Control(tuple(_composed(each, state) for each in wide), part))
-        state, done = _composed(found, state), done + part
+            *wide, state = split(_composed(joined([*wide, found]), state), 5)
+            controls.append(Control(tuple(wide), part))
+        else:
+            state = _composed(found, state)
+        done += part
         if varying:
             slopes.append(_slopes(tape, [piece.B, *(each.ball for each in others)]))
             end, within = drift(slopes, signal, settings.period * done)

@@ -23,11 +23,13 @@ from jaxtyping import Array, Float
 from reachjax.loops.units import AbstractUnit, SmoothUnit, UnboundedError
 from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.rounding import (
+    NOTHING,
     TINY,
     Ball,
     constant,
     errors,
     gamma,
+    is_counted,
     namespace,
     settled,
     underflow,
@@ -114,8 +116,8 @@ class TaylorModels(AbstractNumber):
 
     @cached_property
     def _size(self) -> Any:
-        """Bounds of `|c|` and all terms, for rounding."""
-        return abs(self.rows[:, 0]) + sum(self._parts)
+        """Bounds of `|c|` and all terms, for rounding; nothing where that is not counted."""
+        return abs(self.rows[:, 0]) + sum(self._parts) if is_counted() else NOTHING
 
     @property
     def spread(self) -> Any:
@@ -161,7 +163,8 @@ class TaylorModels(AbstractNumber):
         xp = namespace(self.rows)
         if isinstance(other, TaylorModels):
             rows = self.rows + other.rows
-            return self._with(rows, self.radii + other.radii, gamma(1) * (self._size + other._size))
+            lost = gamma(1) * (self._size + other._size)
+            return self._with(rows, self.radii + other.radii, lost)
         first = self.rows[:, :1] + xp.asarray(other)[..., None]
         rows = xp.concatenate([first, self.rows[:, 1:]], axis=1)
         return self._with(rows, self.radii, gamma(1) * abs(first[:, 0]))
@@ -172,8 +175,8 @@ class TaylorModels(AbstractNumber):
     def __rmul__(self, factor: Any) -> TaylorModels:
         """Each number times an exact one, or all times one."""
         factor = namespace(self.rows).broadcast_to(factor, (len(self.rows),))
-        size = gamma(1) * abs(factor) * self._size + TINY
-        return self._with(factor[:, None] * self.rows, abs(factor) * self.radii, size)
+        lost = errors(lambda: gamma(1) * abs(factor) * self._size + TINY)
+        return self._with(factor[:, None] * self.rows, abs(factor) * self.radii, lost)
 
     def times(self, other: TaylorModels) -> TaylorModels:
         """Products, entry by entry, without what is of degree three."""
@@ -196,8 +199,8 @@ class TaylorModels(AbstractNumber):
         rows = xp.concatenate([*parts, rows[:, 1 + count :]], axis=1)
         size, size_ = abs(center[:, 0]) + whole, abs(another[:, 0]) + whole_
         radii = left + self.radii * (size_ + other.radii) + other.radii * size
-        rounding = gamma(rows.shape[1] + 4) * size * size_ + 8 * TINY
-        return self._with(rows, radii * (1 + gamma(16)), rounding)
+        lost = errors(lambda: gamma(rows.shape[1] + 4) * size * size_ + 8 * TINY)
+        return self._with(rows, radii * (1 + gamma(16)), lost)
 
     def at(self, unit: AbstractUnit) -> TaylorModels:
         """The values of smooth units: by a quadratic, or by lines where these leave less out.

@@ -210,27 +210,39 @@ def _refreshed(
     """A state with a new symbol each for all of it that is not of the initial set.
 
     Returns:
-        The state, and the other arguments, of these symbols.
+        The state, and the other arguments, of these symbols and of higher products.
     """
-    xp, n, (initial, curved, radii) = namespace(state.rows), len(state), state.symbols
+    xp, n, (initial, curved, radii, _) = namespace(state.rows), len(state), state.symbols
     first = 1 + state.symbols.own
     own = abs(state.rows[:, first:]) @ radii * (1 + gamma(len(radii))) + state.radii
-    symbols = Symbols(initial, curved, xp.concatenate([own * (1 + gamma(2)), radii[n:]]))
-    eye = xp.eye(n, len(radii))
-    rows = xp.concatenate([state.rows[:, :first], eye], axis=1)
-    here = TaylorModels(rows, xp.zeros_like(state.radii), symbols)
-    return here, [TaylorModels(each.rows, each.radii, symbols) for each in others]
+    own = xp.concatenate([own * (1 + gamma(2)), radii[n:]])
+    symbols = Symbols(initial, curved, own).with_higher
+
+    def filled(rows: Any, radii: Any) -> TaylorModels:
+        more = 1 + symbols.count - rows.shape[1]
+        rows = xp.concatenate([rows, xp.zeros((len(rows), more))], axis=1)
+        return TaylorModels(rows, radii, symbols)
+
+    rows = xp.concatenate([state.rows[:, :first], xp.eye(n, len(radii))], axis=1)
+    here = filled(rows, xp.zeros_like(state.radii))
+    return here, [filled(each.rows, each.radii) for each in others]
 
 
 def _composed(found: TaylorModels, state: TaylorModels) -> TaylorModels:
-    """What was found of a state's new symbols, of the state's own ones."""
+    """What was found of a state's new symbols, of the state's own ones.
+
+    Higher products are worth what they can be.
+    """
     xp, n, symbols = namespace(found.rows), len(state), state.symbols
-    first = 1 + symbols.own
+    first, higher = 1 + symbols.own, found.symbols.higher
+    last = first + len(symbols.radii)
     slope, own = found.rows[:, first : first + n], state.rows[:, first:]
-    more = xp.concatenate([xp.zeros((len(found), n)), found.rows[:, first + n :]], axis=1)
+    more = xp.concatenate([xp.zeros((len(found), n)), found.rows[:, first + n : last]], axis=1)
     rows = xp.concatenate([found.rows[:, :first], slope @ own + more], axis=1)
     sizes = (abs(slope) @ abs(own) + abs(more)) @ symbols.radii
     radii = found.radii + abs(slope) @ state.radii * (1 + gamma(n)) + gamma(2 * n + 8) * sizes
+    if higher is not None:
+        radii = radii + abs(found.rows[:, last:]) @ higher * (1 + gamma(len(higher)))
     return TaylorModels(rows, radii * (1 + gamma(4)), symbols)
 
 

@@ -184,18 +184,22 @@ class _Decisions(AbstractSearch):
         if self.ended:
             return
         if first and self._may_halve(node, axis):
-            self._halve(node, axis)
+            self._halve(node, axis, outcome.then)
         elif first and self._first is not self._task and self._task.by_programs:
             self._last.append(node)
 
     def _may_halve(self, node: Node, axis: int) -> bool:
         return not self._budget.late and self._cells.can_halve(node, axis)
 
-    def _halve(self, node: Node, axis: int) -> None:
+    def _halve(self, node: Node, axis: int, then: int = -1) -> None:
         halves = self._cells.halved(node, axis)
         self._cells.replace(node, halves, axis)
         node.found = None
-        self._open.extend(halves)
+        for half in halves:
+            if then >= 0 and self._may_halve(half, then):
+                self._halve(half, then)
+            else:
+                self._open.append(half)
 
     def _hopeless(self, node: Node) -> int | None:
         """Along which axis to halve a cell at once, if none of its size was proved lately."""

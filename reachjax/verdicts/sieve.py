@@ -82,6 +82,7 @@ class Outcome(NamedTuple):
         margins: of those that were looked at; NaN of the others.
         refuted: whether one of them fails from every state of it.
         axis: along which it should be halved; -1 where nothing says that.
+        then: along which its halves should be before they are bounded; -1 if they should not.
         unbounded: the unit that has no bounds over it, if there is one.
         leaves: of requirements that forms alone do not prove.
         open: decisions that may go either way from it, as far as that was looked at.
@@ -94,6 +95,7 @@ class Outcome(NamedTuple):
     unbounded: Unbounded | None = None
     leaves: tuple[Leaves, ...] = ()
     open: tuple[OpenDecision, ...] = ()
+    then: int = -1
 
     @property
     def margin(self) -> float:

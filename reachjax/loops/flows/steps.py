@@ -159,16 +159,16 @@ def flowed(
     within: Any = 0.0
     while todo:
         part = todo.pop()
-        h = settings.period * part
+        h, halves = settings.period * part, count < MOST and part / 2 >= SHORTEST
         here, given = _refreshed(state, others)
         # a signal may have taken states away from where its mean has
         X = here.widened(within).ball if done else here.ball.meeting(box)
         boxes = [each.ball for each in given]
         if is_counted():
-            piece, holds = _enclosed(tape, X, boxes, h, part, settings, between)
+            piece, holds = _enclosed(tape, X, boxes, h, part, settings, between, halves)
         else:
             piece, holds = _sketched(X, settings.order), True
-        if piece is None or (piece.excess > 1 and count < MOST and part / 2 >= SHORTEST):
+        if piece is None or (piece.excess > 1 and halves):
             todo, count = [*todo, part / 2, part / 2], count + 1
             continue
         proved = proved & holds
@@ -254,6 +254,7 @@ def _enclosed(
     part: float,
     settings: Settings,
     between: bool,
+    halves: bool,
 ) -> tuple[_Piece | None, Any]:
     """A step with its enclosure, and whether that is proved; None of one that has to be halved.
 
@@ -271,7 +272,7 @@ def _enclosed(
                 raise _escaped(X, B)
             return None, proved
         whole = 1 / part if between else None
-        return _remainder(tape, X, B, others, h, settings.order, whole), proved
+        return _remainder(tape, X, B, others, h, settings.order, whole, halves), proved
     except UnboundedError:
         if shortest:
             raise
@@ -286,6 +287,7 @@ def _remainder(
     h: Any,
     order: int | None,
     whole: float | None = None,
+    halves: bool = False,
 ) -> _Piece:
     """A step of the order that was asked for, or of the lowest whose remainder is small enough.
 
@@ -302,28 +304,33 @@ def _remainder(
         h: how long the step is.
         order: of the polynomials; None to choose it.
         whole: how many such steps a period is, if control points are asked for.
+        halves: whether a step that is too long is halved, so that nothing else is of use.
     """
-    chosen, least, on_host = order or ORDER, 0.0, namespace(X.mid) is np
-    rate = h * Series.value(tape, [X, *others]) if on_host else X
-    if order is None and on_host:
-        solution, terms = Solution(tape, B, others, h), list[Ball]()
-        chosen, least = 0, np.inf
-        for k in range(HIGHEST + 1):
-            terms.append(solution.advance())
-            excess = _excess(terms[k], rate, X)
-            if k and excess < least:
-                chosen, least = k, excess
-            if least <= 1 or (k > 4 and excess > 4 * least):
-                break
-        while len(terms) <= max(chosen, 3):
-            terms.append(solution.advance())
-    else:
+    chosen, between, on_host = order or ORDER, 0.0, namespace(X.mid) is np
+    if not on_host:
         terms = solved(tape, B, others, h, max(chosen, 3) + 1)
+        return _Piece(B, constant_ball(terms[chosen]), _size(terms[3]), chosen, 0.0)
+    rate, solution = h * Series.value(tape, [X, *others]), Solution(tape, B, others, h)
+    terms = [solution.advance() for _ in range(4)]
     second, fourth = (_size(terms[k]) for k in (1, 3))
-    if whole is not None and on_host:
+    if whole is not None:
         moved = IN_BETWEEN * (X.rad + whole * (_size(rate) + second))
-        least = max(least, _over(second / 12 + fourth / 16, moved))
-    return _Piece(B, constant_ball(terms[chosen]), fourth, chosen, least)
+        between = _over(second / 12 + fourth / 16, moved)
+    excess = list[float]()
+    for k in range(HIGHEST + 1 if order is None else 0):
+        if k == len(terms):
+            if halves and between > 1:
+                break
+            terms.append(solution.advance())
+        excess.append(_excess(terms[k], rate, X) if k else np.inf)
+        if min(excess) <= 1 or (k > 4 and excess[k] > 4 * min(excess)):
+            break
+    least = 0.0
+    if order is None:
+        chosen, least = int(np.argmin(excess)), min(excess)
+    while len(terms) <= chosen:
+        terms.append(solution.advance())
+    return _Piece(B, constant_ball(terms[chosen]), fourth, chosen, max(least, between))
 
 
 def _excess(remainder: Ball, rate: Ball, X: Ball) -> float:

@@ -4,8 +4,8 @@ Cells are bounded by forms, whose remainders fall with the third power of their 
 compiled call once there are as many. Those that are left over are bounded one by one
 (`cell_tasks`). What a smooth loop's forms leave out, a half lowers eightfold for the price of a
 form, so its cells get programs only where they are not halved any more. Halves are taken along the
-coordinate that moves the inputs of units most. Of a cell nothing is kept but its box and its
-margins.
+coordinate that what is left out is due to, and of a cell that failed early the halves are halved at
+once. Of a cell nothing is kept but its box and its margins.
 """
 
 from __future__ import annotations

@@ -240,7 +240,7 @@ class TaylorModels(AbstractNumber):
         a, b = self.rows, other.rows
         center, another = a[:, :1], b[:, :1]
         rows = center * b + another * a
-        (one, two, three, *_), (one_, two_, three_, *_) = self._parts, other._parts
+        (one, two, three, *_), (_, two_, three_, *_) = self._parts, other._parts
         whole, whole_ = sum(self._parts), sum(other._parts)
         constants, linear, rest = center * another, rows[:, 1 : 1 + n], [rows[:, 1 + count :]]
         products, left = rows[:, 1 + n : 1 + count], whole * whole_

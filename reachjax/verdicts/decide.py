@@ -69,9 +69,10 @@ from reachjax.verdicts.verdict import Verdict, VerdictStatus
 FIRST_PROGRAMS = 50
 """Linear programs that each bound may take at first, while ranges are those of affine forms."""
 
-FOR_CELLS = 0.5
+FOR_CELLS, FOR_CELLS_OF_FLOWS = 0.5, 0.9
 """The part of its time that a smooth loop's cells get, by forms; the rest is for programs over the
-whole set, which close what cells do not where much is switched and little is smooth."""
+whole set, which close what cells do not where much is switched and little is smooth. What a flow
+leaves out no program closes."""
 
 TO_CLOSE = 50
 """Linear programs that a bound may take from a set that shall be come back to: there are others."""
@@ -297,7 +298,8 @@ def _by_remedies(
         if decision.ended:
             return decision.verdict()
         task = CellTask(on_host, horizon, start, tuple(required), nodes=0)
-        share = budget.share(FOR_CELLS if programs_may_follow else 1.0)
+        part = FOR_CELLS_OF_FLOWS if loop.plant.continuous else FOR_CELLS
+        share = budget.share(part if programs_may_follow else 1.0)
         parts = CellTree.whole(X0, most)
         by_cells = decided_by_cells(task, X0, parts, decision.simulations, share)
         if by_cells.status is not VerdictStatus.UNKNOWN or not relaxation.nodes:

@@ -61,6 +61,7 @@ class CompiledBeside:
         seconds: Callable[[], float | None],
         evaluations: int,
         left: float,
+        share: float = 1.0,
         **static: Any,
     ) -> bool:
         """Whether the compiled function is there for such arguments, and faster than numpy.
@@ -73,14 +74,15 @@ class CompiledBeside:
                 be said.
             evaluations: how many evaluations of what is compiled that is.
             left: the seconds until somebody stops waiting.
+            share: the part of the call that is of use.
             static: keywords of the function.
         """
         known = self._of(given, static)
         if known.seconds is None:
             known.seconds = seconds()
         if known.seconds is None or known.began:
-            return known.faster
-        known.spent += known.seconds
+            return known.faster(share)
+        known.spent += share * known.seconds
         price = EVALUATIONS * known.seconds / evaluations
         with self._lock:
             early = price > CHEAP and known.spent < EARLY * price
@@ -93,7 +95,7 @@ class CompiledBeside:
         thread.start()
         if price <= CHEAP:  # beside others each would take twice as long
             thread.join(min(left, threading.TIMEOUT_MAX))
-        return known.faster
+        return known.faster(share)
 
     def _of(self, given: Any, static: Any) -> _Compiled:
         """What is known of arguments like these."""
@@ -135,10 +137,10 @@ class _Compiled:
         self.takes, self.spent, self.began = np.inf, 0.0, False
         self.seconds: float | None = None
 
-    @property
-    def faster(self) -> bool:
-        """Whether it is there, and takes less than numpy."""
-        return self.call is not None and self.seconds is not None and self.takes < self.seconds
+    def faster(self, share: float) -> bool:
+        """Whether it is there, and takes less than a part of it takes in numpy."""
+        known = self.call is not None and self.seconds is not None
+        return known and self.takes < share * self.seconds
 
 
 def keep_compilations(folder: str | os.PathLike[str] | None = None) -> Path:

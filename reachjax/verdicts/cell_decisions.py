@@ -4,8 +4,8 @@ Cells are bounded by forms, whose remainders fall with the third power of their 
 compiled call once there are as many. Those that are left over are bounded one by one
 (`cell_tasks`). What a smooth loop's forms leave out, a half lowers eightfold for the price of a
 form, so its cells get programs only where they are not halved any more. Halves are taken along the
-coordinate that moves the inputs of units most. Of a cell nothing is kept but its box and its
-margins.
+coordinate that what is left out is due to, and of a cell that failed early the halves are halved at
+once. Of a cell nothing is kept but its box and its margins.
 """
 
 from __future__ import annotations
@@ -37,6 +37,9 @@ PROGRAMS = 50
 
 SHOTS, FEWER = 64, 8
 """How many trajectories are simulated from a cell that is not proved; and from each of many."""
+
+FEW = 4
+"""So many cells of a flow are worth a compiled call for more, which is filled up."""
 
 TRIED = 8
 """After so many cells of a size of which none was proved, one in so many is tried."""
@@ -126,9 +129,8 @@ class _Decisions(AbstractSearch):
     def question(self, asked: int, workers: int) -> Question | None:
         """Forms of many cells, of one, or what programs say of one that is not halved any more."""
         while (self._open or self._left_over) and not self._budget.overdue:
-            many = len(self._open) >= TOGETHER and not self._task.loop.jumps
-            if not self._left_over and many and not self._budget.late:
-                some = [self._open.popleft() for _ in range(TOGETHER)]
+            if not self._left_over and self._many and not self._budget.late:
+                some = [self._open.popleft() for _ in range(min(TOGETHER, len(self._open)))]
                 given = self._task, [node.ends for node in some], self._budget
                 return Question(some, sifted, given)
             node, known = (
@@ -140,6 +142,12 @@ class _Decisions(AbstractSearch):
                 )
             )
             bounded = known is not None and not self._first.by_programs
+            tried = self._tried.get(self._cells.halvings(node))
+            if known is not None and bounded and tried and self._task.loop.plant.continuous:
+                self._judge(node, Outcome(False, known, axis=tried[-1]))
+                if self.ended:
+                    return None
+                continue
             axis = None if bounded else self._hopeless(node)
             if axis is None:
                 return self._about(node, self._first, known)
@@ -147,6 +155,12 @@ class _Decisions(AbstractSearch):
         if self._last and not (self._open or self._left_over or self._budget.late):
             return self._about(self._last.popleft(), self._task)
         return None
+
+    @property
+    def _many(self) -> bool:
+        """Whether there are cells for a compiled call; of flows it takes less than a few do."""
+        loop = self._task.loop
+        return not loop.jumps and len(self._open) >= (FEW if loop.plant.continuous else TOGETHER)
 
     def _about(self, node: Node, task: CellTask, known: Margins | None = None) -> Question:
         return Question([node], outcome_of, (task, jax.device_get(node.part), self._budget, known))
@@ -184,18 +198,22 @@ class _Decisions(AbstractSearch):
         if self.ended:
             return
         if first and self._may_halve(node, axis):
-            self._halve(node, axis)
+            self._halve(node, axis, outcome.then)
         elif first and self._first is not self._task and self._task.by_programs:
             self._last.append(node)
 
     def _may_halve(self, node: Node, axis: int) -> bool:
         return not self._budget.late and self._cells.can_halve(node, axis)
 
-    def _halve(self, node: Node, axis: int) -> None:
+    def _halve(self, node: Node, axis: int, then: int = -1) -> None:
         halves = self._cells.halved(node, axis)
         self._cells.replace(node, halves, axis)
         node.found = None
-        self._open.extend(halves)
+        for half in halves:
+            if then >= 0 and self._may_halve(half, then):
+                self._halve(half, then)
+            else:
+                self._open.append(half)
 
     def _hopeless(self, node: Node) -> int | None:
         """Along which axis to halve a cell at once, if none of its size was proved lately."""

@@ -22,6 +22,9 @@ from reachjax.methods.ladder import WORK, Ladder
 from reachjax.methods.steps import boxed
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.flags import lenient
+from reachjax.programs.affine import AffineForms
+from reachjax.programs.affine_steps import UnitForms
+from reachjax.programs.initial import InitialColumns
 from reachjax.proofs.branches import Branches
 from reachjax.sets import AbstractSet
 from reachjax.sets.balance import balanced
@@ -29,6 +32,10 @@ from reachjax.verdicts.grounds import Leaves
 from reachjax.verdicts.sieve import Margins, Outcome, Sieve, Unbounded, no_margins
 from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.targets import target_of, values_of
+
+HALVED = 0.4
+"""What smooth functions leave out on account of a coordinate falls to less than this part of it
+where it is halved: to a quarter of what is of degree two, to an eighth of degree three."""
 
 
 class CellTask(NamedTuple):
@@ -111,13 +118,22 @@ def _climbed(
     ladder = Ladder(task.loop, part, around, scenarios, task.start, *limits, between=between)
     if by_forms and part.intervals is not None and not task.by_programs:
         ladder.advance(tighten=False)  # nothing but forms could be tried again
-        axis = _axis(ladder, _first_open(task.required, margins))
+        axis, _ = _axes(ladder, _first_open(task.required, margins))
         return Outcome(False, margins, axis=axis)
     middle, failing = scenarios.middle(np.asarray(around.center)), any(broken)
-    proved, axis, leaves = not failing, 0, list[Leaves]()
+    proved, axes, leaves = not failing, (-1, -1), list[Leaves]()
     for k in range(task.horizon + 1):
         if k:
-            ladder.advance(tighten=False)
+            try:
+                ladder.advance(tighten=False)
+            except UnboundedError as error:
+                axis, then = axes
+                if proved and k > 1:
+                    axis, then = _axes(
+                        ladder, _first_open(task.required, margins), 2 * k < task.horizon
+                    )
+                lost = Unbounded.of(error)
+                return Outcome(False, margins, axis=axis, then=then, unbounded=lost)
         if budget.overdue:
             return Outcome(False, margins)
         for number, item in enumerate(task.required):
@@ -129,10 +145,11 @@ def _climbed(
                 proved, margin, branches = bounded(item, ladder, part, middle)
                 leaves += [Leaves(item.name, k, branches)] if proved and branches else []
                 margins[item.name][k] = np.fmax(margins[item.name][k], margin)
-                axis = axis if proved else _axis(ladder, item)
+                axes = axes if proved else _axes(ladder, item, 2 * k < task.horizon)
         if not (proved or failing):
             break
-    return Outcome(proved, margins, axis=axis, leaves=tuple(leaves))
+    axis, then = axes
+    return Outcome(proved, margins, axis=axis, leaves=tuple(leaves), then=then)
 
 
 def _first_open(required: Sequence[Requirement], margins: Margins) -> Requirement:
@@ -172,15 +189,65 @@ def _all_right(item: Requirement, bounds: Float[np.ndarray, " g"]) -> bool:
     return bool(np.all(bounds <= 0 if item.inside else bounds < 0))
 
 
-def _axis(ladder: Ladder, item: Requirement) -> int:
-    """The coordinate that moves the inputs of the first step's units most, or what is required."""
-    horizon = ladder.horizon
-    n = len(horizon.start.center)
-    size = np.zeros(n)
-    for layer in horizon.steps[0] if horizon.steps else ():
-        bent = slice(None) if layer.unit.curved else layer.places >= 0
-        size += abs(layer.inputs.columns[:, :n])[bent].sum(axis=0)
+def _axes(ladder: Ladder, item: Requirement, early: bool = False) -> tuple[int, int]:
+    """The coordinate along which a half leaves least out of what a requirement speaks of.
+
+    And the one along which halves are halved at once, or -1: a half gets at most about twice as far
+    as its cell, so that of a cell that failed early none is proved.
+
+    What units leave out is due to the coordinates that move their inputs; what a flow leaves out is
+    of third order, and due to those of which the state has large products.
+    """
+    horizon, C = ladder.horizon, np.asarray(item.region.facets[0])
+    start, n = horizon.start, len(horizon.start.center)
+    size, known = np.zeros(n), start.count
+    left = abs((C @ horizon.state).columns).sum(axis=0)
+    for layers, merged, state in zip(horizon.steps, horizon.merged, horizon.states, strict=True):
+        summed = {number for part in merged for number in part.layers}
+        own = [
+            (layer.places, _moved(layer, n))
+            for number, layer in enumerate(layers)
+            if number not in summed
+        ]
+        for part in merged:
+            moved = sum(_moved(layers[number], n).sum(axis=0) for number in part.layers)
+            own.append((part.places, np.tile(moved, (len(part.places), 1))))
+        for places, moved in own:
+            there = places >= 0
+            size += left[places[there]] @ _shares(moved[there])
+            left[places[there]] = 0.0
+        last = min(state.columns.shape[1], len(left))
+        size += left[known:last].sum() * _shares(_bent(start, state)).mean(axis=0)
+        known = max(known, last)
+    size = np.where(np.isfinite(size), size, 0.0)
     if not size.any():
-        C = np.asarray(item.region.facets[0])
-        size = abs(C @ horizon.start.spread).sum(axis=0)
-    return int(size.argmax())
+        size = abs(C @ start.spread).sum(axis=0)
+    axis, then = int(size.argmax()), -1
+    if early and start.curved:
+        size[axis] *= HALVED
+        then = int(size.argmax())
+    return axis, then
+
+
+def _moved(layer: UnitForms, n: int) -> Float[np.ndarray, "k n"]:
+    """How far each of `n` coordinates moves the inputs of units; of all, where they share these."""
+    rows, count = abs(layer.inputs.columns[:, :n]), len(layer.places)
+    if count and len(rows) % count == 0:
+        return rows.reshape(-1, count, n).sum(axis=0)
+    return np.tile(rows.sum(axis=0), (count, 1))
+
+
+def _bent(start: InitialColumns, state: AffineForms) -> Float[np.ndarray, "n_x n"]:
+    """What each state has of products of each of `n` coordinates."""
+    n, found = len(start.center), np.zeros((len(state), len(start.center)))
+    for number, pair in enumerate(zip(*start.pairs, strict=True)):
+        for place in pair:
+            found[:, place] += abs(state.columns[:, n + number])
+    return found
+
+
+def _shares(rows: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k n"]:
+    """The parts that rows have of their sums; none of zeros, or where nothing is known."""
+    sums = rows.sum(axis=1, keepdims=True)
+    known = (sums > 0) & (sums < np.inf)
+    return np.where(known, rows / np.where(known, sums, 1.0), 0.0)

@@ -9,7 +9,6 @@ until it is decided. Between its forms and its programs a smooth loop is halved 
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from collections import Counter
 from collections.abc import Sequence
@@ -70,9 +69,10 @@ from reachjax.verdicts.verdict import Verdict, VerdictStatus
 FIRST_PROGRAMS = 50
 """Linear programs that each bound may take at first, while ranges are those of affine forms."""
 
-FOR_CELLS = 0.5
+FOR_CELLS, FOR_CELLS_OF_FLOWS = 0.5, 0.9
 """The part of its time that a smooth loop's cells get, by forms; the rest is for programs over the
-whole set, which close what cells do not where much is switched and little is smooth."""
+whole set, which close what cells do not where much is switched and little is smooth. What a flow
+leaves out no program closes."""
 
 TO_CLOSE = 50
 """Linear programs that a bound may take from a set that shall be come back to: there are others."""
@@ -274,26 +274,32 @@ def _by_remedies(
     decision.at_first()
     on_host, begun, around = jax.device_get((loop, X0, boxed(X0, "X0")))
 
-    def climb(nodes: int) -> None:
+    def climb(nodes: int, cells_follow: bool = False) -> None:
         if not decision.ended:
             scenarios = Scenarios.of(on_host, begun, horizon, start)
             own = budget.with_work(np.inf if budget.timed else WORK)
             between = any(item.throughout for item in required)
             given = on_host, begun, around, scenarios, start, nodes, own
             ladder = Ladder(*given, between=between)
-            decision.climb(ladder, tighten=nodes > FIRST_PROGRAMS)
+            # a flow costs much where bounds are wide, and cells begin anew
+            ends = cells_follow and loop.plant.continuous
+            decision.climb(ladder, tighten=nodes > FIRST_PROGRAMS, to_first_open=ends)
 
     by_cells, most = None, 1
     if loop.curved:
         each = 2 * WAYS if loop.jumps else 2
         most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / each))
     if most > 1:
-        with contextlib.suppress(UnboundedError):  # of halves there may be bounds
-            climb(0)
+        programs_may_follow = relaxation.nodes > 0
+        try:
+            climb(0, cells_follow=True)
+        except UnboundedError:  # of halves there may be bounds; programs have nothing to begin with
+            programs_may_follow = False
         if decision.ended:
             return decision.verdict()
         task = CellTask(on_host, horizon, start, tuple(required), nodes=0)
-        share = budget.share(FOR_CELLS if relaxation.nodes else 1.0)
+        part = FOR_CELLS_OF_FLOWS if loop.plant.continuous else FOR_CELLS
+        share = budget.share(part if programs_may_follow else 1.0)
         parts = CellTree.whole(X0, most)
         by_cells = decided_by_cells(task, X0, parts, decision.simulations, share)
         if by_cells.status is not VerdictStatus.UNKNOWN or not relaxation.nodes:
@@ -382,12 +388,13 @@ class _Decision:
                 compared = item.compared_with(self._X0)
                 self._findings.prove(item, float(compared.margins.min()), item.proved(compared))
 
-    def climb(self, ladder: Ladder, tighten: bool) -> None:
+    def climb(self, ladder: Ladder, tighten: bool, to_first_open: bool = False) -> None:
         """Climb until all is decided, or nothing more can be.
 
         Args:
             ladder: at the initial set.
             tighten: whether the ranges of units are bounded by linear programs.
+            to_first_open: whether nothing later matters where a requirement is not proved.
         """
         last = max(time for _, time in self._findings.open)
         self._climbs.append(ClimbRecord())
@@ -401,7 +408,7 @@ class _Decision:
             for key, item in list(self._findings.open.items()):
                 if item.time == k and not self.ended:
                     self._decided(key, item, ladder)
-            if self.ended:
+            if self.ended or (to_first_open and any(time == k for _, time in self._findings.open)):
                 return
 
     def _decided(self, key: tuple[str, int], item: Requirement, ladder: Ladder) -> None:

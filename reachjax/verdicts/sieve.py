@@ -35,6 +35,13 @@ from reachjax.verdicts.specification import Requirement
 TOGETHER = 32
 """So many cells are a call: fewer are filled up, so that one shape is compiled."""
 
+PASSES = 7
+"""In numpy a period of a flow goes through its right-hand side so many times as often as it stands
+in compiled code: some forty times, for steps that are tried, enclosures and every coefficient."""
+
+MEASURED = 2
+"""So many periods of a flow say what all of them take."""
+
 SIFT = CompiledBeside(unrolled_from_boxes)
 
 Margins = dict[str, Float[np.ndarray, " h+1"]]
@@ -82,6 +89,7 @@ class Outcome(NamedTuple):
         margins: of those that were looked at; NaN of the others.
         refuted: whether one of them fails from every state of it.
         axis: along which it should be halved; -1 where nothing says that.
+        then: along which its halves should be before they are bounded; -1 if they should not.
         unbounded: the unit that has no bounds over it, if there is one.
         leaves: of requirements that forms alone do not prove.
         open: decisions that may go either way from it, as far as that was looked at.
@@ -94,6 +102,7 @@ class Outcome(NamedTuple):
     unbounded: Unbounded | None = None
     leaves: tuple[Leaves, ...] = ()
     open: tuple[OpenDecision, ...] = ()
+    then: int = -1
 
     @property
     def margin(self) -> float:
@@ -129,11 +138,13 @@ class Sieve:
         if self._of_subnormals or holds_subnormals(cells):
             return False
         steps = max(len(self._directions) - 1, 1)
+        passes = PASSES if self._loop.plant.continuous else 1
         return SIFT.pays(
             *self._given(cells),
             seconds=lambda: self._measured(cells[0]),
-            evaluations=TOGETHER * steps,
+            evaluations=TOGETHER * steps * passes,
             left=budget.left,
+            share=len(cells) / TOGETHER,
             t=self._start,
         )
 
@@ -148,10 +159,14 @@ class Sieve:
         try:
             between = self._whole is not None
             given = self._on_host, box, box, self._directions[1:], self._start
-            list(unrolled(*given, between=between))
+            steps = unrolled(*given, between=between)
+            if self._loop.plant.continuous:  # a flow costs about the same in each
+                steps = itertools.islice(steps, MEASURED)
+            count = len(list(steps))
         except UnboundedError:
             return None
-        return TOGETHER * (time.perf_counter() - began)
+        whole = (len(self._directions) - 1) / max(count, 1)
+        return TOGETHER * whole * (time.perf_counter() - began)
 
     def _given(self, cells: Sequence[Ends]) -> tuple[Any, ...]:
         """The arguments of the compiled call."""

@@ -105,6 +105,14 @@ def test_what_is_slower_than_numpy_or_cannot_be_measured_is_not_used():
     assert not found.pays(x, by=2.0, seconds=lambda: 1e-12, **given)
 
 
+def test_a_part_of_a_call_is_compared_with_what_that_part_takes():
+    found, x = beside(7)
+    given = {"seconds": lambda: 1.0, "evaluations": 3000, "left": np.inf}
+    assert found.pays(x, by=2.0, **given)
+    assert found.pays(x, by=2.0, share=0.5, **given)
+    assert not found.pays(x, by=2.0, share=1e-9, **given)
+
+
 @pytest.mark.costly
 def test_of_the_settings_of_the_suite_the_installed_xla_accepts_all_that_are_used():
     """XLA ends a process that names one which it no longer has."""

@@ -205,3 +205,19 @@ def test_trajectories_that_are_no_numbers_say_nothing():
         verdict = rj.decide(loop, X0, 2, goal=rj.Box([-1.0], [1.0]), cells=cells)
         assert verdict.status is rj.VerdictStatus.REFUTED
         assert np.nanmin(verdict.simulated["goal"]) == pytest.approx(1 - 2**0.25)
+
+
+def test_a_cell_is_halved_where_what_is_left_out_comes_from():
+    """Not where it is longest, nor where requirements point: a flow bends along one coordinate."""
+    plant = rj.SampledPlant(
+        lambda x, u: jnp.array([jnp.sin(3 * x[1]) - x[0], -x[1] + 0 * u[0]]), 2, 1, period=0.3
+    )
+    loop = rj.ClosedLoop(plant, rj.Network(lambda x: -x[:1], 2, 1))
+    wide = rj.Box([-2.0, -0.7], [2.0, 0.7])
+    last = np.asarray(loop.simulate(wide.sample(jax.random.key(0), 4000), 2))[:, -1]
+    goal = rj.Box(last.min(axis=0) - 0.02, last.max(axis=0) + 0.02)
+    verdict = rj.decide(loop, wide, 2, goal=goal, cells=2)
+    first, second = verdict.cells
+    assert verdict.status is rj.VerdictStatus.UNKNOWN
+    assert {float(first.upper[1]), float(second.upper[1])} == {0.0, 0.7}
+    assert first.lower[0] == second.lower[0] == -2.0

@@ -86,7 +86,7 @@ class ClockedFlow(AbstractFlow):
     def followed(self, given: list[TaylorModels], box: Ball, between: bool = False) -> Flowed:
         """What Taylor models lead to; the symbol of the clock is put behind those of states."""
         x, *others = given
-        n, (initial, curved, radii) = self.states, x.symbols
+        n, (initial, curved, radii, _) = self.states, x.symbols
         xp, place = namespace(x.rows), 1 + x.symbols.own + n
         error = xp.asarray(self._error)[None]
         symbols = Symbols(initial, curved, xp.concatenate([radii[:n], error, radii[n:]]))

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -383,9 +384,15 @@ def _convolved(ones: Any, others: Any, k: Any, slope: bool = False, known: bool 
     pairs = [(ones[j], others[k - j]) for j in range(first, k + 1)]
     if len(pairs) == 1:
         return product(*pairs[0])
-    weights = np.arange(1, k + 1) / k if slope else np.ones(len(pairs))
-    matrix = np.kron(weights, np.eye(size(pairs[0][0])))
+    matrix = _summing(len(pairs), size(pairs[0][0]), slope)
     return matrix @ product(*(joined([*part]) for part in zip(*pairs, strict=True)))
+
+
+@lru_cache(maxsize=256)
+def _summing(count: int, size: int, slope: bool) -> np.ndarray:
+    """The matrix of a sum of so many vectors, those of a slope by their places."""
+    weights = np.arange(1, count + 1) / count if slope else np.ones(count)
+    return np.kron(weights, np.eye(size))
 
 
 def _slope(unit: AbstractUnit, y: Any) -> Any:

@@ -160,16 +160,16 @@ def flowed(
     within: Any = 0.0
     while todo:
         part = todo.pop()
-        h = settings.period * part
+        h, halves = settings.period * part, count < MOST and part / 2 >= SHORTEST
         here, given = _refreshed(state, others)
         # a signal may have taken states away from where its mean has
         X = here.widened(within).ball if done else here.ball.meeting(box)
         boxes = [each.ball for each in given]
         if is_counted():
-            piece, holds = _enclosed(tape, X, boxes, h, part, settings, between)
+            piece, holds = _enclosed(tape, X, boxes, h, part, settings, between, halves)
         else:
             piece, holds = _sketched(X, settings.order), True
-        if piece is None or (piece.excess > 1 and count < MOST and part / 2 >= SHORTEST):
+        if piece is None or (piece.excess > 1 and halves):
             todo, count = [*todo, part / 2, part / 2], count + 1
             continue
         proved = proved & holds
@@ -214,27 +214,39 @@ def _refreshed(
     """A state with a new symbol each for all of it that is not of the initial set.
 
     Returns:
-        The state, and the other arguments, of these symbols.
+        The state, and the other arguments, of these symbols and of higher products.
     """
-    xp, n, (initial, curved, radii) = namespace(state.rows), len(state), state.symbols
+    xp, n, (initial, curved, radii, _) = namespace(state.rows), len(state), state.symbols
     first = 1 + state.symbols.own
     own = abs(state.rows[:, first:]) @ radii * (1 + gamma(len(radii))) + state.radii
-    symbols = Symbols(initial, curved, xp.concatenate([own * (1 + gamma(2)), radii[n:]]))
-    eye = xp.eye(n, len(radii))
-    rows = xp.concatenate([state.rows[:, :first], eye], axis=1)
-    here = TaylorModels(rows, xp.zeros_like(state.radii), symbols)
-    return here, [TaylorModels(each.rows, each.radii, symbols) for each in others]
+    own = xp.concatenate([own * (1 + gamma(2)), radii[n:]])
+    symbols = Symbols(initial, curved, own).with_higher
+
+    def filled(rows: Any, radii: Any) -> TaylorModels:
+        more = 1 + symbols.count - rows.shape[1]
+        rows = xp.concatenate([rows, xp.zeros((len(rows), more))], axis=1)
+        return TaylorModels(rows, radii, symbols)
+
+    rows = xp.concatenate([state.rows[:, :first], xp.eye(n, len(radii))], axis=1)
+    here = filled(rows, xp.zeros_like(state.radii))
+    return here, [filled(each.rows, each.radii) for each in others]
 
 
 def _composed(found: TaylorModels, state: TaylorModels) -> TaylorModels:
-    """What was found of a state's new symbols, of the state's own ones."""
+    """What was found of a state's new symbols, of the state's own ones.
+
+    Higher products are worth what they can be.
+    """
     xp, n, symbols = namespace(found.rows), len(state), state.symbols
-    first = 1 + symbols.own
+    first, higher = 1 + symbols.own, found.symbols.higher
+    last = first + len(symbols.radii)
     slope, own = found.rows[:, first : first + n], state.rows[:, first:]
-    more = xp.concatenate([xp.zeros((len(found), n)), found.rows[:, first + n :]], axis=1)
+    more = xp.concatenate([xp.zeros((len(found), n)), found.rows[:, first + n : last]], axis=1)
     rows = xp.concatenate([found.rows[:, :first], slope @ own + more], axis=1)
     sizes = (abs(slope) @ abs(own) + abs(more)) @ symbols.radii
     radii = found.radii + abs(slope) @ state.radii * (1 + gamma(n)) + gamma(2 * n + 8) * sizes
+    if higher is not None:
+        radii = radii + abs(found.rows[:, last:]) @ higher * (1 + gamma(len(higher)))
     return TaylorModels(rows, radii * (1 + gamma(4)), symbols)
 
 
@@ -246,6 +258,7 @@ def _enclosed(
     part: float,
     settings: Settings,
     between: bool,
+    halves: bool,
 ) -> tuple[_Piece | None, Any]:
     """A step with its enclosure, and whether that is proved; None of one that has to be halved.
 
@@ -263,7 +276,7 @@ def _enclosed(
                 raise _escaped(X, B)
             return None, proved
         whole = 1 / part if between else None
-        return _remainder(tape, X, B, others, h, settings.order, whole), proved
+        return _remainder(tape, X, B, others, h, settings.order, whole, halves), proved
     except UnboundedError:
         if shortest:
             raise
@@ -278,6 +291,7 @@ def _remainder(
     h: Any,
     order: int | None,
     whole: float | None = None,
+    halves: bool = False,
 ) -> _Piece:
     """A step of the order that was asked for, or of the lowest whose remainder is small enough.
 
@@ -294,28 +308,33 @@ def _remainder(
         h: how long the step is.
         order: of the polynomials; None to choose it.
         whole: how many such steps a period is, if control points are asked for.
+        halves: whether a step that is too long is halved, so that nothing else is of use.
     """
-    chosen, least, on_host = order or ORDER, 0.0, namespace(X.mid) is np
-    rate = h * Series.value(tape, [X, *others]) if on_host else X
-    if order is None and on_host:
-        solution, terms = Solution(tape, B, others, h), list[Ball]()
-        chosen, least = 0, np.inf
-        for k in range(HIGHEST + 1):
-            terms.append(solution.advance())
-            excess = _excess(terms[k], rate, X)
-            if k and excess < least:
-                chosen, least = k, excess
-            if least <= 1 or (k > 4 and excess > 4 * least):
-                break
-        while len(terms) <= max(chosen, 3):
-            terms.append(solution.advance())
-    else:
+    chosen, between, on_host = order or ORDER, 0.0, namespace(X.mid) is np
+    if not on_host:
         terms = solved(tape, B, others, h, max(chosen, 3) + 1)
+        return _Piece(B, constant_ball(terms[chosen]), _size(terms[3]), chosen, 0.0)
+    rate, solution = h * Series.value(tape, [X, *others]), Solution(tape, B, others, h)
+    terms = [solution.advance() for _ in range(4)]
     second, fourth = (_size(terms[k]) for k in (1, 3))
-    if whole is not None and on_host:
+    if whole is not None:
         moved = IN_BETWEEN * (X.rad + whole * (_size(rate) + second))
-        least = max(least, _over(second / 12 + fourth / 16, moved))
-    return _Piece(B, constant_ball(terms[chosen]), fourth, chosen, least)
+        between = _over(second / 12 + fourth / 16, moved)
+    excess = list[float]()
+    for k in range(HIGHEST + 1 if order is None else 0):
+        if k == len(terms):
+            if halves and between > 1:
+                break
+            terms.append(solution.advance())
+        excess.append(_excess(terms[k], rate, X) if k else np.inf)
+        if min(excess) <= 1 or (k > 4 and excess[k] > 4 * min(excess)):
+            break
+    least = 0.0
+    if order is None:
+        chosen, least = int(np.argmin(excess)), min(excess)
+    while len(terms) <= chosen:
+        terms.append(solution.advance())
+    return _Piece(B, constant_ball(terms[chosen]), fourth, chosen, max(least, between))
 
 
 def _excess(remainder: Ball, rate: Ball, X: Ball) -> float:

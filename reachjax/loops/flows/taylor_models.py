@@ -7,6 +7,10 @@ that there is to a state, an input or a disturbance. Each number is
     c + g . w + q . (products of w) + l . r  up to a radius,    |w_i| <= 1,  |r_i| <= radii_i,
 
 and a product of two leaves out all that is of degree three in `w`, or of degree two with an `r`.
+On the host more products are symbols within a step of a flow: of three `w`, and of two of all `w`
+and `r` (`higher`). What they are worth is found at its end, where most of it has cancelled of what
+each operation alone would leave out. Products of `w` are those of Chebyshev polynomials, so that
+none exceeds one: `T_2(w_i) w_j`, `T_3(w_i) = 4 w_i^3 - 3 w_i`.
 
 Since symbols are few, what is computed with them does not grow with the columns of a horizon; the
 `l` are the derivatives by which these are carried on (`programs.flows`).
@@ -14,6 +18,8 @@ Since symbols are few, what is computed with them does not grow with the columns
 
 from __future__ import annotations
 
+import itertools
+import math
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, cast
 
@@ -54,6 +60,37 @@ def _packing(n: int) -> np.ndarray:
     return found
 
 
+@lru_cache(maxsize=64)
+def _mixed(n: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of `n + count` numbers the pairs that are not of the first `n` alone, and their weights."""
+    i, j = np.triu_indices(n + count)
+    i, j = i[j >= n], j[j >= n]
+    return i, j, np.where(i == j, 0.5, 1.0)
+
+
+@lru_cache(maxsize=64)
+def _cubic(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """How a linear form `g` and products `q` of two make products of three of `n` numbers.
+
+    Returns:
+        Which `g_i` and `q_jk` make up each product of three, at most three of these pairs, and
+        their weights; and which `q_ij` stands at each `(i, j)`.
+    """
+    i, j = _pairs(n)
+    place = np.zeros((n, n), int)
+    place[i, j] = place[j, i] = np.arange(len(i))
+    linear, pairs, weights = (list[list[float]]() for _ in range(3))
+    for a, b, c in itertools.combinations_with_replacement(range(n), 3):
+        ways = dict.fromkeys([(a, (b, c)), (b, (a, c)), (c, (a, b))])
+        worth = [1.0 if one not in two else 0.5 for one, two in ways]
+        rest = [0] * (3 - len(ways))
+        linear.append([*(one for one, _ in ways), *rest])
+        pairs.append([*(place[two] for _, two in ways), *rest])
+        weights.append([*worth, *rest])
+    shaped = (np.reshape(each, (-1, 3)).T for each in (linear, pairs))
+    return (*(each.astype(int) for each in shaped), np.reshape(weights, (-1, 3)).T, place)
+
+
 class Symbols(NamedTuple):
     """What polynomials are of.
 
@@ -61,11 +98,34 @@ class Symbols(NamedTuple):
         initial: how many `w` there are.
         curved: whether products of them are symbols too.
         radii: `(K,)`, of the `r`.
+        higher: `(M,)`, bounds of products of three `w`, then of those of two with an `r`, where
+            these are symbols, the last ones.
     """
 
     initial: int
     curved: bool
     radii: Float[Array | np.ndarray, " K"]
+    higher: Float[Array | np.ndarray, " M"] | None = None
+
+    @property
+    def with_higher(self) -> Symbols:
+        """The symbols, and higher products where those of two `w` are symbols; in numpy."""
+        if not self.curved or namespace(self.radii) is not np:
+            return self
+        i, j, _ = _mixed(self.initial, len(self.radii))
+        sizes = np.concatenate([np.ones(self.initial), self.radii])
+        mixed = sizes[i] * sizes[j] * (1 + gamma(2)) + TINY
+        return self._replace(higher=np.concatenate([np.ones(self.cubic), mixed]))
+
+    @property
+    def cubic(self) -> int:
+        """How many products of three `w` there are."""
+        return math.comb(self.initial + 2, 3)
+
+    @property
+    def count(self) -> int:
+        """How many there are in all."""
+        return self.own + len(self.radii) + (0 if self.higher is None else len(self.higher))
 
     @property
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +142,7 @@ class TaylorModels(AbstractNumber):
     """A vector of such numbers.
 
     Attributes:
-        rows: `(k, 1 + count + K)`, the constants, and coefficients of all symbols.
+        rows: `(k, 1 + count)`, the constants, and coefficients of all symbols.
         radii: `(k,)`, by how much numbers may be off, rounding included.
         symbols: what they are of.
     """
@@ -102,17 +162,15 @@ class TaylorModels(AbstractNumber):
         return TaylorModels(rows, (radii + constant(rounding)) * (1 + gamma(8)), self.symbols)
 
     @cached_property
-    def _parts(self) -> tuple[Any, Any, Any]:
-        """Sizes of what is linear in `w`, of products of `w`, and of what is of other symbols."""
-        n, count = self.symbols.initial, self.symbols.own
-        sizes = abs(self.rows[:, 1:])
-        error = 1 + gamma(self.rows.shape[1])
-        others = sizes[:, count:] @ self.symbols.radii
-        return (
-            sizes[:, :n].sum(axis=1) * error,
-            sizes[:, n:count].sum(axis=1) * error,
-            others * error,
-        )
+    def _parts(self) -> tuple[Any, ...]:
+        """Sizes of what is linear in `w`, of products of two, of `r`, and of higher products."""
+        n, count, symbols = self.symbols.initial, self.symbols.own, self.symbols
+        sizes, last = abs(self.rows[:, 1:]), count + len(symbols.radii)
+        parts = [sizes[:, :n].sum(axis=1), sizes[:, n:count].sum(axis=1)]
+        parts.append(sizes[:, count:last] @ symbols.radii)
+        if symbols.higher is not None:
+            parts.append(sizes[:, last:] @ symbols.higher)
+        return tuple(part * (1 + gamma(self.rows.shape[1])) for part in parts)
 
     @cached_property
     def _size(self) -> Any:
@@ -179,24 +237,30 @@ class TaylorModels(AbstractNumber):
         return self._with(factor[:, None] * self.rows, abs(factor) * self.radii, lost)
 
     def times(self, other: TaylorModels) -> TaylorModels:
-        """Products, entry by entry, without what is of degree three."""
+        """Products, entry by entry, without what is of a degree that there are no symbols for."""
         xp, symbols = namespace(self.rows, other.rows), self.symbols
         n, count = symbols.initial, symbols.own
         a, b = self.rows, other.rows
         center, another = a[:, :1], b[:, :1]
         rows = center * b + another * a
-        (one, two, three), (one_, two_, three_) = self._parts, other._parts
-        whole, whole_ = one + two + three, one_ + two_ + three_
+        (one, two, three, *_), (_, two_, three_, *_) = self._parts, other._parts
+        whole, whole_ = sum(self._parts), sum(other._parts)
+        constants, linear, rest = center * another, rows[:, 1 : 1 + n], [rows[:, 1 + count :]]
+        products, left = rows[:, 1 + n : 1 + count], whole * whole_
         if symbols.curved:
             g, h = a[:, 1 : 1 + n], b[:, 1 : 1 + n]
-            products = (g[:, :, None] * h[:, None, :]).reshape(len(g), n * n) @ _packing(n)
-            parts = [center * another + SQUARE * (g * h).sum(axis=1, keepdims=True)]
-            parts += [rows[:, 1 : 1 + n], rows[:, 1 + n : 1 + count] + products]
+            squares = (g[:, :, None] * h[:, None, :]).reshape(len(g), n * n) @ _packing(n)
+            constants = constants + SQUARE * (g * h).sum(axis=1, keepdims=True)
+            products = products + squares
             left = one * (two_ + three_) + (two + three) * whole_
-        else:
-            parts = [center * another, rows[:, 1 : 1 + count]]
-            left = whole * whole_
-        rows = xp.concatenate([*parts, rows[:, 1 + count :]], axis=1)
+        if symbols.higher is not None:
+            more, higher = _higher(a, b, symbols)
+            last = len(symbols.radii)
+            linear, rest = linear + more, [rest[0][:, :last], rest[0][:, last:] + higher]
+            high, high_ = self._parts[3], other._parts[3]
+            left = (one + three) * high_ + three * two_ + two * (two_ + three_ + high_)
+            left = left + high * whole_
+        rows = xp.concatenate([constants, linear, products, *rest], axis=1)
         size, size_ = abs(center[:, 0]) + whole, abs(another[:, 0]) + whole_
         radii = left + self.radii * (size_ + other.radii) + other.radii * size
         lost = errors(lambda: gamma(rows.shape[1] + 4) * size * size_ + 8 * TINY)
@@ -228,6 +292,29 @@ class TaylorModels(AbstractNumber):
         """The values of units that are not smooth, where no input reaches a bend."""
         slope, offset = straight(unit, lower, upper)
         return slope * self + offset
+
+
+def _higher(a: np.ndarray, b: np.ndarray, symbols: Symbols) -> tuple[np.ndarray, np.ndarray]:
+    """What products of rows have of the `w`, and of higher products, by those of lower degrees.
+
+    As `w_i T_2(w_i)` is `(w_i + T_3(w_i)) / 2` and `w_i^2` is `(1 + T_2(w_i)) / 2`.
+    """
+    n, count = symbols.initial, symbols.own
+    first, second, own = slice(1, 1 + n), slice(1 + n, 1 + count), len(symbols.radii)
+    linear, pairs, weights, place = _cubic(n)
+    cubic, more = np.zeros((len(a), symbols.cubic)), np.zeros((len(a), n))
+    for one, other in ((a, b), (b, a)):
+        g, q = one[:, first], other[:, second]
+        for i, jk, weight in zip(linear, pairs, weights, strict=True):
+            cubic += g[:, i] * q[:, jk] * weight
+        more += 0.5 * (g[:, :, None] * q[:, place]).sum(axis=1)
+    i, j, weights = _mixed(n, own)
+    g, h = (
+        np.concatenate([row[:, first], row[:, 1 + count : 1 + count + own]], axis=1)
+        for row in (a, b)
+    )
+    mixed = (g[:, i] * h[:, j] + g[:, j] * h[:, i]) * weights
+    return more, np.concatenate([cubic, mixed], axis=1)
 
 
 def straight(unit: AbstractUnit, lower: Any, upper: Any) -> tuple[Any, Any]:

@@ -43,6 +43,17 @@ def sound_offsets(
     return _proved_of_each(program, multipliers, goals, interval_offsets(program))
 
 
+def proved_offsets(
+    program: Program, multipliers: Float[np.ndarray, "f K"]
+) -> Float[np.ndarray, " f"]:
+    """The offsets `(f,)` that multipliers prove, or interval arithmetic where it proves less.
+
+    Raises:
+        ValueError: the multipliers have another shape, or contain NaN or infinity.
+    """
+    return np.fmin(sound_offsets(program, multipliers), interval_offsets(program))
+
+
 def interval_offsets(program: Program) -> np.ndarray:
     """Offsets `(f,)` by interval arithmetic alone: `|eta_i| <= 1` in the objective rows."""
     p = program.objective

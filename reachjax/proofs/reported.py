@@ -17,7 +17,7 @@ from reachjax.numerics.rounding import gamma
 from reachjax.programs.lmi import Program, form_rows
 from reachjax.programs.presolve import LEAST_WIDTH, NormalProgram, presolved
 from reachjax.proofs.proposal import ANSWERS, Proposal
-from reachjax.proofs.recheck import interval_offsets, sound_level, sound_offsets
+from reachjax.proofs.recheck import interval_offsets, proved_offsets, sound_level
 from reachjax.sets import NormalForm
 
 SHORTFALL = 1e-3
@@ -66,7 +66,7 @@ class Sized(NamedTuple):
 
 
 def judged_offsets(program: Program, proposal: Proposal) -> Judged:
-    """The rechecked offsets, never below what the relaxation itself gives.
+    """The rechecked offsets, not below what the relaxation itself gives.
 
     The derivative is the program's where multipliers and moments bear the claim out, whatever the
     solver calls it: that is what is held. Elsewhere it is that of what is proved (`gradients`).
@@ -77,16 +77,15 @@ def judged_offsets(program: Program, proposal: Proposal) -> Judged:
     """
     by_intervals = interval_offsets(program)
     multipliers = np.asarray(proposal.multipliers)
-    offsets = np.fmin(sound_offsets(program, multipliers), by_intervals)
+    offsets = proved_offsets(program, multipliers)
     claims = np.asarray(proposal.unknowns)[:, 0]
     size = by_intervals - np.asarray(program.objective.mid)[:, -1]
     slack = SHORTFALL * size + ROUNDING * (abs(by_intervals) + size)
     proved = offsets <= claims + slack  # False where the claim is NaN
     borne_out = proved & np.isfinite(claims) & (_attained(program, proposal) >= claims - slack)
     optimal = np.isin(proposal.statuses, ANSWERS) & borne_out
-    return Judged(
-        np.where(optimal, np.fmax(offsets, claims), offsets), optimal, borne_out, proposal
-    )
+    value = np.where(optimal, np.fmin(np.fmax(offsets, claims), by_intervals), offsets)
+    return Judged(value, optimal, borne_out, proposal)
 
 
 def _attained(program: Program, proposal: Proposal) -> Float[np.ndarray, " f"]:

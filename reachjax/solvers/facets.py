@@ -18,7 +18,7 @@ from reachjax.programs.relaxations import Products
 from reachjax.proofs.by_products import Certificate
 from reachjax.proofs.gradients import held_offsets
 from reachjax.proofs.proposal import Proposal, SolverStatus
-from reachjax.proofs.recheck import clipped, interval_offsets, sound_offsets
+from reachjax.proofs.recheck import clipped, interval_offsets, proved_offsets, sound_offsets
 from reachjax.proofs.reported import Judged, judged_offsets
 from reachjax.sets import Polytope
 from reachjax.solvers.base import AbstractSolver, proposed
@@ -146,8 +146,7 @@ class Facets(AbstractGoal):
         judged = jax.tree.map(lambda *parts: np.concatenate(parts), *own)
         # proved with all products, which are in another order and so round otherwise
         whole = program.replace(products=products)
-        proved = sound_offsets(whole, judged.proposal.multipliers)
-        again = np.fmin(proved, interval_offsets(whole))
+        again = proved_offsets(whole, judged.proposal.multipliers)
         return products, judged._replace(value=np.fmax(judged.value, again))
 
     def slopes(

@@ -221,7 +221,7 @@ class AffineForms(AbstractMethod):
             shaped, facets = problem.facets.at(k), len(problem.facets)
             proof = LinearCertificate(
                 loop=loop,
-                X0=X0,
+                X0=held,
                 directions=shaped.directions,
                 slopes=step.slopes,
                 corners=step.corners,

@@ -24,7 +24,7 @@ class LinearCertificate(AbstractProof):
 
     Attributes:
         loop: the closed loop.
-        X0: the initial set.
+        X0: the initial set, or one around it that forms are bounded over without programs.
         directions: `(f, n_x)`, of the facets.
         slopes: `(k, units)`, of the units at each time before.
         corners: `(f, n_x)`, initial states at which the forms are largest.

@@ -135,8 +135,10 @@ class Repeat:
             raise ValueError(f"it is of step {proof.k} from t = {proof.start}")
         if isinstance(proof, LinearCertificate):
             *_, last = (p for p in tube.certificates if isinstance(p, LinearCertificate))
-            slopes = np.asarray(last.slopes)
-            (found,) = self._by_forms(k, ("slopes", last.k), [(tube.sets[0], self._box)], slopes)
+            slopes, (cut, _) = np.asarray(last.slopes), proof.X0.parts
+            if cut is None or not cut.needs_programs:  # as where they would have taken too long
+                own["X0"] = own["X0"].closed_form(self._box)
+            (found,) = self._by_forms(k, ("slopes", last.k), [(own["X0"], self._box)], slopes)
             return proof.replace(**own, slopes=jax.device_put(slopes[:k])), found
         if isinstance(proof, CellCertificate):
             return self._by_cells(k, proof.replace(**own))

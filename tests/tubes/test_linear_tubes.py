@@ -118,3 +118,20 @@ def test_a_step_and_a_bar():
     assert proof.k == 1
     with pytest.raises(ValueError, match="progress must pass on each of the 5 steps"):
         tube_of(loop, X0, template, progress=lambda steps: steps[:3])
+
+
+def test_what_was_proved_without_programs_is_proved_anew_without_them(tmp_path):
+    plant = rj.NonlinearPlant(lambda x, u: x + 0.3 * jnp.arctan(3 * x[::-1]) + u, 2, 2)
+    loop = rj.ClosedLoop(plant, rj.Network(lambda x: -0.4 * jnp.tanh(x), 2, 2))
+    corner = rj.Polytope([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1]], [0.8, 0.6, 0.9, 0.5, 0.7])
+    given = loop, corner, 3, rj.Template.box(2)
+    loose, tight = (rj.reach(*given, rj.LinearBounds(programs=each)) for each in (False, True))
+    assert np.any(loose.proof(3).bounds > tight.proof(3).bounds + 1e-3)
+    for name, tube in (("loose", loose), ("tight", tight)):
+        path = tmp_path / f"{name}.npz"
+        tube.save(path)
+        again = rj.load(path, loop=loop, recheck=True)
+        for k in range(1, 4):
+            proof = tube.proof(k)
+            np.testing.assert_array_equal(proof.recheck(), proof.bounds)
+            np.testing.assert_allclose(again.proof(k).recheck(), proof.bounds, rtol=1e-12)

@@ -370,8 +370,9 @@ def _rebuilt(named: tuple[Any, ...], *values: Any) -> Any:
     if not hasattr(kind, "__dataclass_fields__"):
         raise ValueError(f"it names {kind.__qualname__}, which has no fields")
     known = dataclasses.fields(kind)
-    later = {f.name: f.default for f in known if f.default is not dataclasses.MISSING}
-    fields = later | dict(zip(names, values, strict=True))
+    plain = {f.name: f.default for f in known if f.default is not dataclasses.MISSING}
+    made = {f.name: f.default_factory() for f in known if callable(f.default_factory)}
+    fields = plain | made | dict(zip(names, values, strict=True))
     if differ := {f.name for f in known} ^ set(fields):
         raise ValueError(
             f"its {kind.__qualname__} has other fields than this version's: {sorted(differ)}"

@@ -139,8 +139,9 @@ class _Compiled:
 
     def faster(self, share: float) -> bool:
         """Whether it is there, and takes less than a part of it takes in numpy."""
-        known = self.call is not None and self.seconds is not None
-        return known and self.takes < share * self.seconds
+        if self.call is None or self.seconds is None:
+            return False
+        return self.takes < share * self.seconds
 
 
 def keep_compilations(folder: str | os.PathLike[str] | None = None) -> Path:

@@ -231,7 +231,7 @@ def _axes(ladder: Ladder, item: Requirement, early: bool = False) -> tuple[int, 
 
 def _moved(layer: UnitForms, n: int) -> Float[np.ndarray, "k n"]:
     """How far each of `n` coordinates moves the inputs of units; of all, where they share these."""
-    rows, count = abs(layer.inputs.columns[:, :n]), len(layer.places)
+    rows, count = abs(np.asarray(layer.inputs.columns)[:, :n]), len(layer.places)
     if count and len(rows) % count == 0:
         return rows.reshape(-1, count, n).sum(axis=0)
     return np.tile(rows.sum(axis=0), (count, 1))

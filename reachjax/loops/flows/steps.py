@@ -223,7 +223,7 @@ def _refreshed(
     symbols = Symbols(initial, curved, own).with_higher
 
     def filled(rows: Any, radii: Any) -> TaylorModels:
-        more = 1 + symbols.count - rows.shape[1]
+        more = 1 + symbols.total - rows.shape[1]
         rows = xp.concatenate([rows, xp.zeros((len(rows), more))], axis=1)
         return TaylorModels(rows, radii, symbols)
 

@@ -87,8 +87,8 @@ def _cubic(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         linear.append([*(one for one, _ in ways), *rest])
         pairs.append([*(place[two] for _, two in ways), *rest])
         weights.append([*worth, *rest])
-    shaped = (np.reshape(each, (-1, 3)).T for each in (linear, pairs))
-    return (*(each.astype(int) for each in shaped), np.reshape(weights, (-1, 3)).T, place)
+    of_linear, of_pairs = (np.reshape(each, (-1, 3)).T.astype(int) for each in (linear, pairs))
+    return of_linear, of_pairs, np.reshape(np.array(weights), (-1, 3)).T, place
 
 
 class Symbols(NamedTuple):
@@ -123,8 +123,8 @@ class Symbols(NamedTuple):
         return math.comb(self.initial + 2, 3)
 
     @property
-    def count(self) -> int:
-        """How many there are in all."""
+    def total(self) -> int:
+        """How many there are."""
         return self.own + len(self.radii) + (0 if self.higher is None else len(self.higher))
 
     @property
@@ -142,7 +142,7 @@ class TaylorModels(AbstractNumber):
     """A vector of such numbers.
 
     Attributes:
-        rows: `(k, 1 + count)`, the constants, and coefficients of all symbols.
+        rows: `(k, 1 + total)`, the constants, and coefficients of all symbols.
         radii: `(k,)`, by how much numbers may be off, rounding included.
         symbols: what they are of.
     """

@@ -51,7 +51,7 @@ def test_products_hold_at_every_point(initial, count):
     rng = np.random.default_rng(initial)
     symbols = Symbols(initial, True, rng.uniform(size=count)).with_higher
     for _ in range(5):
-        A, B = rng.normal(size=(2, 4, 1 + symbols.count)) * rng.uniform(size=(2, 1, 1))
+        A, B = rng.normal(size=(2, 4, 1 + symbols.total)) * rng.uniform(size=(2, 1, 1))
         one, other = (TaylorModels(rows, rng.uniform(size=4) / 10, symbols) for rows in (A, B))
         found = one.times(other)
         for at in points(rng, symbols, 100):
@@ -70,7 +70,7 @@ def test_products_leave_nothing_out_that_there_are_symbols_for(initial, count):
     rng = np.random.default_rng(count)
     symbols = Symbols(initial, True, rng.uniform(size=count)).with_higher
     own, linear = 1 + symbols.own, 1 + symbols.own + count
-    A, B, C, D = rng.normal(size=(4, 3, 1 + symbols.count))
+    A, B, C, D = rng.normal(size=(4, 3, 1 + symbols.total))
     for rows in (A, B):
         rows[:, 1 + initial : own] = rows[:, linear:] = 0.0
     C[:, 1 + initial :] = D[:, own:] = 0.0

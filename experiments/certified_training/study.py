@@ -3,8 +3,9 @@
 Networks imitate a law and break what is asked, or come close to it. Each is trained on in four ways
 by `rj.train`, for equally many seconds with compilation: by imitation alone, with a penalty on
 simulated trajectories, on affine forms over sixteen cells, and on these from coarse to fine after
-simulations. A run that is proved ends. All are judged alike: imitation error on held-out samples,
-the verdict of `decide`, and how many cells and seconds that takes.
+simulations. A run that is proved goes on as long as that lowers its loss. All are judged alike:
+imitation error on held-out samples, the verdict of `decide`, and how many cells and seconds that
+takes.
 """
 
 import time

@@ -371,7 +371,9 @@ def _rebuilt(named: tuple[Any, ...], *values: Any) -> Any:
         raise ValueError(f"it names {kind.__qualname__}, which has no fields")
     known = dataclasses.fields(kind)
     plain = {f.name: f.default for f in known if f.default is not dataclasses.MISSING}
-    made = {f.name: f.default_factory() for f in known if callable(f.default_factory)}
+    made = {
+        f.name: f.default_factory() for f in known if f.default_factory is not dataclasses.MISSING
+    }
     fields = plain | made | dict(zip(names, values, strict=True))
     if differ := {f.name for f in known} ^ set(fields):
         raise ValueError(

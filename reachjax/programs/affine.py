@@ -284,7 +284,7 @@ def joined(parts: Sequence[AffineForms]) -> AffineForms:
 
 
 def folded(parts: Any, count: int) -> Any:
-    """Sums of so many parts of equal length that stand one behind the other."""
+    """Sums of so many blocks of rows of equal length; `numbers.summed` has the last axis."""
     if count == 1:
         return parts
     return parts.reshape(count, len(parts) // count, *parts.shape[1:]).sum(axis=0)

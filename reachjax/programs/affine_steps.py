@@ -6,9 +6,10 @@ the initial state and `|g w| <= S`, `|h| <= R` for what else there is,
     f(y) = p + s d + q (g w)^2 + e v,    |v| <= 1,    e = (error of the model) + |q| (2 S R + R^2),
 
 and `(g w)^2` is a row over products of the `w`, which are columns too (`initial`). Where `h` is so
-large that lines leave less out, it is these. What the units of a smooth part leave out, that is of
-the controller or of the plant, is summed up at its outputs, one column for each: a step adds as
-many columns for ten neurons as for a thousand. They stay columns, which the feedback contracts.
+large that lines leave less out, it is these. What the units of a smooth part leave out, or of any
+part where columns shall be few, that is of the controller or of the plant, is summed up at its
+outputs, one column for each: a step adds as many columns for ten neurons as for a thousand. They
+stay columns, which the feedback contracts.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class UnitForms(NamedTuple):
 
 
 class PartColumns(NamedTuple):
-    """What the units of a smooth part of a step leave out, as one column for each of its outputs.
+    """What the units of a part of a step leave out, as one column for each of its outputs.
 
     Attributes:
         outputs: forms of the outputs.

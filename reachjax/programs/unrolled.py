@@ -177,7 +177,7 @@ COLUMNS, MEMORY = 96, 12
 more: old ones are merged."""
 
 
-def columns_kept(loop: ClosedLoop) -> int:
+def _columns_kept(loop: ClosedLoop) -> int:
     """How many columns of earlier steps are kept where many cells are bounded."""
     return max(COLUMNS, MEMORY * step_columns(loop)[0])
 
@@ -266,7 +266,7 @@ def unrolled_from_boxes(
         t: the time of the boxes.
         columns: as of `unrolled_at_once`; None for as many as a dozen steps add.
     """
-    most = columns or columns_kept(loop)
+    most = columns or _columns_kept(loop)
 
     def one(lower: Float[Array, " n_x"], upper: Float[Array, " n_x"]) -> Float[Array, "N m"]:
         box = Box(lower, upper)

@@ -66,7 +66,7 @@ class Sized(NamedTuple):
 
 
 def judged_offsets(program: Program, proposal: Proposal) -> Judged:
-    """The rechecked offsets, not below what the relaxation itself gives.
+    """The rechecked offsets, raised to the relaxation's optimum, never above interval arithmetic.
 
     The derivative is the program's where multipliers and moments bear the claim out, whatever the
     solver calls it: that is what is held. Elsewhere it is that of what is proved (`gradients`).

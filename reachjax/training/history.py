@@ -24,7 +24,7 @@ class Epoch(NamedTuple):
         skipped: how many of these had no finite gradient.
         task: the mean of the task's loss.
         penalty: the mean of the objective.
-        status: of the verdict after the epoch.
+        status: of the verdict on the controller that is kept after the epoch.
         margin: the smallest certified margin; minus infinity where none is known.
         cells: how many the decision looked at.
         proved: how many of these are proved.

@@ -27,7 +27,7 @@ from reachjax.verdicts.specification import Requirement
 BETWEEN = 4
 """So many states of a period are simulated where requirements hold at all times."""
 
-COLUMNS = 16
+COLUMNS_IN_TRAINING = 16
 """Forms keep so many columns of earlier steps, or four a state where these are more."""
 
 
@@ -135,7 +135,7 @@ class Certified(Replaceable):
             else:
                 outside.setdefault(ends, np.zeros((steps + 1, 1), bool))[each.item.time] = True
         between = bool(whole.any())
-        kept = {"counted": False, "columns": COLUMNS}
+        kept = {"counted": False, "columns": COLUMNS_IN_TRAINING}
 
         def of_cell(lower: Array, upper: Array) -> Array:
             box, later = Box(lower, upper), jnp.asarray(directions[1:])

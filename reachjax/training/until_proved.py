@@ -1,4 +1,4 @@
-"""Training that ends when the controller is proved.
+"""Training until the controller is proved, and on from there while its loss falls.
 
 An epoch lowers the task's loss plus an objective over the worst cells of the initial set; then
 `decide` says what is proved. What it finds is what is trained on next: cells that it could not
@@ -257,7 +257,7 @@ def train(
     sizes = _Sizes(batch, samples, steps, weight)
     try:
         first = min(FIRST, budget.left / 10) if budget.timed else FIRST
-        run.decide(budget, max(LEAST, first), asked, after=len(run.epochs))
+        run.decide(budget, max(LEAST, first, PATIENCE * run.proof), asked, after=len(run.epochs))
         for _ in wrapped(progress, range(len(run.epochs), epochs)):
             if run.over or budget.late:
                 break
@@ -310,6 +310,7 @@ class _Kept(NamedTuple):
         begun: the epoch that it began with.
         epochs: so far.
         fruitless: whether the last one of a proved controller lowered its loss by little.
+        proof: the seconds that the last proof took; zero before.
     """
 
     seal: Any
@@ -320,6 +321,7 @@ class _Kept(NamedTuple):
     begun: int
     epochs: tuple[Epoch, ...]
     fruitless: bool = False
+    proof: float = 0.0
 
 
 class _Run:
@@ -336,7 +338,8 @@ class _Run:
 
     Attributes:
         epochs: so far.
-        known: the controller that was decided last, with its verdict; None before.
+        known: the controller that is kept, with its verdict; None before the first decision.
+        proof: the seconds that the last proof took; zero before.
     """
 
     def __init__(
@@ -360,13 +363,13 @@ class _Run:
         self._state = optimizer.init(self._weights)
         self._examples = np.tile(np.asarray(X0.center), (REMEMBERED, 1))
         self._stage = self._begun = 0
-        self._before, self._proof, self._fruitless = 0.0, 0.0, False
+        self._before, self.proof, self._fruitless = 0.0, 0.0, False
         self.epochs: list[Epoch] = []
         self.known: Trained | None = None
 
     @property
     def found(self) -> Trained:
-        """The controller that was decided last."""
+        """The controller that is kept, with its verdict and the history."""
         assert self.known is not None  # it is decided before anything else
         return dataclasses.replace(self.known, history=TrainingHistory(tuple(self.epochs)))
 
@@ -403,13 +406,13 @@ class _Run:
         asked: dict[str, Any],
         after: int,
     ) -> Trained:
-        """A controller with its verdict, found in so many seconds."""
+        """A controller with its verdict, within so many seconds; how long a proof takes is kept."""
         loop = under(self._loop, weights)
         limit = min(seconds, budget.left) if budget.timed else seconds
         given, clock = (loop, self._X0, self._spec.horizon), Budget()
         verdict = decide(*given, **asked, seed=self._seed + after, time_limit=limit)
         if verdict.proved:
-            self._proof = clock.elapsed
+            self.proof = clock.elapsed
         return Trained(loop, verdict, TrainingHistory())
 
     def epoch(self, sizes: _Sizes, budget: Budget, asked: dict[str, Any]) -> None:
@@ -490,19 +493,22 @@ class _Run:
 
         reached, other = math.inf, given
         if before.proved:
-            reached, other = loss(first), self._weights
-            if not now.proved or not loss(self._weights) < reached:
-                self.known, self._weights = before, first
+            other = self._weights
+            self.known, self._weights = before, first  # a proof is kept, whoever interrupts
+            reached = loss(first)
+            if now.proved and loss(other) < reached:
+                self.known, self._weights = now, other
         least = loss(self._weights)
         for _ in range(HALVINGS):
             pairs = zip(self._weights, other, strict=True)
             middle = [(one + another) / 2 for one, another in pairs]
-            if budget.late or not loss(middle) < least:
+            lower = loss(middle)
+            if budget.late or not lower < least:
                 break
-            limit = max(LEAST, PATIENCE * self._proof)
+            limit = max(LEAST, PATIENCE * self.proof)
             tried = self._decided(middle, budget, limit, asked, after)
             if tried.proved:
-                self.known, self._weights, least = tried, middle, loss(middle)
+                self.known, self._weights, least = tried, middle, lower
             else:
                 other = middle
         self._fruitless = reached - least <= LITTLE * abs(least)
@@ -520,6 +526,7 @@ class _Run:
             self._begun,
             tuple(self.epochs),
             self._fruitless,
+            self.proof,
         )
         write(path, kept, outside=ClosedLoop)
 
@@ -547,6 +554,6 @@ class _Run:
         self._weights = [jnp.asarray(each) for each in kept.weights]
         self._state = jax.tree.unflatten(structure, kept.optimizer)
         self._examples, self._stage, self._begun = kept.examples, kept.stage, kept.begun
-        self._fruitless = kept.fruitless
+        self._fruitless, self.proof = kept.fruitless, kept.proof
         self.epochs = [*kept.epochs]
         self._before = self.epochs[-1].seconds if self.epochs else 0.0

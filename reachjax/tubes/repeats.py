@@ -136,7 +136,7 @@ class Repeat:
         if isinstance(proof, LinearCertificate):
             *_, last = (p for p in tube.certificates if isinstance(p, LinearCertificate))
             slopes, (cut, _) = np.asarray(last.slopes), proof.X0.parts
-            if cut is None or not cut.needs_programs:  # as where they would have taken too long
+            if cut is None or not cut.needs_programs:  # its slopes hold on intervals without them
                 own["X0"] = own["X0"].closed_form(self._box)
             (found,) = self._by_forms(k, ("slopes", last.k), [(own["X0"], self._box)], slopes)
             return proof.replace(**own, slopes=jax.device_put(slopes[:k])), found

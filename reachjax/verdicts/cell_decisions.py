@@ -38,7 +38,7 @@ PROGRAMS = 50
 SHOTS, FEWER = 64, 8
 """How many trajectories are simulated from a cell that is not proved; and from each of many."""
 
-FEW = 4
+FEW_OF_A_FLOW = 4
 """So many cells of a flow are worth a compiled call for more, which is filled up."""
 
 TRIED = 8
@@ -133,17 +133,13 @@ class _Decisions(AbstractSearch):
                 some = [self._open.popleft() for _ in range(min(TOGETHER, len(self._open)))]
                 given = self._task, [node.ends for node in some], self._budget
                 return Question(some, sifted, given)
-            node, known = (
-                self._left_over.popleft()
-                if self._left_over
-                else (
-                    self._open.popleft(),
-                    None,
-                )
-            )
+            left = self._left_over
+            node, known = left.popleft() if left else (self._open.popleft(), None)
             bounded = known is not None and not self._first.by_programs
             tried = self._tried.get(self._cells.halvings(node))
-            if known is not None and bounded and tried and self._task.loop.plant.continuous:
+            # to bound a flow again costs more than to halve it where one of its size was halved
+            again = self._bounded and self._task.loop.plant.continuous
+            if known is not None and bounded and again and tried:
                 self._judge(node, Outcome(False, known, axis=tried[-1]))
                 if self.ended:
                     return None
@@ -160,7 +156,9 @@ class _Decisions(AbstractSearch):
     def _many(self) -> bool:
         """Whether there are cells for a compiled call; of flows it takes less than a few do."""
         loop = self._task.loop
-        return not loop.jumps and len(self._open) >= (FEW if loop.plant.continuous else TOGETHER)
+        return not loop.jumps and len(self._open) >= (
+            FEW_OF_A_FLOW if loop.plant.continuous else TOGETHER
+        )
 
     def _about(self, node: Node, task: CellTask, known: Margins | None = None) -> Question:
         return Question([node], outcome_of, (task, jax.device_get(node.part), self._budget, known))

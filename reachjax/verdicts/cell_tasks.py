@@ -123,16 +123,14 @@ def _climbed(
     middle, failing = scenarios.middle(np.asarray(around.center)), any(broken)
     proved, axes, leaves = not failing, (-1, -1), list[Leaves]()
     for k in range(task.horizon + 1):
+        early = 2 * k < task.horizon
         if k:
             try:
                 ladder.advance(tighten=False)
             except UnboundedError as error:
-                axis, then = axes
                 if proved and k > 1:
-                    axis, then = _axes(
-                        ladder, _first_open(task.required, margins), 2 * k < task.horizon
-                    )
-                lost = Unbounded.of(error)
+                    axes = _axes(ladder, _first_open(task.required, margins), early)
+                (axis, then), lost = axes, Unbounded.of(error)
                 return Outcome(False, margins, axis=axis, then=then, unbounded=lost)
         if budget.overdue:
             return Outcome(False, margins)
@@ -145,7 +143,7 @@ def _climbed(
                 proved, margin, branches = bounded(item, ladder, part, middle)
                 leaves += [Leaves(item.name, k, branches)] if proved and branches else []
                 margins[item.name][k] = np.fmax(margins[item.name][k], margin)
-                axes = axes if proved else _axes(ladder, item, 2 * k < task.horizon)
+                axes = axes if proved else _axes(ladder, item, early)
         if not (proved or failing):
             break
     axis, then = axes
@@ -190,10 +188,23 @@ def _all_right(item: Requirement, bounds: Float[np.ndarray, " g"]) -> bool:
 
 
 def _axes(ladder: Ladder, item: Requirement, early: bool = False) -> tuple[int, int]:
-    """The coordinate along which a half leaves least out of what a requirement speaks of.
+    """The coordinate to halve a cell along, and the one to halve its halves along at once, or -1.
 
-    And the one along which halves are halved at once, or -1: a half gets at most about twice as far
-    as its cell, so that of a cell that failed early none is proved.
+    A half gets at most about twice as far as its cell, so that of one that failed early none is
+    proved.
+    """
+    start, size = ladder.horizon.start, _left_out(ladder, item)
+    if not size.any():
+        size = abs(np.asarray(item.region.facets[0]) @ start.spread).sum(axis=0)
+    axis, then = int(size.argmax()), -1
+    if early and start.curved:
+        size[axis] *= HALVED
+        then = int(size.argmax())
+    return axis, then
+
+
+def _left_out(ladder: Ladder, item: Requirement) -> Float[np.ndarray, " n"]:
+    """What forms leave out of a requirement's values, by the coordinate that it is due to.
 
     What units leave out is due to the coordinates that move their inputs; what a flow leaves out is
     of third order, and due to those of which the state has large products.
@@ -219,26 +230,19 @@ def _axes(ladder: Ladder, item: Requirement, early: bool = False) -> tuple[int, 
         last = min(state.columns.shape[1], len(left))
         size += left[known:last].sum() * _shares(_bent(start, state)).mean(axis=0)
         known = max(known, last)
-    size = np.where(np.isfinite(size), size, 0.0)
-    if not size.any():
-        size = abs(C @ start.spread).sum(axis=0)
-    axis, then = int(size.argmax()), -1
-    if early and start.curved:
-        size[axis] *= HALVED
-        then = int(size.argmax())
-    return axis, then
+    return np.where(np.isfinite(size), size, 0.0)
 
 
 def _moved(layer: UnitForms, n: int) -> Float[np.ndarray, "k n"]:
     """How far each of `n` coordinates moves the inputs of units; of all, where they share these."""
     rows, count = abs(np.asarray(layer.inputs.columns)[:, :n]), len(layer.places)
-    if count and len(rows) % count == 0:
-        return rows.reshape(-1, count, n).sum(axis=0)
+    if len(rows) == layer.unit.inputs * count:
+        return rows.reshape(layer.unit.inputs, count, n).sum(axis=0)
     return np.tile(rows.sum(axis=0), (count, 1))
 
 
 def _bent(start: InitialColumns, state: AffineForms) -> Float[np.ndarray, "n_x n"]:
-    """What each state has of products of each of `n` coordinates."""
+    """What each state has of products of each of `n` coordinates, squares twice."""
     n, found = len(start.center), np.zeros((len(state), len(start.center)))
     for number, pair in enumerate(zip(*start.pairs, strict=True)):
         for place in pair:

@@ -302,7 +302,7 @@ def _by_remedies(
         share = budget.share(part if programs_may_follow else 1.0)
         parts = CellTree.whole(X0, most)
         by_cells = decided_by_cells(task, X0, parts, decision.simulations, share)
-        if by_cells.status is not VerdictStatus.UNKNOWN or not relaxation.nodes:
+        if by_cells.status is not VerdictStatus.UNKNOWN or not programs_may_follow:
             return by_cells
     try:
         for nodes in dict.fromkeys((min(FIRST_PROGRAMS, relaxation.nodes), relaxation.nodes)):

@@ -37,7 +37,7 @@ TOGETHER = 32
 
 PASSES = 7
 """In numpy a period of a flow goes through its right-hand side so many times as often as it stands
-in compiled code: some forty times, for steps that are tried, enclosures and every coefficient."""
+in compiled code, for steps that are tried, enclosures and every coefficient."""
 
 MEASURED = 2
 """So many periods of a flow say what all of them take."""

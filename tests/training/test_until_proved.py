@@ -133,6 +133,9 @@ def test_a_training_goes_on_from_its_file_after_a_proof(tmp_path):
     assert len(second.history) == len(third.history) == len(whole.history)
     for run in (second, third):
         np.testing.assert_array_equal(leaves(run.loop)[0], leaves(whole.loop)[0])
+    assert {epoch.status for epoch in whole.history.epochs[took - 1 :]} == {"PROVED"}
+    states = X0.sample(jax.random.key(1), 64)
+    assert change(whole.loop, states) <= change(first.loop, states)
 
 
 def test_a_training_goes_on_from_its_file(tmp_path):

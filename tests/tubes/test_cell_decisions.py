@@ -199,6 +199,15 @@ def test_where_units_have_no_bounds_nothing_is_known():
     assert not found.of(rj.VerdictStatus.REFUTED)
 
 
+@pytest.mark.costly
+def test_a_flow_that_has_no_bounds_over_any_cell_says_so():
+    law = rj.Network(lambda x: -x, inputs=1, outputs=1)
+    plant = rj.SampledPlant(lambda x, u: jnp.sqrt(x) + 0 * u, 1, 1, period=0.1)
+    loop, goal = rj.ClosedLoop(plant, law), rj.Box([-1.0], [3.0])
+    with pytest.raises(UnboundedError, match="Sqrt"):
+        rj.decide(loop, rj.Box([-2.0], [-1.0]), 2, goal=goal, cells=64)
+
+
 def test_trajectories_that_are_no_numbers_say_nothing():
     loop, X0 = rooted(jnp.sqrt), rj.Box([-1.0], [2.0])
     for cells in (None, 4):

@@ -14,6 +14,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.numerics import archives, storage
+from reachjax.programs.affine import AffineForms
 from tests.closed_loops import closed_loop, random_loop
 from tests.laws.changes import unclaimed
 
@@ -55,6 +56,13 @@ def test_files_that_name_classes_by_the_modules_of_an_earlier_layout_are_read(na
     path = Path(__file__).parents[1] / "data" / "tubes" / f"{name}.npz"
     tube = rj.load(path, recheck=True)
     assert isinstance(tube, rj.PartitionedTube if name == "cells" else rj.ReachTube)
+
+
+def test_a_field_that_is_made_anew_by_default_may_be_missing():
+    named, parts = (AffineForms, "rows", "radii"), (np.zeros((1, 3)), np.zeros((1, 2)))
+    assert storage._rebuilt(named, *parts).inner == {}
+    with pytest.raises(ValueError, match="other fields than this version's"):
+        storage._rebuilt(named[:2], *parts[:1])
 
 
 def sine(p, x, u):

@@ -310,7 +310,7 @@ def _remainder(
         whole: how many such steps a period is, if control points are asked for.
         halves: whether a step that is too long is halved, so that nothing else is of use.
     """
-    chosen, between, on_host = order or ORDER, 0.0, namespace(X.mid) is np
+    chosen, apart, on_host = order or ORDER, 0.0, namespace(X.mid) is np
     if not on_host:
         terms = solved(tape, B, others, h, max(chosen, 3) + 1)
         return _Piece(B, constant_ball(terms[chosen]), _size(terms[3]), chosen, 0.0)
@@ -319,11 +319,11 @@ def _remainder(
     second, fourth = (_size(terms[k]) for k in (1, 3))
     if whole is not None:
         moved = IN_BETWEEN * (X.rad + whole * (_size(rate) + second))
-        between = _over(second / 12 + fourth / 16, moved)
+        apart = _over(second / 12 + fourth / 16, moved)
     excess = list[float]()
     for k in range(HIGHEST + 1 if order is None else 0):
         if k == len(terms):
-            if halves and between > 1:
+            if halves and apart > 1:
                 break
             terms.append(solution.advance())
         excess.append(_excess(terms[k], rate, X) if k else np.inf)
@@ -334,7 +334,7 @@ def _remainder(
         chosen, least = int(np.argmin(excess)), min(excess)
     while len(terms) <= chosen:
         terms.append(solution.advance())
-    return _Piece(B, constant_ball(terms[chosen]), fourth, chosen, max(least, between))
+    return _Piece(B, constant_ball(terms[chosen]), fourth, chosen, max(least, apart))
 
 
 def _excess(remainder: Ball, rate: Ball, X: Ball) -> float:

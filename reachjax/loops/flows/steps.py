@@ -40,6 +40,7 @@ from reachjax.numerics.numbers import split
 from reachjax.numerics.rounding import (
     Ball,
     constant,
+    errors,
     gamma,
     is_counted,
     larger,
@@ -238,15 +239,16 @@ def _composed(found: TaylorModels, state: TaylorModels) -> TaylorModels:
     Higher products are worth what they can be.
     """
     xp, n, symbols = namespace(found.rows), len(state), state.symbols
-    first, higher = 1 + symbols.own, found.symbols.higher
+    first = 1 + symbols.own
     last = first + len(symbols.radii)
     slope, own = found.rows[:, first : first + n], state.rows[:, first:]
     more = xp.concatenate([xp.zeros((len(found), n)), found.rows[:, first + n : last]], axis=1)
     rows = xp.concatenate([found.rows[:, :first], slope @ own + more], axis=1)
     sizes = (abs(slope) @ abs(own) + abs(more)) @ symbols.radii
     radii = found.radii + abs(slope) @ state.radii * (1 + gamma(n)) + gamma(2 * n + 8) * sizes
-    if higher is not None:
-        radii = radii + abs(found.rows[:, last:]) @ higher * (1 + gamma(len(higher)))
+    radii = radii + errors(lambda: 2 * n * symbols.vanishing)
+    if found.symbols.higher:
+        radii = radii + abs(found.rows[:, last:]).sum(axis=1) * (1 + gamma(found.symbols.total))
     return TaylorModels(rows, radii * (1 + gamma(4)), symbols)
 
 

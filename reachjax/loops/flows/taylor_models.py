@@ -10,7 +10,7 @@ and a product of two leaves out all that is of degree three in `w`, or of degree
 On the host more products are symbols within a step of a flow: of three `w`, and of two of all `w`
 and `r` (`higher`). What they are worth is found at its end, where most of it has cancelled of what
 each operation alone would leave out. Products of `w` are those of Chebyshev polynomials, so that
-none exceeds one: `T_2(w_i) w_j`, `T_3(w_i) = 4 w_i^3 - 3 w_i`.
+none exceeds one: `T_2(w_i) w_j`, `T_3(w_i) = 4 w_i^3 - 3 w_i`; so are those of `r_i / radii_i`.
 
 Since symbols are few, what is computed with them does not grow with the columns of a horizon; the
 `l` are the derivatives by which these are carried on (`programs.flows`).
@@ -65,7 +65,7 @@ def _mixed(n: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of `n + count` numbers the pairs that are not of the first `n` alone, and their weights."""
     i, j = np.triu_indices(n + count)
     i, j = i[j >= n], j[j >= n]
-    return i, j, np.where(i == j, 0.5, 1.0)
+    return i, j, np.where(i == j, 0.25, 1.0)
 
 
 @lru_cache(maxsize=64)
@@ -98,24 +98,19 @@ class Symbols(NamedTuple):
         initial: how many `w` there are.
         curved: whether products of them are symbols too.
         radii: `(K,)`, of the `r`.
-        higher: `(M,)`, bounds of products of three `w`, then of those of two with an `r`, where
-            these are symbols, the last ones.
+        higher: whether products of three `w`, then of two `s`, of which one is an `r` at least, are
+            symbols, the last ones; the `s` are the `w`, and the `r` by their radii.
     """
 
     initial: int
     curved: bool
     radii: Float[Array | np.ndarray, " K"]
-    higher: Float[Array | np.ndarray, " M"] | None = None
+    higher: bool = False
 
     @property
     def with_higher(self) -> Symbols:
         """The symbols, and higher products where those of two `w` are symbols; in numpy."""
-        if not self.curved or namespace(self.radii) is not np:
-            return self
-        i, j, _ = _mixed(self.initial, len(self.radii))
-        sizes = np.concatenate([np.ones(self.initial), self.radii])
-        mixed = sizes[i] * sizes[j] * (1 + gamma(2)) + TINY
-        return self._replace(higher=np.concatenate([np.ones(self.cubic), mixed]))
+        return self._replace(higher=self.curved and namespace(self.radii) is np)
 
     @property
     def cubic(self) -> int:
@@ -125,7 +120,13 @@ class Symbols(NamedTuple):
     @property
     def total(self) -> int:
         """How many there are."""
-        return self.own + len(self.radii) + (0 if self.higher is None else len(self.higher))
+        K = len(self.radii)
+        return self.own + K + (self.cubic + len(_mixed(self.initial, K)[0]) if self.higher else 0)
+
+    @property
+    def vanishing(self) -> Any:
+        """What underflow of a product in every coefficient may take from a number, and more."""
+        return 2 * TINY * (1 + self.total + self.radii.sum())
 
     @property
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
@@ -168,8 +169,8 @@ class TaylorModels(AbstractNumber):
         sizes, last = abs(self.rows[:, 1:]), count + len(symbols.radii)
         parts = [sizes[:, :n].sum(axis=1), sizes[:, n:count].sum(axis=1)]
         parts.append(sizes[:, count:last] @ symbols.radii)
-        if symbols.higher is not None:
-            parts.append(sizes[:, last:] @ symbols.higher)
+        if symbols.higher:
+            parts.append(sizes[:, last:].sum(axis=1))
         return tuple(part * (1 + gamma(self.rows.shape[1])) for part in parts)
 
     @cached_property
@@ -210,10 +211,11 @@ class TaylorModels(AbstractNumber):
 
     def __rmatmul__(self, matrix: Any) -> TaylorModels:
         matrix = namespace(self.rows).asarray(matrix)
-        weights, error, count = abs(matrix), gamma(matrix.shape[1]), self.rows.shape[1]
+        weights, error = abs(matrix), gamma(matrix.shape[1])
 
         def lost() -> Any:
-            return error * (weights @ self._size) + underflow(matrix, self._size > 0, count)
+            vanishing = self.symbols.vanishing / TINY * underflow(matrix, self._size > 0)
+            return error * (weights @ self._size) + vanishing
 
         return self._with(matrix @ self.rows, weights @ self.radii * (1 + error), errors(lost))
 
@@ -233,7 +235,7 @@ class TaylorModels(AbstractNumber):
     def __rmul__(self, factor: Any) -> TaylorModels:
         """Each number times an exact one, or all times one."""
         factor = namespace(self.rows).broadcast_to(factor, (len(self.rows),))
-        lost = errors(lambda: gamma(1) * abs(factor) * self._size + TINY)
+        lost = errors(lambda: gamma(1) * abs(factor) * self._size + self.symbols.vanishing)
         return self._with(factor[:, None] * self.rows, abs(factor) * self.radii, lost)
 
     def times(self, other: TaylorModels) -> TaylorModels:
@@ -253,9 +255,9 @@ class TaylorModels(AbstractNumber):
             constants = constants + SQUARE * (g * h).sum(axis=1, keepdims=True)
             products = products + squares
             left = one * (two_ + three_) + (two + three) * whole_
-        if symbols.higher is not None:
-            more, higher = _higher(a, b, symbols)
-            last = len(symbols.radii)
+        if symbols.higher:
+            middle, more, higher = _higher(a, b, symbols)
+            last, constants = len(symbols.radii), constants + middle
             linear, rest = linear + more, [rest[0][:, :last], rest[0][:, last:] + higher]
             high, high_ = self._parts[3], other._parts[3]
             left = (one + three) * high_ + three * two_ + two * (two_ + three_ + high_)
@@ -263,8 +265,12 @@ class TaylorModels(AbstractNumber):
         rows = xp.concatenate([constants, linear, products, *rest], axis=1)
         size, size_ = abs(center[:, 0]) + whole, abs(another[:, 0]) + whole_
         radii = left + self.radii * (size_ + other.radii) + other.radii * size
-        lost = errors(lambda: gamma(rows.shape[1] + 4) * size * size_ + 8 * TINY)
-        return self._with(rows, radii * (1 + gamma(16)), lost)
+
+        def lost() -> Any:
+            vanishing = 8 * symbols.vanishing * (1 + size + size_)
+            return gamma(rows.shape[1] + 8) * size * size_ + vanishing
+
+        return self._with(rows, radii * (1 + gamma(16)), errors(lost))
 
     def at(self, unit: AbstractUnit) -> TaylorModels:
         """The values of smooth units: by a quadratic, or by lines where these leave less out.
@@ -294,10 +300,10 @@ class TaylorModels(AbstractNumber):
         return slope * self + offset
 
 
-def _higher(a: np.ndarray, b: np.ndarray, symbols: Symbols) -> tuple[np.ndarray, np.ndarray]:
-    """What products of rows have of the `w`, and of higher products, by those of lower degrees.
+def _higher(a: np.ndarray, b: np.ndarray, symbols: Symbols) -> tuple[np.ndarray, ...]:
+    """What products of rows have of one, the `w`, and higher products, by those of lower degrees.
 
-    As `w_i T_2(w_i)` is `(w_i + T_3(w_i)) / 2` and `w_i^2` is `(1 + T_2(w_i)) / 2`.
+    As `w_i T_2(w_i)` is `(w_i + T_3(w_i)) / 2` and `s_i^2` is `(1 + T_2(s_i)) / 2`.
     """
     n, count = symbols.initial, symbols.own
     first, second, own = slice(1, 1 + n), slice(1 + n, 1 + count), len(symbols.radii)
@@ -309,12 +315,11 @@ def _higher(a: np.ndarray, b: np.ndarray, symbols: Symbols) -> tuple[np.ndarray,
             cubic += g[:, i] * q[:, jk] * weight
         more += 0.5 * (g[:, :, None] * q[:, place]).sum(axis=1)
     i, j, weights = _mixed(n, own)
-    g, h = (
-        np.concatenate([row[:, first], row[:, 1 + count : 1 + count + own]], axis=1)
-        for row in (a, b)
-    )
+    scaled = (row[:, 1 + count : 1 + count + own] * symbols.radii for row in (a, b))
+    g, h = (np.hstack([row[:, first], of_r]) for row, of_r in zip((a, b), scaled, strict=True))
+    middle = 0.5 * (g[:, n:] * h[:, n:]).sum(axis=1, keepdims=True)
     mixed = (g[:, i] * h[:, j] + g[:, j] * h[:, i]) * weights
-    return more, np.concatenate([cubic, mixed], axis=1)
+    return middle, more, np.hstack([cubic, mixed])
 
 
 def straight(unit: AbstractUnit, lower: Any, upper: Any) -> tuple[Any, Any]:

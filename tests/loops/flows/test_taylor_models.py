@@ -1,6 +1,7 @@
 """Polynomials of symbols: products hold, and leave nothing out that there are symbols for."""
 
 import itertools
+from fractions import Fraction
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,17 +25,18 @@ def chebyshev(powers):
 
 
 def values(symbols, w, r):
-    """The constant and all symbols at a point."""
+    """The constant and all symbols at a point; the `r` are parts of their radii."""
     n, both = symbols.initial, np.concatenate([w, r])
     pairs, triples = (itertools.combinations_with_replacement(range(n), k) for k in (2, 3))
     degrees = [np.bincount(each, minlength=n) for each in itertools.chain(pairs, triples)]
     products, second = [chebyshev(each)(w) for each in degrees], n * (n + 1) // 2
     mixed = [
-        both[i] * both[j]
+        both[i] * both[j] if i != j else 2 * both[i] ** 2 - 1
         for i, j in itertools.combinations_with_replacement(range(len(both)), 2)
         if j >= n
     ]
-    return np.concatenate([[1.0], w, products[:second], r, products[second:], mixed])
+    parts = [1.0], w, products[:second], symbols.radii * r, products[second:], mixed
+    return np.concatenate(parts)
 
 
 def points(rng, symbols, count):
@@ -43,7 +45,7 @@ def points(rng, symbols, count):
         w, r = (rng.uniform(-1, 1, size=size) for size in (symbols.initial, len(symbols.radii)))
         if k % 2:
             w, r = np.sign(w), np.sign(r)
-        yield values(symbols, w, symbols.radii * r)
+        yield values(symbols, w, r)
 
 
 @pytest.mark.parametrize(("initial", "count"), SIZES)
@@ -62,6 +64,30 @@ def test_products_hold_at_every_point(initial, count):
             )
             assert np.all(abs(found.rows @ at - first * second) <= found.radii)
             assert np.all((found.ends()[0] <= first * second) & (first * second <= found.ends()[1]))
+
+
+@pytest.mark.parametrize(
+    ("size", "radius"), [(1e-165, 1e150), (1e-165, 1e300), (1e-200, 1e190), (1e140, 1e-150)]
+)
+def test_no_scale_takes_anything_from_a_number(size, radius):
+    """What underflows in a coefficient is times a radius that may be large."""
+    rng = np.random.default_rng(0)
+    symbols = Symbols(1, True, radius * rng.uniform(0.1, 1, size=2)).with_higher
+    rows = np.zeros((2, 1 + symbols.total))
+    rows[:, 3:5] = size * rng.uniform(-1, 1, size=(2, 2))
+    one, other = (TaylorModels(each[None], np.zeros(1), symbols) for each in rows)
+    for s in itertools.product((-1, 0, 1), repeat=2):
+        r = [Fraction(number) * part for number, part in zip(symbols.radii, s, strict=True)]
+        first, second = (
+            sum(Fraction(number) * part for number, part in zip(each[3:5], r, strict=True))
+            for each in rows
+        )
+        cases = [(one.times(other), first * second), (one.times(one), first * first)]
+        cases += [(1e-160 * one, Fraction(1e-160) * first)]
+        cases += [(np.array([[1e-160]]) @ one, Fraction(1e-160) * first)]
+        for found, value in cases:
+            lower, upper = (float(end[0]) for end in found.ends())
+            assert Fraction(lower) <= value <= Fraction(upper)
 
 
 @pytest.mark.parametrize(("initial", "count"), SIZES)

@@ -125,3 +125,13 @@ def test_simulations_with_states_in_between_are_of_the_flow():
     discrete = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.zeros((2, 1))), STILL)
     with pytest.raises(ValueError, match="parts must be 1"):
         discrete.simulate([0.0, 1.0], 2, parts=2)
+
+
+@pytest.mark.costly
+def test_a_trajectory_that_escapes_is_refuted_where_it_is_still_enclosed():
+    net = rj.MLP.from_layers([([[0.3, 0.1], [-0.2, 0.3]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+    plant = rj.SampledPlant(lambda x, u: jnp.array([x[0] ** 2 + u[0], -x[1]]), 2, 1, period=0.25)
+    loop, wide = rj.ClosedLoop(plant, net), rj.Box([0.2, -1.0], [1.0, 1.0])
+    verdict = rj.decide(loop, wide, 6, safe=rj.Box([-50.0, -5.0], [50.0, 5.0]), cells=64)
+    assert verdict.refuted
+    assert verdict.counterexample.states[-1][0] > 50.0

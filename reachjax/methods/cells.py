@@ -8,8 +8,8 @@ are halved first: the initial set is treated like any part of it.
 What forms leave out of units that switch falls slowly, and another method costs as much as many
 forms. It is tried on the cell that decides most, once forms had their chance. Where it closes most
 of what they leave open, the set is cut into as many cells as there is work for, the largest first,
-and each that decides a facet is bounded by it. Where it does not, and the loop jumps, cells are
-followed along all ways in which their decisions may go.
+and each that decides a facet is bounded by it. A loop that jumps is also followed along all ways in
+which its decisions may go: if that leaves less open than the other method, all cells are.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from reachjax.methods.ladder import LEAST_RANGE, ROUNDED, WORK
 from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
 from reachjax.methods.searches import AbstractSearch, Question
 from reachjax.methods.steps import overflow
-from reachjax.numerics.budget import Budget
+from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.affine_steps import step_columns
@@ -76,6 +76,10 @@ it may take the other part."""
 WAYS = 32
 """Along so many ways of its decisions a loop that jumps is followed over a cell: each takes as long
 as another cell, but half of a cell may have as many."""
+
+LEFT_TO_METHOD = 1 / 2
+"""The part of a limited time that is kept from the first cell that is followed, where the other
+method closes most: should that take longer, its halves could not be followed in time either."""
 
 SEARCHING = 0.9
 """The part of the time in which cells are halved: sets, proofs and witnesses take the rest, 0.7 s
@@ -230,11 +234,15 @@ class _Search(AbstractSearch):
         """What the search took so far."""
         return self._budget.elapsed
 
-    def _by_forms(self, node: Node) -> _Bounds:
+    def _by_forms(self, node: Node, budget: Budget = ENDLESS) -> _Bounds:
+        """What forms say over a cell, of as many steps as a budget has time for."""
         given = self._loop, node.part, node.box, self._directions, self._problem.start
         began, steps, lost = self._budget.elapsed, list[ByForms](), None
         try:
-            steps.extend(unrolled(*given, most=self.ways, wanted=self._wanted_bounds))
+            for step in unrolled(*given, most=self.ways, wanted=self._wanted_bounds):
+                steps.append(step)
+                if budget.late:
+                    break
         except UnboundedError as error:  # of halves there may be bounds
             lost = error
         self._longest = max(self._longest, self._budget.elapsed - began)
@@ -359,11 +367,8 @@ class _Search(AbstractSearch):
         before, after = (self._beyond(found.offsets) for found in (node.found, tried))
         self._planned = True
         self._asks = bool(after.sum() <= (1 - CLOSED) * before.sum())
-        if self._follows and not self._asks:  # what is left open is left so by decisions
-            self.ways = WAYS
-            followed = self._by_forms(node)
-            self._left -= followed.effort
-            node.found = followed if followed.is_bounded else node.found
+        if self._follows:
+            self._follow(node, float(after.sum()))
         if self._asks:
             most = self._left / (2 + self._price)
             seconds = 2 * self._longest + self._slowest
@@ -371,6 +376,23 @@ class _Search(AbstractSearch):
                 most = min(most, self._budget.left / seconds)
             gap = max(self._problem.gap, ROUNDED)
             self._wanted = int(min(most, 1 + float(after.max()) / gap))
+
+    def _follow(self, node: Node, opened: float) -> None:
+        """Follow cells along ways from now on, unless another method leaves less of one open.
+
+        Args:
+            node: that one.
+            opened: what the other method leaves open of it, of all facets together.
+        """
+        longest, self.ways = self._longest, WAYS
+        share = self._budget.share(1 - LEFT_TO_METHOD if self._asks else 1.0)
+        followed = self._by_forms(node, share)
+        self._left -= followed.effort
+        self._asks = self._asks and opened < float(self._beyond(followed.offsets).sum())
+        if self._asks:
+            self.ways, self._longest = 1, longest
+        elif followed.is_bounded:
+            node.found = followed
 
     def _beyond(self, offsets: Float[np.ndarray, "N f"]) -> Float[np.ndarray, "N f"]:
         """What bounds leave open, in parts of ranges."""

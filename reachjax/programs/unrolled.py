@@ -42,6 +42,8 @@ class ByForms(NamedTuple):
         between: `(m,)`, upper bounds at all times since the sample before, if they are asked for.
         open: decisions of the step that may go either way, none of compiled code.
         ways: along how many ways of decisions that is so.
+        moved: `(n_x,)`, how far each coordinate of the initial set moves what decides between this
+            way and others, all decisions together; empty where there is no other way.
     """
 
     offsets: Float[Array | np.ndarray, "*N m"]
@@ -51,6 +53,7 @@ class ByForms(NamedTuple):
     between: Float[Array | np.ndarray, "*N m"] | None = None
     open: tuple[OpenDecision, ...] = ()
     ways: int = 1
+    moved: Float[np.ndarray, " n"] = np.zeros(0)
 
 
 def unrolled(
@@ -145,7 +148,8 @@ def _of_way(
             np.where(known[:, None], at[:, each], one)
             for each, one in zip(way.free, drawn, strict=True)
         ]
-        found = found._replace(offsets=upper, corners=corners)
+        moved = abs(way.facts.columns[:, :first]).sum(axis=0)
+        found = found._replace(offsets=upper, corners=corners, moved=moved)
     return found._replace(drawn=tuple(drawn), open=way.open)
 
 

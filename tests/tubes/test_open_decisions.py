@@ -1,10 +1,14 @@
 """Verdicts name decisions that stay open; those of a counterexample win by more than rounding."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.numerics.budget import Budget
+from reachjax.verdicts.cell_tasks import CellTask, outcome_of
+from reachjax.verdicts.specification import requirements
 
 STILL = rj.MLP.from_layers([([[0.0]], [0.0])])
 
@@ -56,6 +60,22 @@ def test_what_holds_on_both_sides_is_proved_across_the_surface(plant):
     verdict = rj.decide(loop_of(plant), rj.Box([-1.0], [1.0]), 3, safe=wide)
     assert verdict.proved
     assert "stay open" not in str(verdict)
+
+
+def test_a_cell_is_halved_along_what_decides():
+    def plant(x, u):
+        after = jnp.where(x[1] > 0.0, 1.0, -1.0) + u[0]
+        return jnp.stack([x[0] + 0.1 * jnp.sin(x[0]), after])
+
+    still = rj.MLP.from_layers([([[0.0, 0.0]], [0.0])])
+    loop = rj.ClosedLoop(rj.NonlinearPlant(plant, states=2, inputs=1), still)
+    goal, X0 = rj.Box([-3.0, -0.5], [3.0, 2.0]), rj.Box([-1.0, -1.0], [1.0, 1.0])
+    task = CellTask(
+        jax.device_get(loop), 1, 0, tuple(requirements(2, 1, goal, None, None)), nodes=0
+    )
+    outcome = outcome_of(task, jax.device_get(X0), Budget())
+    assert not outcome.proved
+    assert outcome.axis == 1
 
 
 def test_a_loop_without_jumps_has_no_decisions():

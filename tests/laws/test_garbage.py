@@ -9,6 +9,7 @@ import reachjax as rj
 from tests.cases import HORIZON, ROUNDING, each
 
 KINDS = {
+    "own": lambda own, rng: own,
     "normal": lambda own, rng: rng.normal(size=own.shape),
     "positive": lambda own, rng: rng.exponential(size=own.shape),
     "wrong signs": lambda own, rng: -own,
@@ -47,6 +48,22 @@ def test_bounds_by_garbage_hold(case):
             found = proof.recheck(change(given, rng))
             assert np.all(found >= least), (k, kind)
             assert not np.isnan(found).any()
+            if kind == "own":
+                np.testing.assert_array_equal(found, proof.recheck())
+
+
+@each(lambda case: case.method in ("forms", "programs", "paper") and not case.round, every=2)
+def test_bounds_are_those_of_what_a_proof_is_given(case):
+    """Of garbage they are looser, and of a proof that has it as its own the same."""
+    proof, rng = case.tube.proof(HORIZON), np.random.default_rng(0)
+    name, given = own(proof)
+    garbage = KINDS["normal"](given, rng)
+    loose = proof.recheck(garbage)
+    np.testing.assert_array_equal(proof.replace(**{name: garbage}).recheck(), loose)
+    assert np.all(loose >= proof.witnesses - ROUNDING * np.maximum(1.0, abs(proof.witnesses)))
+    if case.of.plain is not None and case.initial not in ("point", "flat", "thin"):
+        # other units may leave slopes no choice
+        assert np.any(loose > proof.bounds + 1e-9), "other slopes or multipliers change nothing"
 
 
 def by_cells(proof, axes):
@@ -55,6 +72,12 @@ def by_cells(proof, axes):
         return proof.recheck(axes)
     except ValueError:
         return np.full(np.shape(proof.bounds), np.inf)
+
+
+def allowed(case):
+    """How many cells a row's method may make."""
+    method = case.options.get("relaxation", rj.BranchAndCut())
+    return method.most if isinstance(method, rj.Cells) else method.cells
 
 
 @each(lambda case: case.searches_cells)
@@ -68,6 +91,8 @@ def test_bounds_by_any_cells_hold(case):
         found = [by_cells(proof, axes) for axes in trees]
         assert np.all(found >= attained(case, k))
         assert np.isfinite(found[0]).all()
+        assert np.all(found[0] >= proof.bounds - ROUNDING * np.maximum(1.0, abs(proof.bounds)))
+        assert 1 <= proof.cells <= allowed(case)
 
 
 @each()

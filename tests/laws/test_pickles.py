@@ -39,6 +39,9 @@ def test_no_part_of_a_tube_can_be_exchanged(case):
         another(loop), case.X0, 3, case.shape, rj.LinearBounds(), start=case.of.start, samples=10
     ) if not case.round else None  # fmt: skip
     changes = [{"loop": another(loop)}, {"start": tube.start + 1}, {"sets": tube.sets[::-1]}]
+    if isinstance(case.shape, rj.Template):
+        changes += [{"template": case.shape.replace(directions=2 * case.shape.directions)}]
+    changes += [{"certificates": (None, *tube.certificates[:0:-1])}, {"seal": tube.seal[::-1]}]
     if other is not None:
         changes += [{"certificates": other.certificates}, {"seal": other.seal}]
     for each_change in changes:

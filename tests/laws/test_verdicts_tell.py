@@ -60,7 +60,8 @@ def genuine(case, example, goal=None, safe=None, avoid=()):
     elif example.requirement == "goal":
         assert not bool(goal.contains(at))
     else:
-        assert any(bool(region.contains(at)) for region in avoid)
+        regions = avoid[example.time] if isinstance(avoid, dict) else avoid
+        assert any(bool(region.contains(at)) for region in regions)
 
 
 @each(lambda case: case.method in ("default", "forms", "programs"), basic=FEW, every=2)
@@ -95,6 +96,8 @@ def test_what_sets_stay_in_is_proved_and_nothing_refutes_it(case):
 ROWS = (
     *(Case(loop) for loop in ("relu", "varying", "one state", "three states", "hard")),
     Case("relu", "default", "ellipsoid"),
+    Case("sine"),
+    Case("sine, tanh"),
 )
 
 
@@ -109,3 +112,4 @@ def test_verdicts_change_where_bounds_are(case):
         for asked in ({"goal": goal}, {"avoid": avoid}):
             for verdict in verdicts(case, **asked):
                 assert verdict.status.name == status
+                checked(case, verdict, **asked)

@@ -66,7 +66,7 @@ class Sized(NamedTuple):
 
 
 def judged_offsets(program: Program, proposal: Proposal) -> Judged:
-    """The rechecked offsets, raised to the relaxation's optimum, never above interval arithmetic.
+    """The rechecked offsets, never below what the relaxation itself gives.
 
     The derivative is the program's where multipliers and moments bear the claim out, whatever the
     solver calls it: that is what is held. Elsewhere it is that of what is proved (`gradients`).
@@ -84,7 +84,7 @@ def judged_offsets(program: Program, proposal: Proposal) -> Judged:
     proved = offsets <= claims + slack  # False where the claim is NaN
     borne_out = proved & np.isfinite(claims) & (_attained(program, proposal) >= claims - slack)
     optimal = np.isin(proposal.statuses, ANSWERS) & borne_out
-    value = np.where(optimal, np.fmin(np.fmax(offsets, claims), by_intervals), offsets)
+    value = np.where(optimal, np.fmax(offsets, claims), offsets)
     return Judged(value, optimal, borne_out, proposal)
 
 

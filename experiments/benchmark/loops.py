@@ -14,6 +14,7 @@ from experiments.benchmark.steps import REFERENCE, paper_data
 from experiments.benchmark.timing import cells, repeated
 from experiments.double_integrator import study as double_integrator
 from experiments.double_integrator.problem import HORIZON, INITIAL_BOX, template
+from experiments.layers import Layers
 from experiments.verified_training.fine_tuning import certified_tube
 from experiments.verified_training.step_cost import StepCost, step_cost
 
@@ -23,8 +24,6 @@ LOOPS_NOTE = """\
 s/tube: median of warm calls;  first: compilation included
 faster: seconds of the relaxation's first row over this row's
 area: of the last set;  * first call, longer than --patience"""
-
-Layers = list[tuple[np.ndarray, np.ndarray]]
 
 
 def controller(settings: Settings) -> Layers:

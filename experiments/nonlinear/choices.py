@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import reachjax as rj
+from experiments.layers import Layers
 
 PERIODS = 20
-
-Layers = list[tuple[np.ndarray, np.ndarray]]
 
 
 def mountain_car(x: Array, u: Array) -> Array:

@@ -10,10 +10,9 @@ from numpy import ndarray
 from scipy.linalg import solve_discrete_are
 
 import reachjax as rj
+from experiments.layers import Layers
 from experiments.sampling import Samples
 from experiments.task import Task
-
-Layers = list[tuple[ndarray, ndarray]]
 
 PERIOD = 0.1
 """Seconds between inputs of the pendulum, of TORA and of the oscillator."""

@@ -11,11 +11,10 @@ import reachjax as rj
 from experiments.benchmark.rivals import cruise_control
 from experiments.double_integrator import problem
 from experiments.imitation import train_networks
+from experiments.layers import Layers
 from experiments.quadrotor import controller, model
 from experiments.sampling import Samples, sample_policy
 from experiments.task import Task
-
-Layers = list[tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,10 @@ from numpy import ndarray
 
 from experiments import stored
 from experiments.imitation import evaluate, train_network
+from experiments.layers import Layers
 from experiments.sampling import Samples
 
 DATA = Path(__file__).parent / "data"
-
-Layers = list[tuple[Float[ndarray, "out in"], Float[ndarray, " out"]]]
 
 
 @dataclass(frozen=True)

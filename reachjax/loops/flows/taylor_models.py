@@ -62,7 +62,7 @@ def _packing(n: int) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def _mixed(n: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of `n + count` numbers the pairs that are not of the first `n` alone, and their weights."""
+    """Pairs of `n + count` numbers that are not of the first `n` alone, and their weights."""
     i, j = np.triu_indices(n + count)
     i, j = i[j >= n], j[j >= n]
     return i, j, np.where(i == j, 0.25, 1.0)

@@ -163,8 +163,8 @@ def main(settings: Settings) -> None:
     configure_jax(settings.output)
     figure, (axes,) = report.panels(1, 2, (11, 4.2))
     results, kept = {}, {}
-    for ax, (name, X0) in zip(axes, INITIAL.items(), strict=True):
-        layers = learned(name, settings.rounds)
+    for ax, (name, ends) in zip(axes, INITIAL.items(), strict=True):
+        X0, layers = rj.Box(*ends), learned(name, settings.rounds)
         for k, (W, b) in enumerate(layers):
             kept |= {f"{name} {k} weight": W, f"{name} {k} bias": b}
         loop, n = closed(name, layers), PLANTS[name][1]

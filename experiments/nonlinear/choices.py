@@ -34,9 +34,10 @@ PLANTS = {"mountain car": (mountain_car, 2), "cart-pole": (cart_pole, 4)}
 ACTIONS = {"mountain car": (-1.0, 0.0, 1.0), "cart-pole": (-10.0, 10.0)}
 
 INITIAL = {
-    "mountain car": rj.Box([-0.6, 0.0], [-0.4, 0.0]),
-    "cart-pole": rj.Box([0.2, 0.1, 0.05, 0.1], [0.22, 0.12, 0.06, 0.12]),
+    "mountain car": ([-0.6, 0.0], [-0.4, 0.0]),
+    "cart-pole": ([0.2, 0.1, 0.05, 0.1], [0.22, 0.12, 0.06, 0.12]),
 }
+"""Ends of initial boxes."""
 
 
 def closed(name: str, layers: Layers) -> rj.ClosedLoop:

@@ -18,7 +18,7 @@ SAMPLES, SECONDS = 40_000, 60.0
 @pytest.fixture(scope="module", params=INITIAL)
 def bounded(request):
     """A loop, its samples, and its sets."""
-    name, X0 = request.param, INITIAL[request.param]
+    name, X0 = request.param, rj.Box(*INITIAL[request.param])
     with np.load(KEPT) as kept:
         layers = [(kept[f"{name} {k} weight"], kept[f"{name} {k} bias"]) for k in range(3)]
     loop = closed(name, layers)

@@ -9,7 +9,8 @@ What forms leave out of units that switch falls slowly, and another method costs
 forms. It is tried on the cell that decides most, once forms had their chance. Where it closes most
 of what they leave open, the set is cut into as many cells as there is work for, the largest first,
 and each that decides a facet is bounded by it. A loop that jumps is also followed along all ways in
-which its decisions may go: if that leaves less open than the other method, all cells are.
+which its decisions may go: if that leaves no more open than the other method, or that one closes
+little, all cells are.
 """
 
 from __future__ import annotations
@@ -234,12 +235,12 @@ class _Search(AbstractSearch):
         """What the search took so far."""
         return self._budget.elapsed
 
-    def _by_forms(self, node: Node, budget: Budget = ENDLESS) -> _Bounds:
+    def _by_forms(self, node: Node, budget: Budget = ENDLESS, ways: int | None = None) -> _Bounds:
         """What forms say over a cell, of as many steps as a budget has time for."""
         given = self._loop, node.part, node.box, self._directions, self._problem.start
         began, steps, lost = self._budget.elapsed, list[ByForms](), None
         try:
-            for step in unrolled(*given, most=self.ways, wanted=self._wanted_bounds):
+            for step in unrolled(*given, most=ways or self.ways, wanted=self._wanted_bounds):
                 steps.append(step)
                 if budget.late:
                     break
@@ -367,7 +368,7 @@ class _Search(AbstractSearch):
         before, after = (self._beyond(found.offsets) for found in (node.found, tried))
         self._planned = True
         self._asks = bool(after.sum() <= (1 - CLOSED) * before.sum())
-        if self._follows:
+        if self._follows and (not self._asks or self._left >= 2 * WAYS):
             self._follow(node, float(after.sum()))
         if self._asks:
             most = self._left / (2 + self._price)
@@ -378,21 +379,22 @@ class _Search(AbstractSearch):
             self._wanted = int(min(most, 1 + float(after.max()) / gap))
 
     def _follow(self, node: Node, opened: float) -> None:
-        """Follow cells along ways from now on, unless another method leaves less of one open.
+        """Follow cells along ways from now on, unless another method closes much and leaves less.
 
         Args:
             node: that one.
             opened: what the other method leaves open of it, of all facets together.
         """
-        longest, self.ways = self._longest, WAYS
+        longest = self._longest
         share = self._budget.share(1 - LEFT_TO_METHOD if self._asks else 1.0)
-        followed = self._by_forms(node, share)
+        followed = self._by_forms(node, share, WAYS)
         self._left -= followed.effort
-        self._asks = self._asks and opened < float(self._beyond(followed.offsets).sum())
-        if self._asks:
-            self.ways, self._longest = 1, longest
-        elif followed.is_bounded:
-            node.found = followed
+        known = followed.is_bounded
+        if self._asks and not (known and self._beyond(followed.offsets).sum() <= opened):
+            self._longest = longest
+        elif known or not self._late:  # what is proved along fewer ways is kept as it is
+            self._asks, self.ways = False, WAYS
+            node.found = followed if known else node.found
 
     def _beyond(self, offsets: Float[np.ndarray, "N f"]) -> Float[np.ndarray, "N f"]:
         """What bounds leave open, in parts of ranges."""

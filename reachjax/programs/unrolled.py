@@ -53,7 +53,7 @@ class ByForms(NamedTuple):
     between: Float[Array | np.ndarray, "*N m"] | None = None
     open: tuple[OpenDecision, ...] = ()
     ways: int = 1
-    moved: Float[np.ndarray, " n"] = np.zeros(0)
+    moved: Float[np.ndarray, " n_x"] = np.zeros(0)
 
 
 def unrolled(
@@ -148,9 +148,20 @@ def _of_way(
             np.where(known[:, None], at[:, each], one)
             for each, one in zip(way.free, drawn, strict=True)
         ]
-        moved = abs(way.facts.columns[:, :first]).sum(axis=0)
+        moved = _moved(np.asarray(way.facts.columns), start)
         found = found._replace(offsets=upper, corners=corners, moved=moved)
     return found._replace(drawn=tuple(drawn), open=way.open)
+
+
+def _moved(columns: Float[np.ndarray, "k n"], start: InitialColumns) -> Float[np.ndarray, " n_x"]:
+    """How far each coordinate of the initial set moves numbers, all together, by their columns."""
+    sizes, first = abs(columns[:, : start.count]).sum(axis=0), start.spread.shape[1]
+    found = sizes[:first].copy()
+    for places in start.pairs:
+        np.add.at(found, places, sizes[first:])
+    if start.box is None or not start.round:
+        return found
+    return (found @ abs(start.back)) * np.asarray(start.box.upper - start.box.lower) / 2
 
 
 def _together(each: Sequence[ByForms]) -> ByForms:

@@ -238,7 +238,7 @@ class Sieve:
 
 
 def _deciding_axis(each: Sequence[ByForms]) -> int:
-    """The coordinate that moves what decides between ways most; -1 where there is one way.
+    """The coordinate that moves what decides between ways most; -1 where none does.
 
     Of its halves most have fewer ways. Along the longest side three times as many cells were needed
     for a cart-pole whose pole moves decisions, and not the place of the cart.

@@ -102,6 +102,13 @@ class InitialColumns(Replaceable):
         """How many columns there are, products among them."""
         return self.spread.shape[1] + len(self.pairs[0])
 
+    def by_coordinate(self, products: Float[np.ndarray, "k m"]) -> Float[np.ndarray, "k n"]:
+        """What products are worth, to each column that they are of; squares twice; in numpy."""
+        found = np.zeros((self.spread.shape[1], len(products)))
+        for places in self.pairs:
+            np.add.at(found, places, products.T)
+        return found.T
+
     def squared(self, rows: Rows) -> tuple[Any, Rows]:
         """`(r . w)^2` for each row: its constant, and its coefficients of the products."""
         i, j = self.pairs

@@ -155,10 +155,8 @@ def _of_way(
 
 def _moved(columns: Float[np.ndarray, "k n"], start: InitialColumns) -> Float[np.ndarray, " n_x"]:
     """How far each coordinate of the initial set moves numbers, all together, by their columns."""
-    sizes, first = abs(columns[:, : start.count]).sum(axis=0), start.spread.shape[1]
-    found = sizes[:first].copy()
-    for places in start.pairs:
-        np.add.at(found, places, sizes[first:])
+    sizes, first = abs(columns[:, : start.count]), start.spread.shape[1]
+    found = (sizes[:, :first] + start.by_coordinate(sizes[:, first:])).sum(axis=0)
     if start.box is None or not start.round:
         return found
     return (found @ abs(start.back)) * np.asarray(start.box.upper - start.box.lower) / 2

@@ -243,11 +243,7 @@ def _moved(layer: UnitForms, n: int) -> Float[np.ndarray, "k n"]:
 
 def _bent(start: InitialColumns, state: AffineForms) -> Float[np.ndarray, "n_x n"]:
     """What each state has of products of each of `n` coordinates, squares twice."""
-    n, found = len(start.center), np.zeros((len(state), len(start.center)))
-    for number, pair in enumerate(zip(*start.pairs, strict=True)):
-        for place in pair:
-            found[:, place] += abs(state.columns[:, n + number])
-    return found
+    return start.by_coordinate(abs(np.asarray(state.columns)[:, len(start.center) : start.count]))
 
 
 def _shares(rows: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k n"]:

@@ -9,12 +9,13 @@ tells.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import lru_cache, partial
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.loops.draws import drawn
@@ -30,6 +31,7 @@ from reachjax.numerics.checks import (
     same_size,
     whole_number,
 )
+from reachjax.numerics.host import in_numpy
 from reachjax.numerics.pytrees import Replaceable, converted, pytree
 from reachjax.sets import AbstractSet, Box
 from reachjax.sets.unusable import ThinSetError
@@ -185,17 +187,17 @@ class ClosedLoop(Replaceable):
     @property
     def unit_layers(self) -> tuple[UnitLayer, ...]:
         """The layers of units in the order of the forward pass, the projection's last."""
-        return _recorded(*_shaped(self))
+        return _layers(self)
 
     @property
     def controller_layers(self) -> tuple[UnitLayer, ...]:
         """The layers of units of the controller, which come after those of noise."""
-        return _recorded(*_shaped(self.controller))
+        return _layers(self.controller)
 
     @property
     def plant_layers(self) -> tuple[UnitLayer, ...]:
         """The layers of units of the plant, which come last."""
-        return _recorded(*_shaped(self.plant))
+        return _layers(self.plant)
 
     @property
     def curved(self) -> bool:
@@ -403,21 +405,43 @@ def split(scenarios: Any, n_x: int, n_w: int, n_v: int) -> Scenario:
     return Scenario(states, w if n_w else None, v if n_v else None)
 
 
-def _shaped(tree: Any) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
-    """The structure of a tree, and the shapes and kinds of its leaves."""
-    leaves, structure = jax.tree.flatten(tree)
-    kinds = ((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-    return structure, tuple(jax.ShapeDtypeStruct(*each) for each in kinds)
+MOST_KNOWN = 256
+"""The layers of so many loops, and parts of them, are kept."""
+
+_KNOWN: dict[Any, tuple[UnitLayer, ...]] = {}
 
 
-@lru_cache(maxsize=256)
-def _recorded(structure: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> tuple[UnitLayer, ...]:
+def _layers(tree: Any) -> tuple[UnitLayer, ...]:
     """The layers of units that the forward pass of a loop, or of a part of it, meets.
 
-    Args:
-        structure: of the loop, the plant or the controller as a tree.
-        leaves: their shapes and kinds.
+    They depend on its structure, and on the shapes and kinds of its leaves, but on no number: known
+    numbers are run as they are, which traces nothing.
     """
+    leaves, structure = jax.tree.flatten(tree)
+    kinds = tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    found = _KNOWN.get((structure, kinds))
+    if found is None:
+        if is_concrete(tree):
+            with np.errstate(all="ignore"):
+                found = _met(in_numpy(tree), np.zeros)
+        else:
+            shapes = [jax.ShapeDtypeStruct(*each) for each in kinds]
+            found = _traced(jax.tree.unflatten(structure, shapes))
+        if len(_KNOWN) >= MOST_KNOWN:
+            _KNOWN.clear()
+        _KNOWN[structure, kinds] = found
+    return found
+
+
+def _traced(tree: Any) -> tuple[UnitLayer, ...]:
+    """The layers, of a tree with shapes and kinds for leaves."""
+    found = []
+    jax.eval_shape(lambda tree: found.append(_met(tree, jnp.zeros)), tree)
+    return found[0]
+
+
+def _met(tree: Any, zeros: Callable[[int], Any]) -> tuple[UnitLayer, ...]:
+    """The layers that a forward pass meets from such vectors."""
     layers = []
 
     def record(unit: AbstractUnit, *y: Array) -> Array:
@@ -425,20 +449,13 @@ def _recorded(structure: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> tuple
         layers.append(UnitLayer(unit.kind, len(z), sum(map(len, y))))
         return z
 
-    def passed(tree: Any, given: Sequence[Array]) -> Array:
-        if isinstance(tree, ClosedLoop):
-            return tree.step(given[0], 0, record)
-        if isinstance(tree, AbstractPlant):
-            x, u, *w = given
-            return tree.propagate(x, u, 0, record, *w)
-        return tree.propagate(given[0], record)
-
-    tree = jax.tree.unflatten(structure, leaves)
-    sizes = [tree.inputs] if isinstance(tree, AbstractNetwork) else [tree.states]
-    if isinstance(tree, AbstractPlant):
-        sizes += [tree.inputs, *([tree.disturbances] if tree.disturbances else [])]
-    given = [jax.ShapeDtypeStruct((size,), float) for size in sizes]
-    jax.eval_shape(passed, tree, given)
+    if isinstance(tree, ClosedLoop):
+        tree.step(zeros(tree.states), 0, record)
+    elif isinstance(tree, AbstractPlant):
+        drawn = [zeros(tree.disturbances)] if tree.disturbances else []
+        tree.propagate(zeros(tree.states), zeros(tree.inputs), 0, record, *drawn)
+    else:
+        tree.propagate(zeros(tree.inputs), record)
     return tuple(layers)
 
 

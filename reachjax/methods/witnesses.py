@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import PULL, Runs, Scenarios
 from reachjax.loops.tracing.functions import Compiled
+from reachjax.numerics.host import in_numpy
 from reachjax.sets import AbstractSet
 
 ASCENT_STEPS = 80
@@ -178,7 +179,7 @@ class Simulations:
         self, loop: ClosedLoop, X0: AbstractSet, horizon: int, start: int, samples: int, seed: int
     ):
         self._loop, self._start, self._horizon = loop, start, horizon
-        self._on_host = jax.device_get(loop)
+        self._on_host = in_numpy(loop)
         self._scale = X0.scale()
         self._all = Scenarios.of(loop, X0, horizon, start)
         states = initial_states(X0, samples, seed)

@@ -18,6 +18,9 @@ from reachjax.numerics.checks import described
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import LOGGER, LONG
 
+ONCE = {"xla_backend_optimization_level": 0}
+"""For what is compiled in longer than it ever runs."""
+
 EVALUATIONS = 3000
 """What compiling a step of a loop takes, in evaluations of it in numpy: both grow with the number
 of operations (measured: 2100 to 3300 for five loops of 15 to 73 units, from 2 s to 57 s)."""

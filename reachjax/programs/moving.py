@@ -19,6 +19,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.tracing.functions import with_constants
 from reachjax.loops.units import AbstractUnit, Mark
 from reachjax.numerics.checks import is_concrete
+from reachjax.numerics.compilations import ONCE
 from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, states_facts, step_columns, step_forms
@@ -27,9 +28,6 @@ from reachjax.sets import AbstractSet, Box
 
 INTERVAL, KNOWN = -1, -2
 """In the place of a bound's number: that of an interval, and what is known of a state besides."""
-
-ONCE = {"xla_backend_optimization_level": 0}
-"""For what is compiled in longer than it ever runs."""
 
 Carry = tuple[AffineForms, Array]
 

@@ -13,6 +13,7 @@ every set has one around it.
 from __future__ import annotations
 
 import abc
+from functools import partial
 from typing import NamedTuple, Self
 
 import jax
@@ -522,9 +523,7 @@ class Box(PolyhedralSet):
     def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
         """Points drawn uniformly."""
         self._single()
-        shape = (count, self.dimension)
-        draws = jax.random.uniform(key, shape, dtype=self.lower.dtype)
-        return jnp.clip(self.lower + draws * self.widths, self.lower, self.upper)
+        return _uniform(self.lower, self.upper, key, count)
 
     def volume(self) -> Float[Array, ""]:
         """The product of the widths."""
@@ -535,6 +534,14 @@ class Box(PolyhedralSet):
         """The box itself."""
         self._single()
         return self
+
+
+@partial(jax.jit, static_argnames="count")
+def _uniform(
+    lower: Float[Array, " n"], upper: Float[Array, " n"], key: PRNGKeyArray, count: int
+) -> Float[Array, "count n"]:
+    draws = jax.random.uniform(key, (count, len(lower)), dtype=lower.dtype)
+    return jnp.clip(lower + draws * (upper - lower), lower, upper)
 
 
 @jax.jit

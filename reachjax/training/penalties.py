@@ -18,6 +18,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.methods.problem import AbstractMethod, Problem
 from reachjax.methods.propagation import Options, check_problem, require_kinds
 from reachjax.numerics.checks import described, is_concrete, whole_number
+from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import unlogged
 from reachjax.programs.relaxations import BranchAndCut, LinearBounds, LocalBounds
@@ -99,6 +100,7 @@ def volume_penalty(
     return _penalised(size, loop, X0, horizon, template, cells, options)
 
 
+@once_positional("goal", "avoid", "safe")
 @unlogged
 @lenient
 def specification_penalty(
@@ -106,10 +108,10 @@ def specification_penalty(
     X0: AbstractSet,
     horizon: int,
     template: AbstractTemplate,
-    goal: Timed | None = None,
-    avoid: AvoidSets | None = None,
-    safe: Region | None = None,
     *,
+    goal: Timed | None = None,
+    safe: Region | None = None,
+    avoid: AvoidSets | None = None,
     margin: float = 0.0,
     cells: Sequence[int] | None = None,
     **options: Any,
@@ -127,9 +129,9 @@ def specification_penalty(
         template: what every set looks like: facet directions, ellipsoids, or both.
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
+        safe: where every state must be at all times.
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
             times, or from ranges of times, to sequences.
-        safe: where every state must be at all times.
         margin: how far the sets should be from breaking a requirement, in the units of the state; a
             little more than zero keeps the proof when the weights move on.
         cells: as of `volume_penalty`; what is proved of each cell is proved of `X0`.
@@ -153,7 +155,9 @@ def specification_penalty(
     required: list[Requirement] = []
     if isinstance(loop, ClosedLoop):  # mistakes are named before anything is solved
         steps = whole_number("horizon", horizon, 1)
-        required = requirements(loop.states, steps, goal, avoid, safe, period_of(loop))
+        required = requirements(
+            loop.states, steps, period_of(loop), goal=goal, safe=safe, avoid=avoid
+        )
 
     def missed(tube: ReachTube | Sketch) -> Float[Array, ""]:
         return missing(required, tube, margin)

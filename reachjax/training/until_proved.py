@@ -41,6 +41,7 @@ from reachjax.numerics.checks import (
     whole_number,
     wrapped,
 )
+from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.numerics.seals import Seal, seal_of
@@ -134,6 +135,7 @@ class Trained:
         return f"Trained({self.verdict.status.name}, epochs={len(self.history)})"
 
 
+@once_positional("goal", "safe", "avoid")
 @logged
 @lenient
 def train(
@@ -141,10 +143,10 @@ def train(
     X0: Box,
     horizon: int,
     task_loss: TaskLoss,
+    *,
     goal: Timed | None = None,
     safe: Region | None = None,
     avoid: AvoidSets | None = None,
-    *,
     optimizer: optax.GradientTransformation | None = None,
     stages: Sequence[Stage] = STAGES,
     weight: float = 1.0,
@@ -245,7 +247,9 @@ def train(
     real_number("weight", weight, 0.0)
     require_bar(progress)
     loop, X0 = known_numbers("train", loop, X0, "X0")
-    required = tuple(requirements(loop.states, horizon, goal, avoid, safe, period_of(loop)))
+    required = tuple(
+        requirements(loop.states, horizon, period_of(loop), goal=goal, safe=safe, avoid=avoid)
+    )
     spec = Specification(horizon, start, required, real_number("margin", margin, 0.0))
     chosen = _skipping(_adam() if optimizer is None else optimizer, FOREVER - 1)
     run = _Run(loop, X0, spec, task_loss, chosen, tuple(stages), seed)

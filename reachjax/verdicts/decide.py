@@ -42,7 +42,9 @@ from reachjax.numerics.checks import (
     same_size,
     whole_number,
 )
+from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
+from reachjax.numerics.host import in_numpy
 from reachjax.numerics.logs import logged
 from reachjax.programs.followed import OpenDecision, open_decisions
 from reachjax.programs.relaxations import BranchAndCut
@@ -87,16 +89,17 @@ PULLS = 1.0, 1 - 1e-12, 1 - 1e-9, 1 - 1e-6
 """How far an initial state is brought towards the middle of the set, so that it surely is in it."""
 
 
+@once_positional("goal", "safe", "avoid")
 @logged
 @lenient
 def decide(
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
+    *,
     goal: Timed | None = None,
     safe: Region | None = None,
     avoid: AvoidSets | None = None,
-    *,
     relaxation: BranchAndCut = BranchAndCut(),  # noqa: B008  (immutable)
     start: int = 0,
     samples: int = 1000,
@@ -170,7 +173,10 @@ def decide(
     whole_number("samples", samples, 1)
     whole_number("seed", seed, 0)
     budget, (loop, X0) = Budget.of(time_limit), known_numbers("decide", loop, X0, "X0")
-    required = requirements(loop.states, horizon, goal, avoid, safe, period_of(loop))
+    loop = in_numpy(loop)
+    required = requirements(
+        loop.states, horizon, period_of(loop), goal=goal, safe=safe, avoid=avoid
+    )
     if cells is not None:
         CellTree.over(X0, cells)  # its errors come first
         require_executor(executor)
@@ -243,7 +249,7 @@ class _Asked(NamedTuple):
         if cells is not None:
             parts = CellTree.over(X0, cells)
             counts = () if isinstance(cells, int | np.integer) else tuple(map(int, cells))
-            task = CellTask(jax.device_get(loop), horizon, start, tuple(required), relaxation.nodes)
+            task = CellTask(in_numpy(loop), horizon, start, tuple(required), relaxation.nodes)
             given = task, X0, parts, simulations, budget, executor, progress
             return decided_by_cells(*given, counts=counts)
         decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
@@ -272,7 +278,7 @@ def _by_remedies(
     then programs, few of each bound first.
     """
     decision.at_first()
-    on_host, begun, around = jax.device_get((loop, X0, boxed(X0, "X0")))
+    on_host, begun, around = map(in_numpy, (loop, X0, boxed(X0, "X0")))
 
     def climb(nodes: int, cells_follow: bool = False) -> None:
         if not decision.ended:
@@ -340,13 +346,13 @@ class _Decision:
         budget: Budget,
     ):
         self._loop, self._start, self._budget = loop, start, budget
-        self._horizon, self._on_host, self._X0 = horizon, jax.device_get(loop), X0
+        self._horizon, self._on_host, self._X0 = horizon, in_numpy(loop), X0
         self._scenarios = Scenarios.of(loop, X0, horizon, start)
         self._middle = self._scenarios.middle(np.asarray(boxed(X0, "X0").center))
         self._findings = Findings(loop, X0, horizon, start, required)
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
         self._climbs = list[ClimbRecord]()
-        self._asked = Asked(loop, X0, horizon, start, tuple(required))
+        self._asked = Asked(jax.device_put(loop), X0, horizon, start, tuple(required))
         self._ends: dict[tuple[str, int], np.ndarray] = {}
         self._decisions: tuple[OpenDecision, ...] = ()
         self.simulations = simulations

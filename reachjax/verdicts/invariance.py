@@ -13,7 +13,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -126,7 +125,7 @@ def for_ever(
 
 def _long_runs(loop: ClosedLoop, X0: AbstractSet, start: int, seed: int, budget: Budget) -> Runs:
     """Many steps of trajectories from corners of a set and from points of it; few without time."""
-    scenarios, on_host = Scenarios.of(loop, X0, LONG, start), jax.device_get(loop)
+    scenarios, on_host = Scenarios.of(loop, X0, LONG, start), in_numpy(loop)
     drawn = scenarios.drawn(initial_states(X0, TRAJECTORIES, seed), seed)
     found = list[Runs]()
     for some in np.array_split(drawn, min(TURNS, len(drawn))):
@@ -164,8 +163,8 @@ def _broken_later(
 
 def _for_long(loop: ClosedLoop, wanted: Wanted) -> list[Requirement]:
     """What is wanted at all times of long simulations."""
-    given = None, wanted.avoid or None, wanted.safe
-    return requirements(loop.states, LONG, *given, period_of(loop))
+    wanted_of = {"safe": wanted.safe, "avoid": wanted.avoid or None}
+    return requirements(loop.states, LONG, period_of(loop), **wanted_of)
 
 
 def _require_unbroken(

@@ -30,6 +30,7 @@ from reachjax.numerics.checks import (
     whole_number,
     wrapped,
 )
+from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.logs import logged
@@ -201,16 +202,17 @@ class LargestSet(NamedTuple):
     verdict: Verdict
 
 
+@once_positional("goal", "safe", "avoid")
 @logged
 @lenient
 def largest_set(
     loop: ClosedLoop,
     X0: Kind,
     horizon: int,
+    *,
     goal: Timed | None = None,
     safe: Region | None = None,
     avoid: AvoidSets | None = None,
-    *,
     rounds: int = 50,
     relaxation: BranchAndCut = BranchAndCut(),  # noqa: B008  (immutable)
     start: int = 0,
@@ -263,7 +265,9 @@ def largest_set(
     loop.check_horizon(horizon, start)
     require_bar(progress)
     loop, X0 = known_numbers("largest_set", loop, X0, "X0")
-    required = requirements(loop.states, horizon, goal, avoid, safe, period_of(loop))
+    required = requirements(
+        loop.states, horizon, period_of(loop), goal=goal, safe=safe, avoid=avoid
+    )
 
     def decided(region: Kind) -> Verdict:
         limits = {
@@ -272,7 +276,7 @@ def largest_set(
             "samples": 200,
             "time_limit": budget.share(TURN).limit,
         }
-        return decide(loop, region, horizon, goal, safe, avoid, **limits)
+        return decide(loop, region, horizon, goal=goal, safe=safe, avoid=avoid, **limits)
 
     budget = Budget.of(time_limit)
     search = _Search(loop, X0, required, horizon, start, decided, budget)

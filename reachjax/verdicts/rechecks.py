@@ -23,6 +23,7 @@ from reachjax.methods.searches import Bar
 from reachjax.methods.steps import boxed
 from reachjax.numerics.budget import ENDLESS
 from reachjax.numerics.checks import wrapped
+from reachjax.numerics.host import in_numpy
 from reachjax.programs.affine import AffineForms, joined
 from reachjax.proofs.branches import Branches, bounds_of, leaf_bounds
 from reachjax.sets import AbstractSet
@@ -51,10 +52,10 @@ def rechecked(verdict: Verdict, progress: Bar | None = None) -> Verdict:
         DisagreementError: it says what is not proved.
         ValueError: the progress bar leaves out cells.
     """
-    asked = verdict.asked
-    assert asked is not None
+    assert verdict.asked is not None
+    asked = verdict.asked._replace(loop=in_numpy(verdict.asked.loop))
     findings = Findings(asked.loop, asked.X0, asked.horizon, asked.start, asked.required)
-    more: dict[str, Any] = {"asked": asked}
+    more: dict[str, Any] = {"asked": verdict.asked}
     left_out = 0
     try:
         if verdict.status is VerdictStatus.REFUTED:
@@ -91,7 +92,7 @@ def _refute(verdict: Verdict, asked: Asked, findings: Findings) -> None:
     example = verdict.counterexample
     if example is None:
         raise DisagreementError("the verdict is said to be REFUTED, but without a counterexample")
-    loop, X0 = jax.device_get((asked.loop, asked.X0))
+    loop, X0 = asked.loop, in_numpy(asked.X0)
     scenarios = Scenarios.of(loop, X0, asked.horizon, asked.start)
     drawn = (example.disturbances, example.noises)
     scenario = np.asarray(scenarios.joined(np.asarray(example.states)[0], *drawn), float)[None]
@@ -114,7 +115,7 @@ def _proved(
     Raises:
         ValueError: the tree is none of the initial set's, or there are not as many climbs as cells.
     """
-    loop, cells = jax.device_get(asked.loop), _cells(asked.X0, grounds)
+    loop, cells = asked.loop, _cells(asked.X0, grounds)
     if not cells or len(cells) != len(grounds.climbs):
         raise ValueError(f"it has {len(cells)} cells, but {len(grounds.climbs)} proofs")
     found = {(item.name, item.time): (np.inf, True) for item in asked.required}

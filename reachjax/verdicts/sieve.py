@@ -24,7 +24,7 @@ from reachjax.loops.units import UnboundedError
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.compilations import CompiledBeside
 from reachjax.numerics.host import in_numpy
-from reachjax.numerics.rounding import gamma, holds_subnormals
+from reachjax.numerics.rounding import TINY, gamma, holds_subnormals
 from reachjax.programs.followed import OpenDecision
 from reachjax.programs.unrolled import ByForms, along_ways, unrolled, unrolled_from_boxes
 from reachjax.sets import AbstractSet, Box
@@ -253,5 +253,5 @@ def _at_first(
     """What rows attain on boxes: exactly, if each is a coordinate, else rounded up."""
     largest = np.maximum(rows * lower[:, None], rows * upper[:, None])
     whole = np.isin(rows, (-1.0, 0.0, 1.0)).all(axis=1) & (np.count_nonzero(rows, axis=1) < 2)
-    error = gamma(2 * rows.shape[1]) * abs(largest).sum(axis=2)
+    error = gamma(2 * rows.shape[1]) * abs(largest).sum(axis=2) + rows.shape[1] * TINY
     return largest.sum(axis=2) + np.where(whole, 0.0, error)

@@ -8,6 +8,7 @@ against what is proved. One that breaks it by more than rounding is no verdict b
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ from jaxtyping import Array, Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.loops.tracing.functions import Compiled
+from reachjax.numerics.compilations import ONCE
 from reachjax.sets import AbstractSet
 from reachjax.verdicts.counterexamples import deviates, enclosures, most_room
 from reachjax.verdicts.specification import Requirement
@@ -161,7 +163,7 @@ def compiled_runs(
     return Runs(rows, np.stack(jax.device_get(found), axis=1)[: len(rows)])
 
 
-@Compiled
+@partial(Compiled, compiler_options=ONCE)
 def _stepped(
     loop: ClosedLoop,
     states: Float[Array, "c n_x"],

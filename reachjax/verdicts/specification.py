@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from reachjax.loops import ClosedLoop
 from reachjax.methods.problem import Span, at
 from reachjax.numerics.checks import described, is_concrete, real_number, require_kind
+from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope, outer_polytope
@@ -274,9 +275,7 @@ class Requirement:
         return bool(np.all(known & right))
 
 
-def of_tube(
-    tube: ReachTube, goal: Timed | None, avoid: AvoidSets | None, safe: Region | None
-) -> list[Requirement]:
+def of_tube(tube: ReachTube, **required: Any) -> list[Requirement]:
     """A specification's requirements for a tube, one for each set and time.
 
     Raises:
@@ -286,7 +285,7 @@ def of_tube(
     """
     require_kind("tube", tube, ReachTube, "a ReachTube, as reach(...) returns it")
     tube.require_sealed()
-    return requirements(tube.loop.states, tube.horizon, goal, avoid, safe, period_of(tube.loop))
+    return requirements(tube.loop.states, tube.horizon, period_of(tube.loop), **required)
 
 
 def period_of(loop: ClosedLoop) -> float | None:
@@ -303,21 +302,22 @@ def period_of(loop: ClosedLoop) -> float | None:
 def requirements(
     states: int,
     horizon: int,
-    goal: Timed | None,
-    avoid: AvoidSets | None,
-    safe: Region | None,
     period: float | None = None,
+    *,
+    goal: Timed | None = None,
+    safe: Region | None = None,
+    avoid: AvoidSets | None = None,
 ) -> list[Requirement]:
     """A specification's requirements, one for each set and time.
 
     Args:
         states: of the loop.
         horizon: the number of steps.
-        goal: where states must be, at samples or over spans.
-        avoid: where they must not be.
-        safe: where they must be all along.
-        period: of a plant in continuous time: then the latter two are meant at all times, in
+        period: of a plant in continuous time: then the last two are meant at all times, in
             between samples too, at a sample since the one before.
+        goal: where states must be, at samples or over spans.
+        safe: where they must be all along.
+        avoid: where they must not be.
 
     Raises:
         TypeError: a set is no Box, Polytope or Ellipsoid, or a time no whole number.
@@ -448,13 +448,14 @@ def _depths(ball: Ellipsoid, points: np.ndarray) -> Float[np.ndarray, " c"]:
     return (1 - away) * np.sqrt(np.linalg.eigvalsh(np.asarray(ball.shape))[0])
 
 
+@once_positional("goal", "avoid", "safe")
 @lenient
 def shortfall(
     tube: ReachTube,
-    goal: Timed | None = None,
-    avoid: AvoidSets | None = None,
-    safe: Region | None = None,
     *,
+    goal: Timed | None = None,
+    safe: Region | None = None,
+    avoid: AvoidSets | None = None,
     margin: float = 0.0,
 ) -> Float[Array, ""]:
     """By how much a tube misses a specification: zero if every margin is at least `margin`.
@@ -468,9 +469,9 @@ def shortfall(
         tube: certified sets for `t = 0 .. horizon`.
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
+        safe: where every state must be at all times.
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
             times, or from ranges of times, to sequences.
-        safe: where every state must be at all times.
         margin: how far the sets should be from breaking a requirement, in the units of the state.
 
     Raises:
@@ -486,7 +487,7 @@ def shortfall(
         0.1
     """
     check_margin(margin)
-    return missing(of_tube(tube, goal, avoid, safe), tube, margin)
+    return missing(of_tube(tube, goal=goal, safe=safe, avoid=avoid), tube, margin)
 
 
 def missing(

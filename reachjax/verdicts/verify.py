@@ -16,6 +16,7 @@ from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.methods.witnesses import initial_states
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.checks import is_concrete, require_kind, whole_number
+from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.sets import AbstractSet
@@ -29,14 +30,15 @@ from reachjax.verdicts.specification import AvoidSets, Region, Requirement, Time
 from reachjax.verdicts.verdict import Verdict, of_cells
 
 
+@once_positional("goal", "avoid", "safe")
 @logged
 @lenient
 def verify(
     tube: ReachTube | PartitionedTube,
-    goal: Timed | None = None,
-    avoid: AvoidSets | None = None,
-    safe: Region | None = None,
     *,
+    goal: Timed | None = None,
+    safe: Region | None = None,
+    avoid: AvoidSets | None = None,
     samples: int = 10_000,
     seed: int = 0,
     forever: bool = False,
@@ -48,9 +50,9 @@ def verify(
         tube: certified sets for `t = 0 .. horizon`; of a partitioned tube, those of every cell.
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
+        safe: where every state must be at all times (its complement is avoided).
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
             times, or from ranges of times, to sequences.
-        safe: where every state must be at all times (its complement is avoided).
         samples: how many trajectories are simulated in search of a counterexample, besides those
             from corners and witnesses; so many from each cell.
         seed: of the samples.
@@ -87,10 +89,10 @@ def verify(
     if isinstance(tube, PartitionedTube):
         tube.require_sealed()
         tubes, X0 = tube.tubes, tube.X0
-        cells = [(each, of_tube(each, goal, avoid, safe)) for each in tubes]
+        cells = [(each, of_tube(each, goal=goal, safe=safe, avoid=avoid)) for each in tubes]
         verdict = of_cells([_decided(*cell, samples, seed, X0) for cell in cells])
     else:
-        required = of_tube(tube, goal, avoid, safe)
+        required = of_tube(tube, goal=goal, safe=safe, avoid=avoid)
         tubes, X0 = (tube,), tube.sets[0]
         verdict = _decided(tube, required, samples, seed, X0)
     if not forever:

@@ -33,6 +33,7 @@ from reachjax.numerics.checks import (
     same_size,
     whole_number,
 )
+from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.numerics.seals import seal_of
@@ -84,16 +85,17 @@ class Sorted(NamedTuple):
     promising: bool = False
 
 
+@once_positional("goal", "safe", "avoid")
 @logged
 @lenient
 def winning_set(
     loop: ClosedLoop,
     domain: Box,
     horizon: int,
+    *,
     goal: Timed | None = None,
     safe: Region | None = None,
     avoid: AvoidSets | None = None,
-    *,
     cells: int = 10_000,
     relaxation: BranchAndCut = BranchAndCut(nodes=LAST_PROGRAMS),  # noqa: B008  (immutable)
     start: int = 0,
@@ -157,7 +159,9 @@ def winning_set(
     most = whole_number("cells", cells, 1)
     require_executor(executor)
     require_bar(progress)
-    required = requirements(loop.states, horizon, goal, avoid, safe, period_of(loop))
+    required = requirements(
+        loop.states, horizon, period_of(loop), goal=goal, safe=safe, avoid=avoid
+    )
     loop, domain = jax.device_get(known_numbers("winning_set", loop, domain, "domain"))
     task = CellTask(loop, horizon, start, tuple(required), relaxation.nodes)
     asked = {

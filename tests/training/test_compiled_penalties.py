@@ -41,7 +41,7 @@ def alike(one, other):
 
 def margins(reached, regions=REGIONS):
     """Of being in each set and of staying out of it."""
-    asked = [requirements(2, 1, {1: one}, {1: [one]}, None) for one in regions.values()]
+    asked = [requirements(2, 1, goal={1: one}, avoid={1: [one]}) for one in regions.values()]
     return [item.compared_with(reached, by_offsets=True).margins for both in asked for item in both]
 
 

@@ -204,7 +204,7 @@ def test_forms_over_a_cell_miss_what_trajectories_from_it_miss(kind):
     loop, steps = rj.ClosedLoop(plant, net), 3
     safe, wall = rj.Box([-0.1, -0.1], [0.1, 0.1]), rj.Box([0.2, -1.0], [0.5, 1.0])
     period = 0.1 if plant.continuous else None
-    required = tuple(requirements(2, steps, None, [wall], safe, period))
+    required = tuple(requirements(2, steps, period, safe=safe, avoid=[wall]))
 
     @jax.jit
     def both(lower, upper, states):

@@ -75,8 +75,8 @@ def test_programs_are_the_last_remedy_of_cells_that_may_not_be_halved(programs):
     loop, X0 = rj.ClosedLoop(plant, net), rj.Box([-1.0], [2.0])
     goal = rj.Box([-0.62], [1.22])
     without = rj.BranchAndCut(nodes=0)
-    assert rj.decide(loop, X0, 1, goal, cells=1, relaxation=without).status.name == "UNKNOWN"
-    assert rj.decide(loop, X0, 1, goal, cells=1).status.name == "PROVED"
+    assert rj.decide(loop, X0, 1, goal=goal, cells=1, relaxation=without).status.name == "UNKNOWN"
+    assert rj.decide(loop, X0, 1, goal=goal, cells=1).status.name == "PROVED"
     assert programs
 
 

@@ -89,7 +89,9 @@ def test_penalties_take_it():
     volume = jax.jit(lambda X0: rj.volume_penalty(loop, X0, 2, template, **options))(X0)
     np.testing.assert_allclose(volume, rj.volume_penalty(loop, X0, 2, template, **options))
     goal = rj.Box([-0.1, -0.1], [0.1, 0.1])
-    missed = jax.grad(lambda X0: rj.specification_penalty(loop, X0, 2, template, goal, **options))
+    missed = jax.grad(
+        lambda X0: rj.specification_penalty(loop, X0, 2, template, goal=goal, **options)
+    )
     assert any(np.any(leaf != 0) for leaf in jax.tree.leaves(missed(X0)))
 
 

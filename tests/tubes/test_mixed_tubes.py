@@ -118,7 +118,7 @@ def test_compiled_and_plain_penalties_agree(horizon):
 
     def missed(net):
         template, closed = rj.MixedTemplate(rj.Template.box(2)), loop.replace(controller=net)
-        return rj.specification_penalty(closed, X0, horizon, template, goal, avoid)
+        return rj.specification_penalty(closed, X0, horizon, template, goal=goal, avoid=avoid)
 
     value, gradient = jax.jit(jax.value_and_grad(missed))(loop.controller)
     assert float(value) == pytest.approx(float(missed(loop.controller)), abs=1e-6)

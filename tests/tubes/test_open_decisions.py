@@ -70,9 +70,7 @@ def test_a_cell_is_halved_along_what_decides():
     still = rj.MLP.from_layers([([[0.0, 0.0]], [0.0])])
     loop = rj.ClosedLoop(rj.NonlinearPlant(plant, states=2, inputs=1), still)
     goal, X0 = rj.Box([-3.0, -0.5], [3.0, 2.0]), rj.Box([-1.0, -1.0], [1.0, 1.0])
-    task = CellTask(
-        jax.device_get(loop), 1, 0, tuple(requirements(2, 1, goal, None, None)), nodes=0
-    )
+    task = CellTask(jax.device_get(loop), 1, 0, tuple(requirements(2, 1, goal=goal)), nodes=0)
     outcome = outcome_of(task, jax.device_get(X0), Budget())
     assert not outcome.proved
     assert outcome.axis == 1

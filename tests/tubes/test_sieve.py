@@ -46,7 +46,7 @@ def test_what_is_decided_of_cells_is_true(kind):
     loop = LOOPS[kind]()
     n = loop.states
     goal, avoid = rj.Ellipsoid(np.zeros(n), 0.7 * np.eye(n)), rj.Box([-0.4] * n, [-0.1] * n)
-    wanted = requirements(n, HORIZON, goal, [avoid], rj.Box([-1.0] * n, [1.0] * n))
+    wanted = requirements(n, HORIZON, goal=goal, safe=rj.Box([-1.0] * n, [1.0] * n), avoid=[avoid])
     boxes = cells(n)
     decided = []
     for (low, high), found in zip(
@@ -73,7 +73,7 @@ def test_what_compiled_code_takes_for_zero_is_not_sifted(where, monkeypatch):
     def pays(weight, lower):
         net = rj.MLP.from_layers([([[weight]], [0.0]), ([[1e300]], [0.0])])
         loop = rj.ClosedLoop(rj.AffinePlant([[0.5]], [[1.0]]), net)
-        sieve = Sieve(loop, 1, 0, requirements(1, 1, None, None, rj.Box([-9.0], [9.0])))
+        sieve = Sieve(loop, 1, 0, requirements(1, 1, safe=rj.Box([-9.0], [9.0])))
         return sieve.pays([(np.array([lower]), np.array([1.0]))], Budget())
 
     assert pays(1e-300, 0.0)
@@ -83,9 +83,7 @@ def test_what_compiled_code_takes_for_zero_is_not_sifted(where, monkeypatch):
 @pytest.mark.costly
 def test_few_cells_are_bounded_as_many():
     loop = LOOPS["three states"]()
-    sieve = Sieve(
-        loop, HORIZON, 0, requirements(3, HORIZON, None, None, rj.Box(-np.ones(3), np.ones(3)))
-    )
+    sieve = Sieve(loop, HORIZON, 0, requirements(3, HORIZON, safe=rj.Box(-np.ones(3), np.ones(3))))
     boxes = cells(3)
     many, few = sieve.sifted(boxes), sieve.sifted(boxes[:2])
     assert [str(one) for one in many[:2]] == [str(one) for one in few]
@@ -94,7 +92,7 @@ def test_few_cells_are_bounded_as_many():
 @pytest.mark.costly
 def test_touching_at_first_is_inside():
     loop = LOOPS["one state"]()
-    wanted = requirements(1, 1, None, None, rj.Box([-1e9], [1e9]))
-    wanted[0] = requirements(1, 1, {0: rj.Box([-0.1], [0.3])}, None, None)[0]
+    wanted = requirements(1, 1, safe=rj.Box([-1e9], [1e9]))
+    wanted[0] = requirements(1, 1, goal={0: rj.Box([-0.1], [0.3])})[0]
     (found,) = Sieve(loop, 1, 0, wanted).sifted([(np.array([-0.1]), np.array([0.3]))])
     assert found.proved

@@ -149,9 +149,9 @@ def test_what_is_no_ball_to_be_decided_is_refused(tube):
         with pytest.raises(ValueError, match=f"goal is too thin.*|{said}"):
             rj.verify(tube, goal=rj.Ellipsoid([1.0, 1.0], shape))
     with pytest.raises(ValueError, match="goal is an ellipsoid of dimension 6, and up to 5"):
-        requirements(6, 2, ball(1.0, np.zeros(6)), None, None)
+        requirements(6, 2, goal=ball(1.0, np.zeros(6)))
     with pytest.raises(ValueError, match="goal must be a polytope inside"):
-        jax.jit(lambda r: len(requirements(2, 2, ball(r), None, None)))(0.3)
+        jax.jit(lambda r: len(requirements(2, 2, goal=ball(r))))(0.3)
 
 
 @pytest.mark.costly
@@ -208,7 +208,7 @@ def test_sets_to_avoid_at_times_and_over_spans(tube):
     assert statuses(tube, avoid={range(2, 5): [away(0.51)]}) == {"PROVED"}
     assert statuses(tube, avoid={range(1, 5): [away(0.51)]}) == {"REFUTED"}
     both = {range(1, 3): [away(1.1)], np.int64(2): [away(0.4)]}
-    named = [(item.time, item.name) for item in requirements(2, 4, None, both, None)]
+    named = [(item.time, item.name) for item in requirements(2, 4, avoid=both)]
     assert named == [(1, "avoid[0]"), (2, "avoid[0]"), (2, "avoid[1]")]
     assert statuses(tube, avoid={range(1, 3): [away(1.1)], 2: [away(0.4)]}) == {"REFUTED"}
 

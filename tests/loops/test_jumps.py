@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 from jax import lax
 
-from tests.loops.traced import assert_sound
+from reachjax.numerics.host import in_numpy
+from tests.loops.traced import assert_sound, interval, network
 
 T, ROWS = jnp.array([1.0, -2.0, 3.0]), jnp.array([[1.0, 2.0], [0.5, -1.0], [-3.0, 0.0]])
 W = jnp.array([[1.0, 0.3], [-0.2, 1.1], [0.7, -0.9]])
 Partial = jax.tree_util.Partial
+
+
+def bits(x):
+    """Whether the numbers are above places."""
+    return jnp.stack([x[0] > 0.3, x[1] > 0])
 
 
 def hypot(x, y):
@@ -85,6 +91,51 @@ JUMPS = {
     "by another number": lambda x: jnp.where(x[::-1] > 0, 2 * x, x),
     "by a learned threshold": Partial(lambda s, x: jnp.where(x > s, x, 0.0), 0.1),
     "equal": lambda x: jnp.where(x == 0.25, 2.0, x),
+    "signs beside numbers": lambda x: jnp.concatenate([jnp.sign(x), x, x > 0.5]),
+    "a place beside a number": lambda x: jnp.array([jnp.argmax(W @ x), 2]) * x,
+    "stacked truth values turned": lambda x: (~bits(x).astype(int)) * x,
+    "stacked truth values as numbers": lambda x: (2 * bits(x).astype(int) + 1) * x,
+    "entries by stacked truth values": lambda x: T[bits(x).astype(int)] * x,
+    "the first that holds": lambda x: T[jnp.argmax(bits(x).astype(int))] * x,
+    "the last that holds": lambda x: T[jnp.argmax(jnp.cumsum(bits(x).astype(int)))] * x,
+    "a place moved": lambda x: lax.switch(
+        jnp.argmax(W @ x) - 1, [jnp.sin, lambda x: 2 * x, jnp.negative], x
+    ),
+    "one that always holds": lambda x: jnp.select([jnp.array(True), x[0] > 0], [1.0, 2.0], 3.0) * x,
+    "branches of comparisons": lambda x: jnp.where(
+        lax.cond(x[0] > 0, lambda x: x[1] > 0, lambda x: x[1] > 0.5, x), x, -x
+    ),
+    "a truth value and a place": lambda x: ((x[0] > 0).astype(int) == jnp.argmax(x)) * x,
+    "a number times signs": lambda x: x[0] * jnp.sign(x),
+    "all products with signs": lambda x: jnp.outer(jnp.sign(x), x).ravel(),
+    "a column by a row": lambda x: (x[:, None] * jnp.sign(x)[None]).ravel(),
+    "a sign times signs": lambda x: jnp.sign(x[0]) * jnp.sign(x),
+    "branches of signs": lambda x: lax.cond(x[0] > 0, jnp.negative, jnp.sign, x),
+    "thresholds that were chosen": lambda x: jnp.where(x[0] > T[jnp.argmax(W @ x)], x, -x),
+    "a relay with hysteresis": lambda x: jnp.where(x[0] > jnp.where(x[1] > 0, -0.1, 0.1), 1.0, -1.0)
+    * x,
+    "places among bounds": lambda x: jnp.searchsorted(jnp.array([-0.5, 0.1, 0.7]), x) * x,
+    "counts in eight bits": lambda x: jnp.sum(x > 0, dtype=jnp.uint8) * x,
+}  # fmt: skip
+
+REFUSED = {
+    "counts below none": lambda x: (jnp.uint8(1) - jnp.sum(x > 0, dtype=jnp.uint8)) * x,
+    "counts that are turned": lambda x: -jnp.sum(x > 0, dtype=jnp.uint8) * x,
+    "products of eight bits": lambda x: (jnp.sum(x > 0, dtype=jnp.int8) * jnp.int8(100)) * x,
+    "sums of eight bits": lambda x: jnp.sum(
+        jnp.where(x > 0, jnp.int8(100), jnp.int8(0)), dtype=jnp.int8
+    ) * x,
+    "products of 64 bits": lambda x: (jnp.sum(x > 0) * 2**62) * x,
+    "counts beside others": lambda x: T[
+        jnp.argmax(jnp.append(jnp.cumsum(bits(x).astype(int)), 1))
+    ] * x,
+    "counts as truth values": lambda x: T[
+        jnp.argmax(jnp.cumsum(bits(x).astype(int)).astype(bool))
+    ] * x,
+    "cases by a parameter": Partial(lambda t, x: jnp.where(t[jnp.argmax(W @ x)] > 0, x, -x), T),
+    "a condition of a parameter": Partial(
+        lambda t, x: jnp.select([x[0] > 0, t[0] > 0], [1.0, 2.0], 3.0) * x, T
+    ),
 }  # fmt: skip
 
 
@@ -99,8 +150,6 @@ BESIDE = np.concatenate([ON, np.nextafter(ON, np.inf), np.nextafter(ON, -np.inf)
 
 @pytest.mark.parametrize("name", JUMPS)
 def test_values_on_the_surfaces_are_within_the_bounds_of_a_point(name):
-    from tests.loops.traced import interval, network
-
     function = JUMPS[name]
     net = network(function)
     expected = np.asarray(jax.vmap(function)(BESIDE))
@@ -108,3 +157,22 @@ def test_values_on_the_surfaces_are_within_the_bounds_of_a_point(name):
         low, high = interval(net, x, x)
         slack = 1e-13 * (1 + abs(value))
         assert np.all((low - slack <= value) & (value <= high + slack)), (x, low, value, high)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_would_be_read_otherwise_than_it_is_computed_is_refused(name):
+    with pytest.raises(TypeError, match=r"cannot be certified: .*(range of|counting|parameter)"):
+        network(REFUSED[name])
+
+
+def test_known_and_traced_tables_are_gated_by_the_same_events():
+    net = network(Partial(lambda t, x: t[jnp.argmax(W @ x)] * x, jnp.array([1.0, 0.0, 3.0])))
+
+    def gates(net, x):
+        found = []
+        net.propagate(x, lambda unit, *y: found.append(unit(*y)) or found[-1])
+        return found
+
+    for x in np.array([[1.0, 0.2], [-1.0, 0.5], [0.3, 1.0], [0.5, -1.0]]):
+        pairs = zip(gates(in_numpy(net), x), jax.jit(gates)(net, x), strict=True)
+        assert all(np.array_equal(*pair) for pair in pairs)

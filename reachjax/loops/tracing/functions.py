@@ -237,9 +237,12 @@ class Function:
             if isinstance(wanted, Choice):
                 wanted = number_of(recorder, as_pick(recorder, wanted))
         except UnsupportedError as error:
-            raise TypeError(
-                f"the primitive {error.primitive!r}{error.line} cannot be certified: {error}"
-            ) from None
+            what = (
+                f"the primitive {error.primitive!r}{error.line}"
+                if error.primitive
+                else "its result"
+            )
+            raise TypeError(f"{what} cannot be certified: {error}") from None
         return self.parameters, (recorder, wanted)
 
 

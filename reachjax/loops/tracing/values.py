@@ -104,10 +104,11 @@ class Conditions(Choice):
     Attributes:
         parts: these.
         counted: whether they are numbers of those so far that hold.
+        kind: of the entries: truth values, or zeros and ones of another kind.
     """
 
-    def __init__(self, parts: Sequence[Any], counted: bool = False):
-        self.parts, self.counted = tuple(parts), counted
+    def __init__(self, parts: Sequence[Any], counted: bool = False, kind: Any = bool):
+        self.parts, self.counted, self.kind = tuple(parts), counted, kind
 
     @property
     def shape(self) -> Shape:
@@ -149,6 +150,12 @@ class Pick(Choice):
     def shape(self) -> Shape:
         """The shape of the array."""
         return np.shape(self.numbers)[1:]
+
+    @property
+    def cases(self) -> list[Any]:
+        """The array of each event: of parameters, if the numbers are."""
+        own = isinstance(self.numbers, Parameter)
+        return [Parameter.of(each) if own else each for each in self.numbers]
 
     @property
     def is_single(self) -> bool:

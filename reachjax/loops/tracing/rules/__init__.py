@@ -41,7 +41,7 @@ __all__ = ["Equation", "recorded"]
 
 # fmt: off
 INFINITE = (
-    "max", "min", "clamp", "select_n", "gt", "ge", "lt", "le", "eq", "ne", *moving.RULES,
+    "max", "min", "clamp", "select_n", *jumps.COMPARED, *moving.RULES,
 )
 """Primitives that may take numbers that are not finite."""
 # fmt: on
@@ -80,8 +80,17 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
     """The value, or a list of them, of one equation, of which one operand at least is a value.
 
     Raises:
-        UnsupportedError: there is no rule for it.
+        UnsupportedError: there is no rule for it, or whole numbers may leave their range.
     """
+    found = _recorded(recorder, equation, operands)
+    if jnp.issubdtype(equation.kind, jnp.integer):
+        for each in found if isinstance(found, list) else [found]:
+            if isinstance(each, Value):
+                jumps.require_whole(recorder, equation, each)
+    return found
+
+
+def _recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
     if jnp.issubdtype(equation.kind, jnp.inexact) and equation.kind != jnp.result_type(float):
         raise UnsupportedError(
             f"it rounds to {equation.kind}: compute in 64-bit floats, for example by not giving "
@@ -126,7 +135,7 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
 def _moved(recorder: Recorder, equation: Equation, operand: Any, others: Sequence[Any]) -> Any:
     """Entries of truth values, or of places, are those of what decides about them."""
     if isinstance(operand, Comparison):
-        moved = recorded(recorder, equation, [operand.value, *others])
+        moved = _recorded(recorder, equation, [operand.value, *others])  # no whole numbers
         return Comparison(moved, operand.strict)
     if isinstance(operand, Index):
         conditions = [_moved(recorder, equation, each, others) for each in operand.conditions]

@@ -97,7 +97,7 @@ def _compared(recorder: Recorder, equation: Equation, operands: Sequence[Operand
     for each, sign in ((one, 1), (other, -1)):
         if _is_plain(each) and np.size(each) and np.all(np.isinf(np.asarray(each))):
             return sign * np.asarray(each) > 0
-    return Comparison(recorder.added(one, other, -1), strict=equation.name in ("gt", "lt"))
+    return Comparison(recorder.added(one, other, -1), strict=equation.name in ("gt", "lt", "lt_to"))
 
 
 @entrywise
@@ -144,7 +144,7 @@ RULES: dict[str, Rule] = {
     "min": _minimum,
     "clamp": _clamped,
     "abs": _absolute,
-    **dict.fromkeys(("gt", "ge", "lt", "le"), _compared),
+    **dict.fromkeys(("gt", "ge", "lt", "le", "lt_to", "le_to"), _compared),
     **dict.fromkeys(("eq", "ne"), _equal),
     "is_finite": _finite,
     "select_n": _selected,

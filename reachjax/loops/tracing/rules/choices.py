@@ -33,11 +33,18 @@ from reachjax.loops.tracing.values import (
 
 
 def _converted(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
-    """Truth values as whole numbers."""
-    (choice,) = operands
-    if isinstance(choice, Comparison) and jnp.issubdtype(equation.kind, jnp.integer):
-        return Index([np.zeros(choice.shape, bool), choice], kind=equation.kind)
-    return choice if isinstance(choice, Conditions) else None
+    """Truth values as numbers of another kind, and counts as whole numbers that hold them."""
+    (choice,), kind = operands, equation.kind
+    if isinstance(choice, Comparison) and jnp.issubdtype(kind, jnp.integer):
+        return Index([np.zeros(choice.shape, bool), choice], kind=kind)
+    if not isinstance(choice, Conditions) or (choice.counted and not _counts(choice, kind)):
+        return None
+    return Conditions(choice.parts, choice.counted, kind)
+
+
+def _counts(conditions: Conditions, kind: Any) -> bool:
+    """Whether numbers of a kind are as many as there are conditions, and wrap at none of these."""
+    return jnp.issubdtype(kind, jnp.integer) and len(conditions.parts) <= jnp.iinfo(kind).max
 
 
 def _stacked(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
@@ -49,17 +56,19 @@ def _stacked(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
     for each in operands:
         if is_stack:
             parts.append(each)
-        elif isinstance(each, Conditions):
+        elif isinstance(each, Conditions) and not each.counted:
             parts += each.parts
         elif isinstance(each, Comparison):
             index = np.arange(each.value.size).reshape(each.shape)
             taken = (recorder.taken(each.value, row) for row in index)
             parts += [Comparison(one, each.strict) for one in taken]
+        elif is_plain(each) and is_known(each):
+            parts += [*np.asarray(each)]
         else:
-            parts += [*(np.asarray(each) if is_known(each) else each)]
+            return None
     if not all(isinstance(each, Comparison) or _is_truth(each) for each in parts):
         return None
-    return Conditions(parts)
+    return Conditions(parts, kind=equation.kind)
 
 
 def _is_truth(part: Any) -> bool:
@@ -74,7 +83,9 @@ def _so_far(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
     params = equation.params
     if not isinstance(choice, Conditions) or choice.counted or params["axis"] or params["reverse"]:
         return None
-    return Conditions(choice.parts, counted=True)
+    if not _counts(choice, equation.kind):
+        return None
+    return Conditions(choice.parts, counted=True, kind=equation.kind)
 
 
 def _place(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
@@ -116,7 +127,9 @@ def _asked(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) 
         return None
     (index,), (first, second) = places, places[0].conditions
     plain = [each for each in operands if each is not index]
-    if not isinstance(second, Comparison) or np.any(first) or not is_known(*plain):
+    if not isinstance(second, Comparison) or np.any(first):
+        return None
+    if not all(map(is_plain, plain)) or not is_known(*plain):
         return None
     both = [
         np.asarray(equation.evaluate(*(np.asarray(k, index.kind) if e is index else e

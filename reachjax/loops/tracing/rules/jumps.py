@@ -17,7 +17,7 @@ import numpy as np
 
 from reachjax.loops.tracing.limits import ConstantLimits
 from reachjax.loops.tracing.recording import Recorder
-from reachjax.loops.tracing.rules.equations import NOT_FINITE, Equation, Rule
+from reachjax.loops.tracing.rules.equations import NOT_FINITE, Equation, Rule, on_host, shaped
 from reachjax.loops.tracing.rules.moving import ALONE
 from reachjax.loops.tracing.rules.picks import (
     MANY,
@@ -32,6 +32,7 @@ from reachjax.loops.tracing.rules.picks import (
     number,
     of_bits,
     opposite,
+    places_of,
     plain_stack,
     stacked,
     stepped,
@@ -45,6 +46,7 @@ from reachjax.loops.tracing.values import (
     Shape,
     UnsupportedError,
     Value,
+    is_constant,
     is_known,
     is_plain,
 )
@@ -60,11 +62,15 @@ ACTIONS = 32
 ENTRYWISE = frozenset({
     "abs", "add", "add_any", "and", "ceil", "clamp", "convert_element_type", "copy", "copy_p",
     "cos", "div", "eq", "exp", "exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite",
-    "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not", "or", "pow",
+    "le", "le_to", "log", "log1p", "logistic", "lt", "lt_to", "max", "min", "mul", "ne", "neg",
+    "not", "or", "pow",
     "rem", "round", "select_n", "shift_left", "shift_right_arithmetic", "shift_right_logical",
     "sign", "sin", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor",
 })
 """Primitives whose results are entry by entry of the same entries of their operands."""
+
+COMPARED = frozenset({"eq", "ge", "gt", "le", "le_to", "lt", "lt_to", "ne"})
+"""Primitives that compare: what is picked with what depends on inputs, as numbers."""
 
 OF_WHOLE = frozenset({
     "add", "add_any", "sub", "neg", "reduce_sum", "cumsum", "dot_general", "mul", "argmax",
@@ -102,6 +108,8 @@ def of_decisions(
     """
     operands = [as_pick(recorder, e) if isinstance(e, Choice) else e for e in operands]
     picks = [each for each in operands if isinstance(each, Pick)]
+    if not picks:
+        return again(recorder, equation, operands)
     values = [each for each in operands if isinstance(each, Value)]
     if equation.name == "select_n" and values:
         return _selected(recorder, equation, operands, again)
@@ -113,8 +121,7 @@ def of_decisions(
     entrywise = equation.name in ENTRYWISE
     apart = len({each.which.place for each in picks}) > 1
     if apart and _is_float(equation) and equation.name in ("add", "add_any", "sub"):
-        given = [number(recorder, e) if isinstance(e, Pick) else e for e in operands]
-        return again(recorder, equation, given)  # a sum needs no common events
+        return again(recorder, equation, _numbers(recorder, operands))  # which no event is for
     if not values and (alone or entrywise):
         common = iter(together(recorder, picks))
         given = [next(common) if isinstance(each, Pick) else each for each in operands]
@@ -123,13 +130,19 @@ def of_decisions(
         return _moved(recorder, equation, operands)
     if equation.name == "mul" and values:
         return _scaled(recorder, values[0], picks[0], equation.shape)
+    if equation.name in COMPARED and values:
+        return again(recorder, equation, _numbers(recorder, operands))
     additive = equation.name in SUMMED or not (alone or entrywise)
     if additive and (_is_float(equation) or equation.name in SUMMED):
-        given = [number(recorder, e) if isinstance(e, Pick) else e for e in operands]
-        return again(recorder, equation, given)
+        return again(recorder, equation, _numbers(recorder, operands))
     if not values:
         raise UnsupportedError(WHOLE)
     return _by_cases(recorder, equation, operands, again)
+
+
+def _numbers(recorder: Recorder, operands: Sequence[Operand]) -> list[Operand]:
+    """Operands of which those that are picked are numbers."""
+    return [number(recorder, each) for each in operands]
 
 
 def _is_float(equation: Equation) -> bool:
@@ -144,7 +157,7 @@ def _by_cases(
     given = [next(common) if isinstance(each, Pick) else each for each in operands]
     picks = [each for each in given if isinstance(each, Pick)]
     found = [
-        again(recorder, equation, [e.numbers[k] if isinstance(e, Pick) else e for e in given])
+        again(recorder, equation, [e.cases[k] if isinstance(e, Pick) else e for e in given])
         for k in range(len(picks[0].numbers))
     ]
     if any(isinstance(each, list | tuple | Choice) for each in found):
@@ -163,18 +176,18 @@ def _scaled(recorder: Recorder, value: Value, pick: Pick, shape: Shape) -> Opera
     """A product of a number with what is picked: a gated number for each case but one."""
     if is_known(pick.numbers) and not np.all(np.isfinite(np.asarray(pick.numbers, float))):
         raise UnsupportedError(NOT_FINITE)
-    events = _events(recorder, pick)
-    numbers = [np.broadcast_to(each, shape, subok=True) if is_known(each) else each
-               for each in pick.numbers]  # fmt: skip
-    first = next((k for k, each in enumerate(numbers) if is_known(each) and not np.any(each)), 0)
+    value = shaped(recorder, value, shape)
+    events = [shaped(recorder, each, shape) for each in _events(recorder, pick)]
+    numbers = [shaped(recorder, each, shape) for each in pick.cases]
+    zeros = (k for k, each in enumerate(numbers) if is_constant(each) and not np.any(each))
+    first = next(zeros, 0)
     parts, rest = [], value
     for k, (event, factor) in enumerate(zip(events, numbers, strict=True)):
         if k != first:
-            gate = event if event.shape == shape else recorder.broadcast(event, shape)
-            part = gated(recorder, gate, value)
+            part = gated(recorder, event, value)
             parts.append(recorder.scaled(part, factor))
             rest = recorder.added(rest, part, -1)
-    if not is_known(numbers[first]) or np.any(numbers[first]):
+    if not is_constant(numbers[first]) or np.any(numbers[first]):
         parts.append(recorder.scaled(rest, numbers[first]))
     return reduce(recorder.added, parts)
 
@@ -210,7 +223,7 @@ def _looked_up(
     ])  # fmt: skip
     every = np.arange(count).reshape(count, *[1] * index.ndim) * size
     every = every + np.broadcast_to(index, equation.shape)
-    found = [again(recorder, equation, [table, each]) for each in places.numbers]
+    found = [again(recorder, equation, [table, each]) for each in places.cases]
     which = Pick(recorder.picked(places.which, every), np.zeros((count, *equation.shape)))
     if not any(isinstance(each, Value) for each in found):
         return Pick(which.which, plain_stack(found))
@@ -237,7 +250,7 @@ def _selected(
 ) -> Operand:
     """One of several numbers, some of which depend on inputs, by a decision."""
     which, *cases = operands
-    cases = [number(recorder, e) if isinstance(e, Pick) else e for e in cases]
+    cases = _numbers(recorder, cases)
     if not isinstance(which, Pick):
         return again(recorder, equation, [which, *cases])
     return chosen_among(recorder, events_of(recorder, which, len(cases)), cases, equation.shape)
@@ -247,7 +260,7 @@ def entering(
     recorder: Recorder, which: Pick, count: int, operands: Sequence[Operand]
 ) -> list[list[Operand]]:
     """The operands of each of some branches, of which one is picked."""
-    within = Pick(which.which, np.clip(np.asarray(which.numbers).astype(int), 0, count - 1))
+    within = Pick(which.which, np.clip(places_of(which), 0, count - 1))
     found = []
     for event in events_of(recorder, within, count):
         found.append([
@@ -259,22 +272,34 @@ def entering(
     return found
 
 
-def picked_case(recorder: Recorder, which: Pick, cases: Sequence[Operand], shape: Shape) -> Operand:
-    """The result of the branch whose place is picked."""
-    if all(is_plain(each) or isinstance(each, Pick) for each in cases):
+def picked_case(
+    recorder: Recorder, which: Operand, cases: Sequence[Operand], shape: Shape
+) -> Operand:
+    """The result of the branch whose place is picked, or known."""
+    last = len(cases) - 1
+    cases = [as_pick(recorder, each) if isinstance(each, Choice) else each for each in cases]
+    if not isinstance(which, Pick) and np.ndim(which) == 0:
+        return cases[int(np.clip(places_of(which), 0, last))]
+    if isinstance(which, Pick) and all(is_plain(each) or isinstance(each, Pick) for each in cases):
         common = together(recorder, [which, *(e for e in cases if isinstance(e, Pick))])
         rest = iter(common[1:])
         given = [next(rest) if isinstance(each, Pick) else each for each in cases]
-        last = len(cases) - 1
-        return evaluated(
-            recorder,
-            lambda place, *each: np.asarray(each[int(np.clip(place, 0, last))]),
-            [common[0], *given],
-        )
-    cases = [number(recorder, as_pick(recorder, e)) if isinstance(e, Choice) else e for e in cases]
-    last = len(cases) - 1
-    within = Pick(which.which, np.clip(np.asarray(which.numbers).astype(int), 0, last))
-    return chosen_among(recorder, events_of(recorder, within, len(cases)), cases, shape)
+        return evaluated(recorder, _case, [common[0], *given])
+    within = np.clip(places_of(which), 0, last)
+    if isinstance(which, Pick):
+        within = Pick(which.which, within)
+    events = events_of(recorder, within, len(cases))
+    return chosen_among(recorder, events, _numbers(recorder, cases), shape)
+
+
+def _case(place: Any, *cases: Any) -> Any:
+    """The case of a place, entry by entry if that is an array."""
+    within = np.clip(places_of(place), 0, len(cases) - 1)
+    if not within.ndim:
+        return cases[int(within)]
+    each = plain_stack([np.broadcast_to(e, within.shape, subok=True) if on_host(e) else e
+                        for e in cases])  # fmt: skip
+    return each[within, *np.indices(within.shape)]
 
 
 def compared_equal(recorder: Recorder, difference: Value, equal: bool) -> Operand:
@@ -406,6 +431,23 @@ def whole_numbers(recorder: Recorder, equation: Equation, value: Value) -> Opera
     return _staircase(recorder, value, whole[0], edges, reached, equation.kind)
 
 
+def require_whole(recorder: Recorder, equation: Equation, value: Value) -> None:
+    """Raise an error unless whole numbers surely are of their kind: JAX wraps those that are not.
+
+    They are computed with as if there were no end to them.
+    """
+    if not value.size:
+        return
+    limits, kind = recorder.limits(value, ConstantLimits), np.iinfo(equation.kind)
+    least, most = limits.least.min(), limits.most.max()
+    if not (np.isfinite([least, most]).all() and kind.min <= int(least) <= int(most) <= kind.max):
+        raise UnsupportedError(
+            f"whole numbers between {least:g} and {most:g} may leave the range of {equation.kind}, "
+            "where JAX wraps them: use a wider kind, as jnp.sum(y > 0, dtype=int), or numbers with "
+            "a point"
+        )
+
+
 def _winner(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Operand:
     """The place of the largest number along an axis, or of the smallest."""
     (value,) = operands
@@ -455,6 +497,7 @@ def _remainder(recorder: Recorder, equation: Equation, operands: Sequence[Operan
     value, divisor = operands
     if not isinstance(value, Value) or not _is_float(equation):
         raise UnsupportedError("what it divides by must be a plain number")
+    value, divisor = (shaped(recorder, each, equation.shape) for each in operands)
     quotient = recorder.divided(value, divisor)
     ends = _range(recorder, quotient)
     if ends is None:
@@ -465,7 +508,7 @@ def _remainder(recorder: Recorder, equation: Equation, operands: Sequence[Operan
     whole = [*range(int(np.trunc(ends[0])), int(np.trunc(ends[1])) + 1)]
     edges = [n if n < 0 else n + 1 for n in whole[:-1]]
     cut = _staircase(recorder, quotient, whole[0], edges, [n >= 0 for n in whole[:-1]], float)
-    times = number(recorder, cut) if isinstance(cut, Pick) else cut
+    times = number(recorder, cut)
     if not isinstance(times, Value):
         return recorder.shifted(value, -times * divisor)
     return recorder.added(value, recorder.scaled(times, divisor), -1)
@@ -503,4 +546,4 @@ def stack_of(recorder: Recorder, column: Sequence[Operand]) -> Operand:
             return of_bits(recorder, stacked(recorder, bits))
     if any(not np.issubdtype(each.numbers.dtype, np.floating) for each in decided):
         raise UnsupportedError(WHOLE)
-    return stacked(recorder, [number(recorder, e) if isinstance(e, Pick) else e for e in picks])
+    return stacked(recorder, _numbers(recorder, picks))

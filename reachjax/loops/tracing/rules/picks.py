@@ -190,12 +190,14 @@ def bits_of(recorder: Recorder, operand: Operand) -> Operand:
     if isinstance(operand, Comparison):
         return stepped(recorder, operand)
     if isinstance(operand, Choice):
-        return number(recorder, as_pick(recorder, operand), float)
-    return np.asarray(operand, float)
+        operand = as_pick(recorder, operand)
+    if isinstance(operand, Pick):
+        return number(recorder, operand)
+    return known_of(operand).astype(float)
 
 
-def as_pick(recorder: Recorder, operand: Operand) -> Pick:
-    """What is decided by comparisons, as one of some arrays.
+def as_pick(recorder: Recorder, operand: Operand) -> Operand:
+    """What is decided by comparisons, as one of some arrays; plain if nothing is left open.
 
     Raises:
         UnsupportedError: it is none.
@@ -207,8 +209,9 @@ def as_pick(recorder: Recorder, operand: Operand) -> Pick:
     if isinstance(operand, Conditions) and not operand.counted:
         parts = [bits_of(recorder, each) for each in operand.parts]
         found = of_bits(recorder, stacked(recorder, parts))
-        if isinstance(found, Pick):
-            return found
+        if not isinstance(found, Pick):
+            return found.astype(operand.kind)
+        return Pick(found.which, found.numbers.astype(operand.kind))
     if isinstance(operand, Index):
         return _places(recorder, operand)
     raise UnsupportedError(
@@ -216,7 +219,7 @@ def as_pick(recorder: Recorder, operand: Operand) -> Pick:
     )
 
 
-def _places(recorder: Recorder, index: Index) -> Pick:
+def _places(recorder: Recorder, index: Index) -> Operand:
     """The place of the first, or of the last, condition that holds; zero if none does."""
     count, shape = len(index.conditions), index.shape
     events: list[Any] = [np.zeros(shape)] * count
@@ -227,6 +230,8 @@ def _places(recorder: Recorder, index: Index) -> Pick:
         rest = both(recorder, rest, opposite(recorder, bits))
     events[0] = _sum(recorder, events[0], rest)
     which = stacked(recorder, events)
+    if not isinstance(which, Value):
+        return np.argmax(which, axis=0).astype(index.kind)
     places = np.arange(count).astype(index.kind).reshape(count, *[1] * len(shape))
     return Pick(_marked(recorder, which), np.broadcast_to(places, (count, *shape)))
 
@@ -241,22 +246,33 @@ def _sum(recorder: Recorder, one: Operand, other: Operand) -> Operand:
     return _marked(recorder, recorder.added(one, other))
 
 
-def spread(recorder: Recorder, pick: Pick) -> Pick:
-    """The same numbers with an event for each entry."""
-    if not pick.is_single:
-        return pick
-    count = len(pick.numbers)
-    index = np.arange(count).reshape(count, *[1] * len(pick.shape))
-    which = recorder.picked(pick.which, np.broadcast_to(index, (count, *pick.shape)))
-    return Pick(which, pick.numbers)
+def _spread(recorder: Recorder, pick: Pick, shape: Shape) -> Pick:
+    """The same numbers in an array of a shape, with an event for each entry."""
+    count, own = len(pick.numbers), pick.which.shape[1:]
+    index = np.arange(pick.which.size).reshape(count, *[1] * (len(shape) - len(own)), *own)
+    which = recorder.picked(pick.which, np.broadcast_to(index, (count, *shape)))
+    return Pick(which, _widened(pick, shape))
 
 
-def number(recorder: Recorder, pick: Pick, kind: Any = None) -> Value:
+def _widened(pick: Pick, shape: Shape) -> Any:
+    """The numbers in arrays of a shape."""
+    count, own = len(pick.numbers), pick.shape
+    numbers = pick.numbers.reshape(count, *[1] * (len(shape) - len(own)), *own)
+    if isinstance(numbers, np.ndarray):
+        return np.broadcast_to(numbers, (count, *shape), subok=True)
+    return jnp.broadcast_to(numbers, (count, *shape))
+
+
+def number(recorder: Recorder, pick: Operand) -> Operand:
     """What is picked as a number: the sum of the numbers, each times whether it is the one.
+
+    What is no pick is a number as it is.
 
     Raises:
         UnsupportedError: one of them is infinite or no number.
     """
+    if not isinstance(pick, Pick):
+        return pick
     numbers = pick.numbers
     if is_known(numbers):
         own = isinstance(numbers, Parameter)
@@ -315,20 +331,23 @@ def together(recorder: Recorder, picks: Sequence[Pick]) -> list[Pick]:
     if len(distinct) == 1:
         return [*picks]
     kinds = [*distinct.values()]
+    at = {key: k for k, key in enumerate(distinct)}
+    places = [at[_key(each)] for each in picks]
     if not all(each.is_single for each in kinds):
-        shape = next(each.shape for each in kinds if not each.is_single)
-        if any(each.shape != shape for each in kinds):
+        try:
+            shape = np.broadcast_shapes(*(each.shape for each in picks))
+        except ValueError:
             raise UnsupportedError(
                 "decisions about arrays of several shapes meet in it: write it of numbers, and "
                 "use jax.vmap"
-            )
-        kinds = [spread(recorder, each) for each in kinds]
+            ) from None
+        picks = [Pick(each.which, _widened(each, shape)) for each in picks]
+        kinds = [_spread(recorder, each, shape) for each in kinds]
     which = reduce(lambda one, other: _product(recorder, one, other), [e.which for e in kinds])
     order = [*itertools.product(*(range(len(each.numbers)) for each in kinds))]
-    at = {key: k for k, key in enumerate(distinct)}
     return [
-        Pick(which, each.numbers[np.array([entry[at[_key(each)]] for entry in order])])
-        for each in picks
+        Pick(which, each.numbers[np.array([entry[place] for entry in order])])
+        for each, place in zip(picks, places, strict=True)
     ]
 
 
@@ -362,15 +381,40 @@ def _product(recorder: Recorder, one: Value, other: Value) -> Value:
     return _marked(recorder, recorder.mapped(given, matrix, (m * n, *rest)))
 
 
-def events_of(recorder: Recorder, which: Pick, count: int) -> list[Operand]:
-    """Whether each of the numbers `0 .. count - 1` is picked: zeros and ones."""
-    found = []
-    for k in range(count):
-        chosen = Pick(which.which, np.asarray(which.numbers).astype(int) == k)
-        chosen = merged(recorder, chosen)
-        bits = chosen if isinstance(chosen, np.ndarray) else number(recorder, chosen, float)
-        found.append(bits if isinstance(bits, Value) else np.asarray(bits, float))
-    return found
+def events_of(recorder: Recorder, which: Operand, count: int) -> list[Operand]:
+    """Whether each of the numbers `0 .. count - 1` is picked: zeros and ones.
+
+    Raises:
+        UnsupportedError: the numbers are those of a parameter.
+    """
+    numbers = places_of(which)
+    if not isinstance(which, Pick):
+        return [(numbers == k).astype(float) for k in range(count)]
+    found = (merged(recorder, Pick(which.which, numbers == k)) for k in range(count))
+    return [bits_of(recorder, each) for each in found]
+
+
+def places_of(which: Operand) -> np.ndarray:
+    """The numbers that say which branch or case is taken.
+
+    Raises:
+        UnsupportedError: they are those of a parameter.
+    """
+    return known_of(which.numbers if isinstance(which, Pick) else which).astype(int)
+
+
+def known_of(plain: Operand) -> np.ndarray:
+    """What decides, where it depends on no input.
+
+    Raises:
+        UnsupportedError: it depends on a parameter.
+    """
+    if not is_constant(plain):
+        raise UnsupportedError(
+            "which case is taken must not depend on the numbers of a parameter: let the function "
+            "close over what decides, in place of being given it"
+        )
+    return np.asarray(plain)
 
 
 def chosen_among(
@@ -447,7 +491,7 @@ def evaluated(recorder: Recorder, evaluate: Callable[..., Any], operands: Sequen
     picks = [each for each in operands if isinstance(each, Pick)]
     found = []
     for k in range(len(picks[0].numbers)):
-        given = [each.numbers[k] if isinstance(each, Pick) else each for each in operands]
+        given = [each.cases[k] if isinstance(each, Pick) else each for each in operands]
         found.append(evaluate(*given))
     made = [*zip(*found, strict=True)] if isinstance(found[0], list | tuple) else [found]
     results = []

@@ -2,54 +2,92 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from reachjax.loops.closed_loop import ClosedLoop
-from reachjax.loops.units import AbstractUnit
+from reachjax.loops.units import AbstractUnit, Entered
 from reachjax.numerics.numbers import AbstractNumber
 
 
 class Batch(AbstractNumber):
-    """The values of `k` numbers at `c` points, as `(c, k)`: a kind of number."""
+    """The values of `k` numbers at `c` points, as `(c, k)`: a kind of number.
 
-    def __init__(self, values: Float[np.ndarray, "c k"]):
-        self.values = values
+    In a branch that most points do not take these stand for one another, and it is computed once
+    for all of them.
+
+    Args:
+        own: `(m, k)`, the values at points that differ.
+        rows: `(c,)`, which of these each point has; None: its own.
+    """
+
+    def __init__(self, own: Float[np.ndarray, "m k"], rows: Int[np.ndarray, " c"] | None = None):
+        self._own, self._rows = own, rows
+
+    @property
+    def values(self) -> Float[np.ndarray, "c k"]:
+        """The values at all points."""
+        return self._own if self._rows is None else self._own[self._rows]
 
     def __len__(self) -> int:
-        return self.values.shape[1]
+        return self._own.shape[1]
 
     def __rmatmul__(self, matrix: Any) -> Batch:
-        return Batch(self.values @ np.asarray(matrix).T)
+        return Batch(self._own @ np.asarray(matrix).T, self._rows)
 
     def __add__(self, other: Any) -> Batch:
-        return Batch(self.values + (other.values if isinstance(other, Batch) else other))
+        return _together(np.add, self, other)
 
     def __neg__(self) -> Batch:
-        return Batch(-self.values)
+        return Batch(-self._own, self._rows)
 
     def __sub__(self, other: Any) -> Batch:
-        return Batch(self.values - (other.values if isinstance(other, Batch) else other))
+        return _together(np.subtract, self, other)
 
     def __rsub__(self, other: Any) -> Batch:
-        return Batch(other - self.values)
+        return Batch(other - self._own, self._rows)
 
     def __rmul__(self, factor: Any) -> Batch:
-        return Batch(self.values * factor)
+        return Batch(self._own * factor, self._rows)
 
     def __getitem__(self, index: Any) -> Batch:
-        return Batch(self.values[:, index])
+        return Batch(self._own[:, index], self._rows)
 
     def widened(self, by: Any) -> Batch:
         """The numbers as they are: values know nothing of errors."""
         return self
 
+    def entered(self) -> Batch:
+        """The inputs of `Entered`, one point standing for all that take no part of the branch."""
+        values = self.values
+        idle = ~values[:, : len(self) // 2].any(axis=1)
+        if np.count_nonzero(idle) < 2:
+            return Batch(values)
+        different = np.append(np.flatnonzero(~idle), np.flatnonzero(idle)[0])
+        rows = np.full(len(values), len(different) - 1)
+        rows[~idle] = np.arange(len(different) - 1)
+        return Batch(values[different], rows)
 
-def _evaluated(unit: AbstractUnit, *y: Batch) -> Batch:
-    values: Any = (each.values for each in y)
-    return Batch(np.asarray(unit(*values)))
+    @staticmethod
+    def evaluated(unit: AbstractUnit, *y: Batch) -> Batch:
+        """What a layer of units makes of numbers."""
+        if isinstance(unit, Entered):
+            y = tuple(each.entered() for each in y)
+        return _together(unit, *y)
+
+
+def _together(function: Callable[..., Any], *given: Any) -> Batch:
+    """A function of numbers, computed once for points that stand for one another in all of them."""
+    batches = [each for each in given if isinstance(each, Batch)]
+    rows = batches[0]._rows
+    if any(each._rows is not rows for each in batches):
+        batches, rows = [Batch(each.values) for each in batches], None
+    values = iter(each._own for each in batches)
+    parts = (next(values) if isinstance(each, Batch) else each for each in given)
+    return Batch(np.asarray(function(*parts)), rows)
 
 
 PARTS = tuple(k / 8 for k in range(1, 8))
@@ -76,11 +114,11 @@ def in_between(
     """
     plant: Any = loop.plant
     w, v = (None if part is None else Batch(part) for part in (disturbances, noises))
-    begun, u = plant.beginning(Batch(states), loop.input(Batch(states), t, _evaluated, v))
+    begun, u = plant.beginning(Batch(states), loop.input(Batch(states), t, Batch.evaluated, v))
     states = begun.values
     others, period = [u] if w is None else [u, w], float(plant.period)
     first, last = (
-        period * plant.flow_at(time).rate((Batch(x), *others), _evaluated).values
+        period * plant.flow_at(time).rate((Batch(x), *others), Batch.evaluated).values
         for time, x in ((t, states), (t + 1, following))
     )
     found = []
@@ -121,6 +159,6 @@ def trajectories(
     with np.errstate(all="ignore"):  # what overflows is no trajectory
         for k in range(horizon):
             w, v = (None if part is None else Batch(part[:, k]) for part in (disturbances, noises))
-            batch = loop.step(batch, start + k, _evaluated, w, v)
+            batch = loop.step(batch, start + k, Batch.evaluated, w, v)
             found.append(batch.values)
     return np.stack(found, axis=1)

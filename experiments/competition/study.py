@@ -246,7 +246,7 @@ def _shown(name: str, value: Any) -> str:
         return "-"
     if name == "cells":
         return f"{value}"
-    return f"{value:.3g}" if name == "margin" else f"{value:.2f}"
+    return f"{value:.3g}" if name == "margin" or value >= 1000 else f"{value:.2f}"
 
 
 def write_markdown(rows: list[dict], path: Path) -> None:

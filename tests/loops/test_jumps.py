@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from jax import lax
 
+import reachjax as rj
+from reachjax.loops.batches import trajectories
 from reachjax.numerics.host import in_numpy
-from tests.loops.traced import assert_sound, interval, network
+from tests.loops.traced import assert_sound, interval, network, points
 
 T, ROWS = jnp.array([1.0, -2.0, 3.0]), jnp.array([[1.0, 2.0], [0.5, -1.0], [-3.0, 0.0]])
 W = jnp.array([[1.0, 0.3], [-0.2, 1.1], [0.7, -0.9]])
@@ -176,3 +178,17 @@ def test_known_and_traced_tables_are_gated_by_the_same_events():
     for x in np.array([[1.0, 0.2], [-1.0, 0.5], [0.3, 1.0], [0.5, -1.0]]):
         pairs = zip(gates(in_numpy(net), x), jax.jit(gates)(net, x), strict=True)
         assert all(np.array_equal(*pair) for pair in pairs)
+
+
+def test_switched_loops_are_simulated_alike_where_points_stand_for_one_another():
+    gains = [[-0.2, -0.1], [0.3, -0.5], [0.1, 0.4]]
+    nets = [rj.MLP.from_layers([(W, np.zeros(3)), ([[*gain, 0.2]], [0.1])]) for gain in gains]
+    policy = rj.Switched(nets, by=lambda x: jnp.argmax(W @ x))
+    plant = rj.AffinePlant([[1.0, 0.2], [0.0, 1.0]], [[0.1], [0.5]])
+    loop = rj.ClosedLoop(plant, policy)
+    states = points()
+    found = trajectories(in_numpy(loop), states, horizon=4)
+    np.testing.assert_allclose(found, loop.simulate(states, 4), rtol=1e-12, atol=1e-13)
+    for alone in (states[:1], states[:2]):  # one point, and branches that nobody takes
+        few = trajectories(in_numpy(loop), alone, horizon=4)
+        np.testing.assert_allclose(few, found[: len(alone)], rtol=1e-12, atol=1e-13)

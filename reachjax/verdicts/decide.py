@@ -189,7 +189,7 @@ class _Asked(NamedTuple):
     """What is the same for all sets from which requirements are decided.
 
     Attributes:
-        loop: the closed loop.
+        loop: the closed loop, of numpy arrays.
         start: the time of the sets, in a loop that varies in time.
         relaxation: how many linear programs a bound may take.
         samples: how many trajectories are simulated.
@@ -249,7 +249,7 @@ class _Asked(NamedTuple):
         if cells is not None:
             parts = CellTree.over(X0, cells)
             counts = () if isinstance(cells, int | np.integer) else tuple(map(int, cells))
-            task = CellTask(in_numpy(loop), horizon, start, tuple(required), relaxation.nodes)
+            task = CellTask(loop, horizon, start, tuple(required), relaxation.nodes)
             given = task, X0, parts, simulations, budget, executor, progress
             return decided_by_cells(*given, counts=counts)
         decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
@@ -278,14 +278,14 @@ def _by_remedies(
     then programs, few of each bound first.
     """
     decision.at_first()
-    on_host, begun, around = map(in_numpy, (loop, X0, boxed(X0, "X0")))
+    begun, around = map(in_numpy, (X0, boxed(X0, "X0")))
 
     def climb(nodes: int, cells_follow: bool = False) -> None:
         if not decision.ended:
-            scenarios = Scenarios.of(on_host, begun, horizon, start)
+            scenarios = Scenarios.of(loop, begun, horizon, start)
             own = budget.with_work(np.inf if budget.timed else WORK)
             between = any(item.throughout for item in required)
-            given = on_host, begun, around, scenarios, start, nodes, own
+            given = loop, begun, around, scenarios, start, nodes, own
             ladder = Ladder(*given, between=between)
             # a flow costs much where bounds are wide, and cells begin anew
             ends = cells_follow and loop.plant.continuous
@@ -294,7 +294,7 @@ def _by_remedies(
     by_cells, most = None, 1
     if loop.curved:
         each = 2 * WAYS if loop.jumps else 2
-        most = int(min(relaxation.cells, 1 + affordable(on_host, horizon, budget) / each))
+        most = int(min(relaxation.cells, 1 + affordable(loop, horizon, budget) / each))
     if most > 1:
         programs_may_follow = relaxation.nodes > 0
         try:
@@ -303,7 +303,7 @@ def _by_remedies(
             programs_may_follow = False
         if decision.ended:
             return decision.verdict()
-        task = CellTask(on_host, horizon, start, tuple(required), nodes=0)
+        task = CellTask(loop, horizon, start, tuple(required), nodes=0)
         part = FOR_CELLS_OF_FLOWS if loop.plant.continuous else FOR_CELLS
         share = budget.share(part if programs_may_follow else 1.0)
         parts = CellTree.whole(X0, most)
@@ -323,7 +323,7 @@ class _Decision:
     """What is known of each requirement so far.
 
     Args:
-        loop: the closed loop.
+        loop: the closed loop, of numpy arrays.
         X0: the initial set.
         horizon: the number of steps.
         start: the time of the initial set.
@@ -346,7 +346,7 @@ class _Decision:
         budget: Budget,
     ):
         self._loop, self._start, self._budget = loop, start, budget
-        self._horizon, self._on_host, self._X0 = horizon, in_numpy(loop), X0
+        self._horizon, self._X0 = horizon, X0
         self._scenarios = Scenarios.of(loop, X0, horizon, start)
         self._middle = self._scenarios.middle(np.asarray(boxed(X0, "X0").center))
         self._findings = Findings(loop, X0, horizon, start, required)
@@ -442,7 +442,7 @@ class _Decision:
         if self.simulations is not None:
             runs = self.simulations.include(scenarios)
         else:
-            given = self._on_host, scenarios, self._horizon, self._start
+            given = self._loop, scenarios, self._horizon, self._start
             runs = Runs(scenarios, self._scenarios.runs(*given))
         self._findings.simulate(runs, [item])
 

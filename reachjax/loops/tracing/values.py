@@ -235,6 +235,6 @@ def is_constant(plain: Any) -> bool:
     return is_concrete(plain) and not isinstance(plain, Parameter)
 
 
-def is_known(*plain: Any) -> bool:
-    """Whether plain arrays are concrete numbers."""
-    return is_concrete(plain)
+def is_known(*operands: Operand) -> bool:
+    """Whether operands are plain arrays of concrete numbers."""
+    return all(map(is_plain, operands)) and is_concrete(operands)

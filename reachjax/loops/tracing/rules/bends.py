@@ -17,10 +17,6 @@ from reachjax.loops.tracing.rules.picks import between, stepped
 from reachjax.loops.tracing.values import Comparison, Operand, UnsupportedError, Value, is_known
 
 
-def _is_plain(operand: Operand) -> bool:
-    return not isinstance(operand, Value | Comparison) and is_known(operand)
-
-
 def _beyond(recorder: Recorder, one: Operand, other: Operand, idle: float, rule: Any) -> Operand:
     """A maximum or a minimum, of which infinite entries of the one sign take nothing.
 
@@ -33,7 +29,7 @@ def _beyond(recorder: Recorder, one: Operand, other: Operand, idle: float, rule:
     """
     if not isinstance(one, Value):
         one, other = other, one
-    if not _is_plain(other):
+    if not is_known(other):
         return rule(one, other)
     plain = np.asarray(other, float)
     if np.any(np.isnan(plain) | (plain == -idle)):
@@ -47,7 +43,7 @@ def _beyond(recorder: Recorder, one: Operand, other: Operand, idle: float, rule:
 
 
 def _larger(recorder: Recorder, one: Value, other: Operand) -> Value:
-    if _is_plain(other) and not np.any(other):
+    if is_known(other) and not np.any(other):
         return recorder.rectified(one)
     found = recorder.added(recorder.rectified(recorder.added(one, other, -1)), other)
     return recorder.limited(found, lambda limits: limits(one).larger(limits(other)))
@@ -95,7 +91,7 @@ def _absolute(recorder: Recorder, equation: Equation, operands: Sequence[Operand
 def _compared(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
     one, other = operands if equation.name in ("gt", "ge") else reversed(operands)
     for each, sign in ((one, 1), (other, -1)):
-        if _is_plain(each) and np.size(each) and np.all(np.isinf(np.asarray(each))):
+        if is_known(each) and np.size(each) and np.all(np.isinf(np.asarray(each))):
             return sign * np.asarray(each) > 0
     return Comparison(recorder.added(one, other, -1), strict=equation.name in ("gt", "lt", "lt_to"))
 
@@ -106,7 +102,7 @@ def _equal(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) 
     one, other = operands
     if isinstance(one, Value) and isinstance(other, Value) and one.place == other.place:
         return np.full(equation.shape, equation.name == "eq")
-    if any(_is_plain(each) and np.all(~np.isfinite(np.asarray(each))) for each in (one, other)):
+    if any(is_known(each) and np.all(~np.isfinite(np.asarray(each))) for each in (one, other)):
         return np.full(equation.shape, equation.name == "ne")
     return compared_equal(recorder, recorder.added(one, other, -1), equation.name == "eq")
 

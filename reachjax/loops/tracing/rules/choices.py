@@ -62,7 +62,7 @@ def _stacked(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
             index = np.arange(each.value.size).reshape(each.shape)
             taken = (recorder.taken(each.value, row) for row in index)
             parts += [Comparison(one, each.strict) for one in taken]
-        elif is_plain(each) and is_known(each):
+        elif is_known(each):
             parts += [*np.asarray(each)]
         else:
             return None
@@ -127,9 +127,7 @@ def _asked(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) 
         return None
     (index,), (first, second) = places, places[0].conditions
     plain = [each for each in operands if each is not index]
-    if not isinstance(second, Comparison) or np.any(first):
-        return None
-    if not all(map(is_plain, plain)) or not is_known(*plain):
+    if not isinstance(second, Comparison) or np.any(first) or not is_known(*plain):
         return None
     both = [
         np.asarray(equation.evaluate(*(np.asarray(k, index.kind) if e is index else e

@@ -36,7 +36,7 @@ def _evaluated(equation: Equation, *operands: Any, **changes: Any) -> Any:
 
 
 def _require_known(places: Sequence[Operand]) -> None:
-    if any(isinstance(each, Value) for each in places) or not is_known(*places):
+    if not is_known(*places):
         raise UnsupportedError(
             "which entries it takes must not depend on inputs or traced parameters"
         )
@@ -55,7 +55,7 @@ def _taken(recorder: Recorder, operands: Sequence[Operand], index: Any) -> Value
     index = np.asarray(index)
     parts = []
     for each, numbers in zip(operands, _numbers(operands), strict=True):
-        if not isinstance(each, Value) and is_known(each):
+        if is_known(each):
             finite = np.isfinite(np.asarray(each))
             if np.any(np.isin(numbers[~finite], index)):
                 raise UnsupportedError(NOT_FINITE)

@@ -247,7 +247,7 @@ def _sum(recorder: Recorder, one: Operand, other: Operand) -> Operand:
 
 
 def _spread(recorder: Recorder, pick: Pick, shape: Shape) -> Pick:
-    """The same numbers in an array of a shape, with an event for each entry."""
+    """A pick of the same numbers in an array of a shape, with an event for each entry."""
     count, own = len(pick.numbers), pick.which.shape[1:]
     index = np.arange(pick.which.size).reshape(count, *[1] * (len(shape) - len(own)), *own)
     which = recorder.picked(pick.which, np.broadcast_to(index, (count, *shape)))
@@ -453,7 +453,7 @@ def _weighed(recorder: Recorder, event: Operand, case: Operand) -> Operand:
 
 def _require_finite(cases: Iterable[Operand]) -> None:
     """Raise an error if one of some cases is known to be infinite or no number."""
-    known = (case for case in cases if not isinstance(case, Value) and is_known(case))
+    known = filter(is_known, cases)
     if not all(np.all(np.isfinite(np.asarray(case, float))) for case in known):
         raise UnsupportedError(NOT_FINITE)
 

@@ -60,7 +60,7 @@ def _power(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) 
     value, power = operands
     if not isinstance(value, Value):
         return _exponential(recorder, value, power)
-    if isinstance(power, Value) or not is_known(power):
+    if not is_known(power):
         raise UnsupportedError("the exponent must be known: no input, and no traced parameter")
     flat = np.asarray(power, float).ravel()
     exponents, which = np.unique(flat, return_inverse=True)

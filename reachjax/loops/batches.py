@@ -6,10 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from reachjax.loops.closed_loop import ClosedLoop
-from reachjax.loops.units import AbstractUnit, Entered
+from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.numbers import AbstractNumber
 
 
@@ -60,12 +60,9 @@ class Batch(AbstractNumber):
         """The numbers as they are: values know nothing of errors."""
         return self
 
-    def entered(self) -> Batch:
-        """The inputs of `Entered`, one point standing for all that take no part of the branch."""
+    def _standing(self, idle: Bool[np.ndarray, " c"]) -> Batch:
+        """One point standing for all that are idle."""
         values = self.values
-        idle = ~values[:, : len(self) // 2].any(axis=1)
-        if np.count_nonzero(idle) < 2:
-            return Batch(values)
         different = np.append(np.flatnonzero(~idle), np.flatnonzero(idle)[0])
         rows = np.full(len(values), len(different) - 1)
         rows[~idle] = np.arange(len(different) - 1)
@@ -74,8 +71,9 @@ class Batch(AbstractNumber):
     @staticmethod
     def evaluated(unit: AbstractUnit, *y: Batch) -> Batch:
         """What a layer of units makes of numbers."""
-        if isinstance(unit, Entered):
-            y = tuple(each.entered() for each in y)
+        idle = unit.idle(lambda: y[0].values)
+        if idle is not None and np.count_nonzero(idle) > 1:
+            y = (y[0]._standing(idle),)
         return _together(unit, *y)
 
 

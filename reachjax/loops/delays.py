@@ -186,10 +186,8 @@ def with_inputs(region: AbstractSet, first: Float[ArrayLike, " k"] | int) -> Abs
         require_kind("region", region, PolyhedralSet, "a Box or a Polytope")
         A, b = region.facets
         return Polytope(jnp.hstack([A, jnp.zeros((len(b), whole_number("first", first, 1)))]), b)
-    if not isinstance(region, Box):
-        raise TypeError(f"region must be a Box, but {described(region)} arrived")
-    rest = Numbers("(k,)")(first, "first")
-    return Box(*(jnp.concatenate([end, rest]) for end in (region.lower, region.upper)))
+    box, rest = require_kind("region", region, Box, "a Box"), Numbers("(k,)")(first, "first")
+    return Box(*(jnp.concatenate([end, rest]) for end in (box.lower, box.upper)))
 
 
 def _with_rest(plant: AbstractPlant, more: int) -> AbstractPlant:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+
+Kind = TypeVar("Kind")
 
 
 def is_concrete(*trees: Any) -> bool:
@@ -234,10 +236,13 @@ def real_number(name: str, value: Any, least: float) -> float:
     return float(array)
 
 
-def require_kind(name: str, value: Any, kind: type | tuple[type, ...], expected: str) -> None:
-    """Raise a `TypeError` that says what was expected if `value` is of another kind."""
+def require_kind(
+    name: str, value: Any, kind: type[Kind] | tuple[type[Kind], ...], expected: str
+) -> Kind:
+    """The value; a `TypeError` that says what was expected if it is of another kind."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be {expected}, but {described(value)} arrived")
+    return value
 
 
 def wrapped(progress: Any, items: Iterable[Any]) -> Iterable[Any]:

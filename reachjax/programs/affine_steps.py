@@ -71,6 +71,11 @@ class UnitForms(NamedTuple):
     places: Int[Array | np.ndarray, " k"]
     outputs: AffineForms
 
+    @property
+    def curved(self) -> bool:
+        """Whether the columns are of what smooth units leave out."""
+        return self.unit.curved
+
 
 class PartColumns(NamedTuple):
     """What the units of a part of a step leave out, as one column for each of its outputs.
@@ -86,6 +91,11 @@ class PartColumns(NamedTuple):
     gap: Float[Array | np.ndarray, " m"]
     places: Int[Array | np.ndarray, " m"]
     layers: range
+
+    @property
+    def curved(self) -> bool:
+        """Whether the columns are of what smooth units leave out: of several layers, yes."""
+        return True
 
 
 class StepForms(NamedTuple):

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from scipy.optimize import linprog
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.units import AbstractUnit, Step
+from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.rounding import TINY
 from reachjax.programs.affine import AffineForms, joined
 from reachjax.programs.affine_steps import UnitForms, step_forms
@@ -215,7 +215,7 @@ def _advanced(
         _ForkError: another decision is open.
     """
     here, still_open = way, list[OpenDecision]()
-    compared = list[tuple[AffineForms, Step, dict[int, bool]]]()
+    compared = list[tuple[AffineForms, AbstractUnit, dict[int, bool]]]()
 
     def ranges(
         unit: AbstractUnit | None, y: AffineForms, ends: Ends, found: Sequence[UnitForms]
@@ -234,8 +234,7 @@ def _advanced(
             return lower, upper
         layer = len(found)
         held = dict[int, bool]()
-        if isinstance(unit, Step):
-            compared.append((y, unit, held))
+        compared.append((y, unit, held))
         for (at, entry), (above, size) in signs.items():
             if at != layer:
                 continue
@@ -244,11 +243,8 @@ def _advanced(
                 raise NoStatesError
             here, held[entry] = here.on_a_side(y[entry : entry + 1], above), above
         for other, before, known in compared:
-            if isinstance(unit, Step) and other is y:  # of one number `>` is no more than `>=`
-                first, last = before.at_zero, unit.at_zero
-                held.update(
-                    (k, v) for k, v in known.items() if (first <= last if v else first >= last)
-                )
+            if other is y:
+                held.update((k, v) for k, v in known.items() if unit.implied(before, v))
         for entry, above in held.items():
             if above:
                 lower[entry] = max(lower[entry], TINY)

@@ -214,7 +214,7 @@ class Horizon:
         summed = _summed(merged)
         own = (layer for number, layer in enumerate(units) if number not in summed)
         for each in (*own, *merged):
-            if _left_out(each):
+            if each.curved:
                 self._varying = np.append(self._varying, each.places[each.places >= 0])
 
     def columns_at(
@@ -362,11 +362,6 @@ class Horizon:
 def _summed(merged: Sequence[PartColumns]) -> set[int]:
     """The layers of a step that are summed up."""
     return {number for part in merged for number in part.layers}
-
-
-def _left_out(each: UnitForms | PartColumns) -> bool:
-    """Whether columns are of what smooth units leave out."""
-    return isinstance(each, PartColumns) or each.unit.curved
 
 
 def _fill(

@@ -17,6 +17,7 @@ import math
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.numerics.numbers import summed
@@ -217,6 +218,17 @@ class AbstractUnit(AbstractActivation):
     def open(self, lower: Any, upper: Any) -> Bool[Array, " k"]:
         """Inputs whose bounds are worth a program each: here those of units that are not affine."""
         return ~self.lines(lower, upper).affine
+
+    def idle(self, values: Callable[[], Float[np.ndarray, "c k"]]) -> Bool[np.ndarray, " c"] | None:
+        """Points, of which `values` are the inputs, at which nothing depends on the unit, if any.
+
+        One of them may stand for all.
+        """
+        return None
+
+    def implied(self, other: AbstractUnit, above: bool) -> bool:
+        """Whether one that jumps, of the same inputs, being above (below) says that this one is."""
+        return False
 
     def distance(self, y: Any, /) -> float:
         """How far inputs are from where the value jumps."""

@@ -18,6 +18,7 @@ A **gated** number is `z = s y` with `s` zero or one. With bounds of `y` it is b
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -60,6 +61,12 @@ class Step(AbstractUnit):
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`1` above zero, `0` below; derivatives are zero."""
         return namespace(y).where(y >= 0 if self.at_zero else y > 0, 1.0, 0.0)
+
+    def implied(self, other: AbstractUnit, above: bool) -> bool:
+        """Of one number `>` is no more than `>=`."""
+        if not isinstance(other, Step):
+            return False
+        return other.at_zero <= self.at_zero if above else other.at_zero >= self.at_zero
 
     def distance(self, y: Float[np.ndarray, " k"], /) -> float:
         """How far the closest input is from where the value changes."""
@@ -196,6 +203,11 @@ class Entered(AbstractUnit):
         """The numbers, which do not matter where the branch is not taken."""
         xp, k = namespace(y), y.shape[-1] // 2
         return xp.concatenate([xp.zeros_like(y[..., :k]), y[..., k:]], axis=-1)
+
+    def idle(self, values: Callable[[], Float[np.ndarray, "c k"]]) -> Bool[np.ndarray, " c"] | None:
+        """Points that take no part of the branch."""
+        taken, _ = np.split(values(), 2, axis=1)
+        return ~np.any(taken, axis=1)
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """The numbers, or their middle."""

@@ -7,8 +7,10 @@ order of the definitions. Where a published equation is read in two ways, both a
 Source: the benchmark repository of ARCH-COMP AINNCS, and the category's reports.
 """
 
+import functools
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -36,6 +38,11 @@ def cruise_control(x: State, u: Input) -> State:
     ahead = 2 * (LEAD - x[2]) - FRICTION * x[1] ** 2
     behind = 2 * (u[0] - x[5]) - FRICTION * x[4] ** 2
     return jnp.array([x[1], x[2], ahead, x[4], x[5], behind])
+
+
+def seen_ahead(x: State) -> Float[Array, " 5"]:
+    """What cruise control sees: speed and time gap that are set, own speed, distance, approach."""
+    return jnp.array([30.0, 1.4, x[4], x[0] - x[3], x[1] - x[4]])
 
 
 def oscillator(x: State, u: Input) -> State:
@@ -209,19 +216,34 @@ def avoidance(worst: bool) -> Callable[..., State]:
     Args:
         worst: whether the pilot may take any of the accelerations, or takes the middle one.
     """
+    return functools.partial(_avoiding, worst)
 
-    def step(x: State, u: Input, w: Float[Array, " 3"] | None = None) -> State:
-        h, v, left, last = x[0], x[1], x[2], x[3:]
-        a = 0.0
-        for k, ((way, rate), options) in enumerate(zip(COMPLIES, CHOICES, strict=True)):
-            taken = options[1]
-            if worst and options[0] != options[2]:
-                assert w is not None
-                taken = rj.one_of(options[:, None], w)[0]
-            if np.isfinite(rate):
-                same = last[k] * jnp.where(way * (v - rate) >= 0, 1.0, 0.0)
-                taken = (1 - same) * taken
-            a = a + u[k] * taken
-        return jnp.concatenate([jnp.array([h - v - a / 2, v + a, left - 1]), u])
 
-    return step
+def _avoiding(worst: bool, x: State, u: Input, w: Float[Array, " 3"] | None = None) -> State:
+    h, v, left, last = x[0], x[1], x[2], x[3:]
+    a = 0.0
+    for k, ((way, rate), options) in enumerate(zip(COMPLIES, CHOICES, strict=True)):
+        taken = options[1]
+        if worst and options[0] != options[2]:
+            assert w is not None
+            taken = rj.one_of(options[:, None], w)[0]
+        if np.isfinite(rate):
+            same = last[k] * jnp.where(way * (v - rate) >= 0, 1.0, 0.0)
+            taken = (1 - same) * taken
+        a = a + u[k] * taken
+    return jnp.concatenate([jnp.array([h - v - a / 2, v + a, left - 1]), u])
+
+
+def seen_intruder(x: State) -> Float[Array, " 3"]:
+    """What collision avoidance sees; files divide the rate of climb by 200."""
+    return x[:3] * jnp.array([1.0, 200 / 5000, 1.0])
+
+
+def last_advisory(x: State) -> Array:
+    """Which advisory acts: its network gives the next one."""
+    return jnp.argmax(x[3:])
+
+
+def best_of(scores: Float[Array, " 9"]) -> Float[Array, " 9"]:
+    """The advisory of the highest score, as the plant takes it."""
+    return jax.nn.one_hot(jnp.argmax(scores), 9)

@@ -4,6 +4,7 @@ Units are those of the definitions. What they leave open is said in the notes, a
 reading where that is cheap.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,13 +124,14 @@ def sampled(
 def scaled(
     net: rj.AbstractNetwork, n: int, before: Callable[..., Any], after: Callable[..., Any]
 ) -> rj.Network:
-    """A network between two functions, of the state and of its output."""
-
-    def law(net: rj.AbstractNetwork, x: Any) -> Any:
-        return after(net(before(x)))
-
+    """A network between two functions of modules, of the state and of its output."""
     m = jax.eval_shape(after, jax.ShapeDtypeStruct((net.outputs,), float)).shape[0]
+    law = functools.partial(_between, before, after)
     return rj.Network(jax.tree_util.Partial(law, net), n, m)
+
+
+def _between(before: Callable[..., Any], after: Callable[..., Any], net: Any, x: Any) -> Any:
+    return after(net(before(x)))
 
 
 def unchanged(x: Any) -> Any:
@@ -137,15 +139,20 @@ def unchanged(x: Any) -> Any:
     return x
 
 
+def _less(offset: float, u: Any) -> Any:
+    return u - offset
+
+
+def _times(factor: float, u: Any) -> Any:
+    return factor * u
+
+
 def _cruise_control() -> Instance:
     n, room = 6, np.array([1.0, 0, 0, -1, -1.4, 0])
 
-    def sees(x):
-        return jnp.array([30.0, 1.4, x[4], x[0] - x[3], x[1] - x[4]])
-
     def loop(nets: Networks) -> rj.ClosedLoop:
         plant = rj.SampledPlant(fields.cruise_control, n, 1, 0.1)
-        return rj.ClosedLoop(plant, scaled(nets[0], n, sees, unchanged))
+        return rj.ClosedLoop(plant, scaled(nets[0], n, fields.seen_ahead, unchanged))
 
     def law(x: np.ndarray) -> np.ndarray:
         speed, distance, relative = x[:, 2], x[:, 3], x[:, 4]
@@ -166,7 +173,7 @@ def _cruise_control() -> Instance:
             "relu",
             law,
             (60.0, 12.0, 2.0, 60.0, 12.0, 2.0),
-            lambda x: np.asarray(jax.vmap(sees)(jnp.asarray(x))),
+            lambda x: np.asarray(jax.vmap(fields.seen_ahead)(jnp.asarray(x))),
         ),
     )
 
@@ -188,7 +195,7 @@ def _oscillators() -> list[Instance]:
             ),
             lambda nets: rj.ClosedLoop(
                 rj.SampledPlant(fields.oscillator, 4, 1, 0.5),
-                scaled(nets[0], 4, unchanged, lambda u: 11.0 * u),
+                scaled(nets[0], 4, unchanged, functools.partial(_times, 11.0)),
             ),
             X0,
             10,
@@ -208,7 +215,7 @@ def _oscillators() -> list[Instance]:
         (("**/Benchmark9-Tora/*ontroller*.onnx", "**/Benchmark9-Tora/*ontroller*.mat"),),
         lambda nets: rj.ClosedLoop(
             rj.SampledPlant(fields.oscillator, 4, 1, 1.0),
-            scaled(nets[0], 4, unchanged, lambda u: u - 10.0),
+            scaled(nets[0], 4, unchanged, functools.partial(_less, 10.0)),
         ),
         rj.Box([0.6, -0.7, -0.4, 0.5], [0.7, -0.6, -0.3, 0.6]),
         20,
@@ -239,7 +246,7 @@ def _unicycles() -> list[Instance]:
             name,
             (("**/Benchmark10-Unicycle/*ontroller*.onnx", "**/Benchmark10-Unicycle/*nnv.mat"),),
             lambda nets: rj.ClosedLoop(
-                plant(), scaled(nets[0], 4, unchanged, lambda u: u - 20.0), **more
+                plant(), scaled(nets[0], 4, unchanged, functools.partial(_less, 20.0)), **more
             ),
             X0,
             50,
@@ -476,19 +483,16 @@ def _balancing() -> Instance:
 
 
 def _avoidances() -> list[Instance]:
-    def sees(x):
-        return x[:3] * jnp.array([1.0, 200 / 5000, 1.0])  # files divide by 200
-
     def loop(worst: bool) -> Callable[[Networks], rj.ClosedLoop]:
         def made(nets: Networks) -> rj.ClosedLoop:
             step = fields.avoidance(worst)
             count = 3 if worst else 0
             plant = rj.NonlinearPlant(step, 12, 9, **({"disturbances": count} if worst else {}))
             scores = rj.Switched(
-                [scaled(net, 12, sees, unchanged) for net in nets],
-                by=lambda x: jnp.argmax(x[3:]),
+                [scaled(net, 12, fields.seen_intruder, unchanged) for net in nets],
+                by=fields.last_advisory,
             )
-            policy = scaled(scores, 12, unchanged, lambda y: jax.nn.one_hot(jnp.argmax(y), 9))
+            policy = scaled(scores, 12, unchanged, fields.best_of)
             drawn = rj.Box(np.zeros(count), np.ones(count)) if worst else None
             return rj.ClosedLoop(plant, policy, disturbance=drawn)
 

@@ -10,13 +10,17 @@ shapes are trained here.
 """
 
 import csv
+import dataclasses
 import hashlib
 import json
+import multiprocessing
+import os
 import platform
 import resource
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +33,7 @@ from rich.table import Table
 
 import reachjax as rj
 from experiments import report
-from experiments.benchmark.rivals.processes import Stopped, from_process
+from experiments.benchmark.rivals.processes import Stopped, from_process, workers
 from experiments.command import bar, configure_jax, require_options
 from experiments.competition import figures
 from experiments.competition.instances import Instance, instances
@@ -46,7 +50,7 @@ first: wall seconds of `decide` in a new process, where nothing is compiled, rea
 warm: of one more call;  recheck: of proving the verdict's file anew in another process
 margin: the least certified one, or by how much a trajectory breaks the requirement
 width: at the end, of affine forms over the whole set, over that of sampled states
-GB: the most memory that the process took"""
+GB: the most memory that the process took, and those that it gave cells to"""
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ class Settings:
     """Instances whose titles contain one of these; all without any."""
     limit: float = 120.0
     """Seconds that a decision may take."""
+    processes: int = dataclasses.field(default_factory=lambda: os.cpu_count() or 1)
+    """That cells are decided in, where one cell is not enough; 1 for none besides."""
     simulations: int = 1000
     """Trajectories that are drawn, and that widths are compared with."""
     training_steps: int = 2000
@@ -70,7 +76,7 @@ class Settings:
     """Where everything is written."""
 
     def __post_init__(self):
-        require_options(self, "limit", simulations=1, training_steps=1)
+        require_options(self, "limit", processes=1, simulations=1, training_steps=1)
         if self.path is not None and not self.path.is_dir():
             raise ValueError(f"PATH must be a folder, but {self.path} arrived")
         if not self.chosen:
@@ -102,7 +108,15 @@ def decided(title: str, settings: Settings) -> Iterator[dict]:
     given = loop, instance.X0, instance.horizon
     options: dict[str, Any] = {**instance.required, "time_limit": settings.limit}
     yield {}
-    began = time.perf_counter()
+    with workers(settings.processes) if settings.processes > 1 else nullcontext() as executor:
+        options |= {"executor": executor}
+        yield from _decided(instance, loop, given, options, settings)
+
+
+def _decided(
+    instance: Instance, loop: rj.ClosedLoop, given: Any, options: dict[str, Any], settings: Settings
+) -> Iterator[dict]:
+    title, began = instance.title, time.perf_counter()
     verdict = rj.decide(*given, **options)
     first = time.perf_counter() - began
     found = {"verdict": verdict.status.name, "first": first, "cells": max(len(verdict.cells), 1)}
@@ -141,8 +155,12 @@ def least(verdict: rj.Verdict) -> float:
 
 
 def peak() -> float:
-    """Gigabytes that this process took at most."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    """Gigabytes that this process took at most, and those that it began, where Linux tells."""
+    found = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for process in multiprocessing.active_children():
+        with suppress(OSError), open(f"/proc/{process.pid}/status") as told:
+            found += sum(int(line.split()[1]) for line in told if line.startswith("VmHWM"))
+    return found / 2**20
 
 
 def width(
@@ -205,7 +223,9 @@ def row_of(instance: Instance, settings: Settings) -> dict:
 
 def key_of(instance: Instance, settings: Settings) -> str:
     """What a row depends on: networks, limit and version."""
-    found = hashlib.sha256(f"{settings.limit} {settings.training_steps} {version()}".encode())
+    found = hashlib.sha256(
+        f"{settings.limit} {settings.processes} {settings.training_steps} {version()}".encode()
+    )
     for path in instance.paths(settings.path) if settings.path is not None else []:
         found.update(path.read_bytes())
     return found.hexdigest()[:16]
@@ -307,8 +327,6 @@ def main(settings: Settings) -> None:
 
 def machine() -> dict[str, Any]:
     """What it ran on, and when."""
-    import os
-
     return {
         "cores": os.cpu_count(),
         "machine": platform.machine(),

@@ -25,10 +25,6 @@ EVALUATIONS = 3000
 """What compiling a step of a loop takes, in evaluations of it in numpy: both grow with the number
 of operations (measured: 2100 to 3300 for five loops of 15 to 73 units, from 2 s to 57 s)."""
 
-EARLY = 0.5
-"""Compiling begins when this part of what it takes was spent without it: so whoever ends just then
-has wasted no more than twice what was spent."""
-
 CHEAP = 5.0
 """What takes fewer seconds to compile is begun at once and waited for, as long as there is time."""
 
@@ -85,10 +81,10 @@ class CompiledBeside:
             known.seconds = seconds()
         if known.seconds is None or known.began:
             return known.faster(share)
-        known.spent += share * known.seconds
-        price = EVALUATIONS * known.seconds / evaluations
+        asked, price = share * known.seconds, EVALUATIONS * known.seconds / evaluations
         with self._lock:
-            early = price > CHEAP and known.spent < EARLY * price
+            early = price > CHEAP and max(known.spent, asked) < price
+            known.spent += asked
             if early or left < price or known.began:
                 return False
             known.began = True

@@ -58,6 +58,11 @@ def pytree(cls: type[T]) -> type[T]:
     def unflatten(aux, children):
         return unchecked(cls, **dict(zip((*data, *meta), (*children, *aux), strict=True)))
 
+    def fields_alone(self) -> dict[str, Any]:
+        """What is pickled and copied: what is kept beside the fields is found again."""
+        return {field.name: getattr(self, field.name) for field in fields}
+
+    cls.__getstate__ = fields_alone  # type: ignore[attr-defined]
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten)
     return cls
 

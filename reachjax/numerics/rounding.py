@@ -138,9 +138,13 @@ def namespace(*numbers: Any) -> Any:
         ('numpy', 'jax.numpy')
     """
     for each in numbers:
-        if type(each) is not np.ndarray and isinstance(each, jax.Array):
+        if type(each) not in OF_HOST and isinstance(each, jax.Array):
             return jnp
     return np
+
+
+OF_HOST = frozenset([np.ndarray, np.float64, np.bool_, float, int, bool])
+"""Types that are none of JAX, for whom there is no need to ask slowly."""
 
 
 def larger(one: Any, other: Any) -> Any:

@@ -133,8 +133,8 @@ def decide(
             or there are as many as the number says. None: the whole set is bounded at once, and has
             certificates; of a smooth loop of which forms do not prove it, cells of the whole set
             are tried next, as many as `relaxation` says, before its programs.
-        executor: runs the cells: any with the interface of `concurrent.futures`, such as a
-            `ProcessPoolExecutor`. None: one after the other, here.
+        executor: runs the cells, whoever asked for them: any with the interface of
+            `concurrent.futures`, such as a `ProcessPoolExecutor`. None: one after the other, here.
         progress: wraps the iteration over cells to show a progress bar, such as `tqdm.tqdm`.
 
     Returns:
@@ -179,8 +179,8 @@ def decide(
     )
     if cells is not None:
         CellTree.over(X0, cells)  # its errors come first
-        require_executor(executor)
-        require_bar(progress)
+    require_executor(executor)
+    require_bar(progress)
     asked = _Asked(loop, start, relaxation, samples, seed)
     return asked.decided(X0, horizon, required, budget, cells, executor, progress)
 
@@ -254,7 +254,8 @@ class _Asked(NamedTuple):
             return decided_by_cells(*given, counts=counts)
         decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
         try:
-            return _by_remedies(decision, loop, X0, horizon, start, required, relaxation, budget)
+            by = relaxation, budget, executor, progress
+            return _by_remedies(decision, loop, X0, horizon, start, required, *by)
         except Interrupted:
             raise
         except KeyboardInterrupt:
@@ -271,6 +272,8 @@ def _by_remedies(
     required: list[Requirement],
     relaxation: BranchAndCut,
     budget: Budget,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
 ) -> Verdict:
     """The verdict by remedies in the order in which they pay.
 
@@ -307,7 +310,8 @@ def _by_remedies(
         part = FOR_CELLS_OF_FLOWS if loop.plant.continuous else FOR_CELLS
         share = budget.share(part if programs_may_follow else 1.0)
         parts = CellTree.whole(X0, most)
-        by_cells = decided_by_cells(task, X0, parts, decision.simulations, share)
+        given = task, X0, parts, decision.simulations, share, executor, progress
+        by_cells = decided_by_cells(*given)
         if by_cells.status is not VerdictStatus.UNKNOWN or not programs_may_follow:
             return by_cells
     try:

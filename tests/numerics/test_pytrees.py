@@ -1,6 +1,7 @@
 """Claims about the immutable dataclasses: users' objects are checked, JAX's are not."""
 
 import dataclasses
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -138,3 +139,11 @@ def test_new_loops_compile_once():
     assert len(traces) == 1
     step(loop(1).replace(input_box=None), jnp.ones(2))
     assert len(traces) == 2
+
+
+def test_what_is_kept_beside_the_fields_is_not_sent():
+    box = rj.Box([0.0], [1.0])
+    object.__setattr__(box, "_kept", lambda: None)  # as recordings of functions are
+    again = pickle.loads(pickle.dumps(box))
+    assert not hasattr(again, "_kept")
+    assert (again.lower, again.upper) == (box.lower, box.upper)

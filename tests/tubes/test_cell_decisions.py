@@ -230,3 +230,21 @@ def test_a_cell_is_halved_where_what_is_left_out_comes_from():
     assert verdict.status is rj.VerdictStatus.UNKNOWN
     assert {float(first.upper[1]), float(second.upper[1])} == {0.0, 0.7}
     assert first.lower[0] == second.lower[0] == -2.0
+
+
+def test_an_executor_runs_the_cells_of_a_set_that_forms_do_not_prove(smooth):
+    sent = []
+
+    class Counting(ThreadPoolExecutor):
+        def submit(self, *given, **named):
+            sent.append(given)
+            return super().submit(*given, **named)
+
+    with Counting(2) as executor:
+        verdict = rj.decide(
+            smooth, X0, HORIZON, safe=around(smooth, X0, 0.02), samples=100, executor=executor
+        )
+    assert verdict.proved
+    assert len(sent) > 1
+    with pytest.raises(TypeError, match="executor must be an object with a method submit"):
+        rj.decide(smooth, X0, 1, safe=X0, executor=2)

@@ -4,7 +4,9 @@ import multiprocessing
 import os
 import pickle
 import sys
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -31,7 +33,7 @@ def from_process(
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     packed = pickle.dumps((function, arguments))
-    process = context.Process(target=_run, args=(theirs, packed), daemon=True)
+    process = context.Process(target=_run, args=(theirs, packed))
     process.start()
     theirs.close()
     try:
@@ -50,6 +52,24 @@ def from_process(
         process.kill()
         process.join()
     raise Stopped(f"it took more than {patience} seconds")
+
+
+def workers(count: int) -> ProcessPoolExecutor:
+    """So many processes for cells, each begun once it is needed; they end with this one."""
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """Watch the process that began this one, which may be killed."""
+
+    def watch() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _run(connection: Connection, packed: bytes) -> None:

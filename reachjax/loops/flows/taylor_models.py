@@ -308,12 +308,12 @@ def _higher(a: np.ndarray, b: np.ndarray, symbols: Symbols) -> tuple[np.ndarray,
     n, count = symbols.initial, symbols.own
     first, second, own = slice(1, 1 + n), slice(1 + n, 1 + count), len(symbols.radii)
     linear, pairs, weights, place = _cubic(n)
-    cubic, more = np.zeros((len(a), symbols.cubic)), np.zeros((len(a), n))
-    for one, other in ((a, b), (b, a)):
-        g, q = one[:, first], other[:, second]
-        for i, jk, weight in zip(linear, pairs, weights, strict=True):
-            cubic += g[:, i] * q[:, jk] * weight
-        more += 0.5 * (g[:, :, None] * q[:, place]).sum(axis=1)
+    both = (a[:, first], b[:, second]), (b[:, first], a[:, second])
+    ways, more = np.zeros((len(a), *weights.shape)), np.zeros((len(a), n))
+    for g, q in both:
+        ways += g[:, linear] * q[:, pairs]
+        more += 0.5 * (g[:, None] @ q[:, place])[:, 0]
+    cubic = (weights * ways).sum(axis=1)
     i, j, weights = _mixed(n, own)
     scaled = (row[:, 1 + count : 1 + count + own] * symbols.radii for row in (a, b))
     g, h = (np.hstack([row[:, first], of_r]) for row, of_r in zip((a, b), scaled, strict=True))
@@ -414,4 +414,5 @@ def rebuilt(like: Any, parts: list[Any]) -> Any:
 
 def settled_number(number: Any) -> Any:
     """A number that a compiler computes once, whatever is made of it."""
-    return rebuilt(number, settled(arrays(number)))
+    parts = arrays(number)
+    return number if namespace(*parts) is np else rebuilt(number, settled(parts))

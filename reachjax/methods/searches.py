@@ -21,10 +21,14 @@ from concurrent.futures import (
     Executor,
     Future,
     ProcessPoolExecutor,
+    ThreadPoolExecutor,
 )
 from concurrent.futures import wait as wait_for
 from contextlib import closing
+from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
+
+import jax
 
 from reachjax.methods.cell_tree import Node
 from reachjax.numerics.checks import wrapped
@@ -46,6 +50,19 @@ class _Job(NamedTuple, Generic[Kept]):
     given: tuple[Any, ...]
 
 
+def _answered(job: bytes, rest: bytes) -> bytes:
+    """The answer to a job, wherever it is, in 64-bit floats."""
+    with jax.enable_x64(True):
+        function, first = _unpacked(job)
+        return pickle.dumps(function(first, *pickle.loads(rest)))
+
+
+@lru_cache(maxsize=4)
+def _unpacked(job: bytes) -> tuple[Callable[..., Any], Any]:
+    """The function of a job and its first argument: what was recorded of that serves many jobs."""
+    return pickle.loads(job)
+
+
 class CellJobs(Generic[Kept]):
     """Jobs that run, each with the cells that it is of.
 
@@ -59,7 +76,7 @@ class CellJobs(Generic[Kept]):
     """
 
     def __init__(self, executor: Executor | None, ahead: int):
-        self._executor, self._sent = executor, False
+        self._executor = executor
         self._running: dict[Future, _Job[Kept]] = {}
         self.workers = 1 if executor is None else getattr(executor, "_max_workers", WORKERS)
         self.most = 1 if executor is None else ahead * self.workers
@@ -71,30 +88,34 @@ class CellJobs(Generic[Kept]):
         """Begin a job; without an executor it is done once it is asked for."""
         future: Future = Future()
         if self._executor is not None:
-            self._require_sent(function, given)
+            sent = self._packed(function, given)
             try:
-                future = self._executor.submit(function, *given)
+                future = self._executor.submit(*sent)
             except BrokenExecutor as error:
                 self._give_up(error)
         self._running[future] = _Job(kept, function, given)
 
-    def _require_sent(self, function: Callable[..., Any], given: tuple[Any, ...]) -> None:
-        """Raise an error where processes would be sent what cannot travel; of the first job.
+    def _packed(self, function: Callable[..., Any], given: tuple[Any, ...]) -> tuple[Any, ...]:
+        """What an executor is sent: of threads the job, of others what needs no 64-bit floats.
+
+        Processes may have none before the job asks for them, and would round arrays of JAX.
 
         Raises:
-            TypeError: a function is none of a module.
+            TypeError: a process would be sent a function that is none of a module.
         """
-        if self._sent or not isinstance(self._executor, ProcessPoolExecutor):
-            return
+        if isinstance(self._executor, ThreadPoolExecutor):
+            return function, *given
+        first, *rest = given
         try:
-            pickle.dumps((function, given))
+            return _answered, pickle.dumps((function, first)), pickle.dumps(rest)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
+            if not isinstance(self._executor, ProcessPoolExecutor):
+                return function, *jax.device_get(given)
             raise TypeError(
                 "executor sends the loop to other processes, but a function that is a lambda or "
                 f"stands within another one cannot be sent ({error}): define it at the top of a "
                 "module, or take threads (ThreadPoolExecutor) or dask (client.get_executor())"
             ) from None
-        self._sent = True
 
     def finished(self) -> Iterator[tuple[Kept, Any]]:
         """The jobs that are done, with their results, once there are any.
@@ -115,7 +136,8 @@ class CellJobs(Generic[Kept]):
         """The result of a job, here if it has none from elsewhere."""
         if self._executor is not None or future.done():
             try:
-                return future.result()
+                answer = future.result()
+                return pickle.loads(answer) if isinstance(answer, bytes) else answer
             except (BrokenExecutor, CancelledError) as error:
                 self._give_up(error)
             except Exception as error:

@@ -5,6 +5,7 @@ import pickle
 import signal
 import threading
 import time
+import warnings
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
@@ -445,9 +446,35 @@ def test_a_process_that_is_killed_loses_nothing(small):
     assert len(tube) == 6
 
 
+def swing(x, u):
+    return jnp.array([x[1], 5 * jnp.sin(x[0]) + u[0]])
+
+
+def push(x):
+    return -8 * jnp.tanh(x[:1] + 0.5 * x[1:])
+
+
+@pytest.mark.costly
+def test_processes_that_have_no_long_floats_of_their_own_answer_to_the_last_digit():
+    import multiprocessing
+
+    sampled = rj.SampledPlant(swing, states=2, inputs=1, period=0.1)
+    loop, X0 = rj.ClosedLoop(sampled, rj.Network(push, 2, 1)), rj.Box([-1.0, -1.0], [1.0, 1.0])
+    thirds = rj.Box([-4.0 / 3, -10 / 3], [4.0 / 3, 10 / 3])  # which short floats would round
+    here = rj.decide(loop, X0, 3, safe=thirds, cells=(2, 2))
+    assert here.proved
+    rj.decide(loop, X0, 1, safe=thirds)  # functions of the loop are recorded
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=spawn) as pool, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        there = rj.decide(loop, X0, 3, safe=thirds, cells=(2, 2), executor=pool)
+    np.testing.assert_array_equal(there.margins["safe"], here.margins["safe"])
+
+
 @pytest.mark.parametrize(
     "call",
     [
+        lambda loop, X0, pool: rj.decide(loop, X0, 1, goal=X0, cells=8, executor=pool),
         lambda loop, X0, pool: rj.reach_partitioned(
             loop, X0, 1, rj.Template.box(1), cells=(2,), executor=pool
         ),
@@ -455,7 +482,7 @@ def test_a_process_that_is_killed_loses_nothing(small):
             loop, X0, 1, safe=rj.Box([-0.9], [2.0]), cells=8, executor=pool
         ),
     ],
-    ids=["reach_partitioned", "winning_set"],
+    ids=["decide", "reach_partitioned", "winning_set"],
 )
 def test_functions_that_no_process_can_be_sent_are_told_how_to(call):
     plant = rj.NonlinearPlant(lambda x, u: 0.5 * x, states=1, inputs=1)

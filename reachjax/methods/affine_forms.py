@@ -159,13 +159,13 @@ def spans_by_forms(
     given = loop, X0, box, directions
     if is_concrete(given):
         found = [
-            step.between
-            for step in unrolled(loop, X0, box, np.asarray(directions), start, between=True)
+            np.max(np.asarray(step.between), axis=0)
+            for step in unrolled(loop, X0, box, np.asarray(directions), start, between=1)
         ]
     else:
-        between = unrolled_at_once(loop, X0.closed_form(box), box, directions, start, between=True)
-        assert between.between is not None  # they were asked for
-        found = [*between.between]
+        steps = unrolled_at_once(loop, X0.closed_form(box), box, directions, start, between=1)
+        assert steps.between is not None  # they were asked for
+        found = [*jnp.max(steps.between, axis=1)]
     pairs = zip(shapes, found, strict=True)
     return tuple(shape.polytope(owned(offsets)) for shape, offsets in pairs)
 

@@ -8,7 +8,7 @@ leaves out of a state is part of its radius, which gets a column.
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import lru_cache, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -34,26 +34,57 @@ class Between(NamedTuple):
     points: tuple[tuple[AffineForms, ...], ...]
     ends: tuple[float, ...]
 
-    def values(self, directions: Float[Array | np.ndarray, "m n_x"]) -> list[AffineForms]:
-        """Forms `(m,)` of directions, one of which each direction does not exceed at any time."""
-        return [directions @ point for point in self.states]
-
     @property
     def states(self) -> list[AffineForms]:
         """The control points, the last of which are states at the next sample."""
         return [point for four in self.points for point in four]
 
+    def values(self, directions: Float[Array | np.ndarray, "m n_x"], parts: int = 1) -> AffineForms:
+        """Forms of directions at control points: part by part, four points each, `m` of each.
+
+        Within a part a direction does not exceed all four. The last ones are of the next sample.
+
+        Args:
+            directions: one row each.
+            parts: a power of two, into so many each step is cut.
+        """
+        fours = [joined([directions @ point for point in four]) for four in self.points]
+        if parts > 1:
+            cut = np.kron(_cut(parts), np.eye(len(directions)))
+            fours = [cut @ four for four in fours]
+        return joined(fours)
+
     def bounds(
-        self, directions: Float[Array | np.ndarray, "m n_x"], start: InitialColumns
-    ) -> Float[Array | np.ndarray, " m"]:
-        """Upper bounds of directions at all times from one sample to the next one.
+        self, directions: Float[Array | np.ndarray, "m n_x"], start: InitialColumns, parts: int = 1
+    ) -> Float[Array | np.ndarray, "p m"]:
+        """Upper bounds of directions at all times of each part of a period.
 
         Args:
             directions: one row each.
             start: what the first columns are.
+            parts: as of `values`.
         """
-        each = self.values(directions)
-        return reduce(larger, split(joined(each).ends(start, True)[1], len(each)))
+        ends = self.values(directions, parts).ends(start, True)[1]
+        each = ends.reshape(-1, 4, len(directions))
+        largest = reduce(larger, (each[:, k] for k in range(4)))
+        xp = namespace(ends)
+        return xp.where(xp.isnan(each).any(axis=1), xp.inf, largest)
+
+
+@lru_cache
+def _cut(parts: int) -> Float[np.ndarray, "p 4"]:
+    """From the control points of a cubic to those of its equal parts, by de Casteljau: exactly.
+
+    Weights are nonnegative and add up to one, so what is known of a cubic up to an error that is
+    the same at all four points is known of its parts.
+    """
+    if parts == 1:
+        return np.eye(4)
+    first, half = np.zeros((4, 4)), np.eye(4)
+    for k in range(4):
+        first[k] = half[0]
+        half = (half[:-1] + half[1:]) / 2
+    return np.vstack([_cut(parts // 2) @ first, _cut(parts // 2) @ first[::-1, ::-1]])
 
 
 def flowed_forms(

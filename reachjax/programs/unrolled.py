@@ -39,7 +39,8 @@ class ByForms(NamedTuple):
             units and what cuts the initial set.
         drawn: for each step so far the values `(m, d)` of disturbances there; nothing of compiled
             code.
-        between: `(m,)`, upper bounds at all times since the sample before, if they are asked for.
+        between: `(p, m)`, upper bounds at all times of each part of the period before, if they are
+            asked for.
         open: decisions of the step that may go either way, none of compiled code.
         ways: along how many ways of decisions that is so.
         moved: `(n_x,)`, how far each coordinate of the initial set moves what decides between this
@@ -50,7 +51,7 @@ class ByForms(NamedTuple):
     slopes: Float[Array | np.ndarray, "*N units"]
     corners: Float[Array | np.ndarray, "*N m n_x"]
     drawn: tuple[Float[np.ndarray, "m d"], ...] = ()
-    between: Float[Array | np.ndarray, "*N m"] | None = None
+    between: Float[Array | np.ndarray, "*N p m"] | None = None
     open: tuple[OpenDecision, ...] = ()
     ways: int = 1
     moved: Float[np.ndarray, " n_x"] = np.zeros(0)
@@ -64,7 +65,7 @@ def unrolled(
     t: int = 0,
     slopes: Float[np.ndarray, "N units"] | None = None,
     known: Sequence[Box] | None = None,
-    between: bool = False,
+    between: int = 0,
     most: int = 1,
     wanted: Float[np.ndarray, "N m"] | None = None,
 ) -> Iterator[ByForms]:
@@ -78,7 +79,8 @@ def unrolled(
         t: the time of the initial set.
         slopes: of lines for the units of each step, of which any are sound; None for good ones.
         known: boxes that surely hold the states after each step, where they are known.
-        between: whether bounds at all times are asked for, of a differential equation.
+        between: into how many parts, a power of two, the steps of a differential equation are cut,
+            in each of which bounds at all times are asked for; 0 if none are.
         most: along how many ways of its decisions a loop that jumps is followed.
         wanted: for each step, bounds of the directions below which nothing is gained; None for
             bounds that are as good as they can be.
@@ -103,7 +105,7 @@ def along_ways(
     t: int = 0,
     slopes: Float[np.ndarray, "N units"] | None = None,
     known: Sequence[Box] | None = None,
-    between: bool = False,
+    between: int = 0,
     most: int = 1,
     wanted: Float[np.ndarray, "N m"] | None = None,
 ) -> Iterator[list[ByForms]]:
@@ -114,14 +116,14 @@ def along_ways(
     loop, X0, box, known = map(in_numpy, (loop, X0, box, known))
     with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
         start = InitialColumns.of(X0, box, loop.curved)
-    given = loop, start, len(directions), t, most, between, slopes, known
+    given = loop, start, len(directions), t, most, between > 0, slopes, known
     for k, found in enumerate(ways(*given)):
         rows = np.asarray(directions[k])
         enough = np.full(len(rows), -np.inf) if wanted is None else wanted[k]
         each = list[ByForms]()
         for way in found:
             with np.errstate(all="ignore"), contextlib.suppress(NoStatesError):
-                each.append(_of_way(way, rows, start, enough))
+                each.append(_of_way(way, rows, start, enough, between))
         nowhere = np.tile(start.center, (len(rows), 1))
         yield each or [ByForms(np.full(len(rows), -np.inf), np.zeros(loop.units), nowhere)]
 
@@ -131,13 +133,15 @@ def _of_way(
     rows: Float[np.ndarray, "m n_x"],
     start: InitialColumns,
     wanted: Float[np.ndarray, " m"],
+    between: int,
 ) -> ByForms:
     """What one way says of the states after a step.
 
     Raises:
         NoStatesError: there are none on it.
     """
-    found, forms = _bounds(rows, way.state, way.units, start, way.spans), rows @ way.state
+    found = _bounds(rows, way.state, way.units, start, way.spans, between)
+    forms = rows @ way.state
     drawn = [np.sign(forms.columns[:, each]) for each in way.free]
     if len(way.facts):
         upper, at = way.bounds(forms, start, wanted)
@@ -175,7 +179,7 @@ def _together(each: Sequence[ByForms]) -> ByForms:
     drawn = tuple(of_deciding(lambda one, k=k: one.drawn[k]) for k in range(len(each[0].drawn)))
     between = None
     if each[0].between is not None:
-        between = np.max([np.asarray(one.between) for one in each], axis=0)
+        between = np.concatenate([np.asarray(one.between) for one in each])
     corners = of_deciding(lambda one: one.corners)
     decisions = tuple(dict.fromkeys(decision for one in each for decision in one.open))
     uppers = uppers.max(axis=0)
@@ -202,7 +206,7 @@ def unrolled_at_once(
     box: Box,
     directions: Float[Array, "N m n_x"],
     t: int = 0,
-    between: bool = False,
+    between: int = 0,
     counted: bool = True,
     columns: int | None = None,
 ) -> ByForms:
@@ -216,7 +220,7 @@ def unrolled_at_once(
         box: around it.
         directions: one row a facet, for each step.
         t: the time of the initial set.
-        between: whether bounds at all times are asked for, of a differential equation.
+        between: as of `unrolled`.
         counted: whether rounding is, and what polynomials leave out of a flow: what is found
             without it is no bound, and takes a fraction of the time.
         columns: how many are kept of all steps before, into which old ones are merged; None for all
@@ -232,7 +236,7 @@ def _at_once(
     box: Box,
     directions: Float[Array, "N m n_x"],
     t: int,
-    between: bool,
+    between: int,
     columns: int | None,
 ) -> ByForms:
     """Bounds for all steps, as one scan."""
@@ -251,14 +255,14 @@ def _at_once(
         spans = [] if between else None
         given = loop, state, t + k, start
         state, units, _ = step_forms(*given, place=place, scratch=end, spans=spans, few=few)
-        found = _bounds(rows, state, units, start, spans)
+        found = _bounds(rows, state, units, start, spans, between)
         return merged_columns(state, first, kept, end) if merges else state, found
 
     state = AffineForms.beginning(start, end + scratch)
     return jax.lax.scan(advance, state, (jnp.arange(steps), directions))[1]
 
 
-@partial(Compiled, static_argnames=("t", "columns"))
+@partial(Compiled, static_argnames=("t", "columns", "between"))
 def unrolled_from_boxes(
     loop: ClosedLoop,
     lower: Float[Array, "c n_x"],
@@ -267,7 +271,8 @@ def unrolled_from_boxes(
     whole: Bool[Array, "N m"] | None = None,
     t: int = 0,
     columns: int | None = None,
-) -> Float[Array, "c N m"]:
+    between: int = 1,
+) -> Float[Array, "c N p m"]:
     """Upper bounds of directions after 1, ..., N steps from each of many boxes, in one call.
 
     Args:
@@ -278,15 +283,20 @@ def unrolled_from_boxes(
         whole: which of them are bounded at all times since the sample before; None for none.
         t: the time of the boxes.
         columns: as of `unrolled_at_once`; None for as many as a dozen steps add.
+        between: into how many parts steps are cut for these.
+
+    Returns:
+        The bounds in each part of a period; of what is bounded at samples the same in all.
     """
     most = columns or _columns_kept(loop)
 
-    def one(lower: Float[Array, " n_x"], upper: Float[Array, " n_x"]) -> Float[Array, "N m"]:
+    def one(lower: Float[Array, " n_x"], upper: Float[Array, " n_x"]) -> Float[Array, "N p m"]:
         box = Box(lower, upper)
         found = unrolled_at_once(
-            loop, box, box, directions, t, between=whole is not None, columns=most
+            loop, box, box, directions, t, 0 if whole is None else between, columns=most
         )
-        return found.offsets if whole is None else jnp.where(whole, found.between, found.offsets)
+        offsets = found.offsets[:, None]
+        return offsets if whole is None else jnp.where(whole[:, None], found.between, offsets)
 
     return jax.vmap(one)(lower, upper)
 
@@ -297,10 +307,13 @@ def _bounds(
     units: tuple[UnitForms, ...],
     start: InitialColumns,
     spans: Sequence[Between] | None,
+    between: int,
 ) -> ByForms:
     rows = directions @ state
     xp = jnp if isinstance(rows.rows, jax.Array) else np
     slopes = xp.concatenate([layer.slope for layer in units] or [xp.zeros(0)])
     corners = start.farthest(constant(rows.columns[:, : len(start.spread)]))
     found = ByForms(rows.ends(start, cut=True)[1], slopes, corners)
-    return found._replace(between=spans[0].bounds(directions, start)) if spans else found
+    if not spans:
+        return found
+    return found._replace(between=spans[0].bounds(directions, start, between))

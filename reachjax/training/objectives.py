@@ -22,7 +22,7 @@ from reachjax.numerics.pytrees import Replaceable
 from reachjax.programs.unrolled import unrolled_at_once
 from reachjax.sets import Box
 from reachjax.verdicts.facet_rows import FacetRowsByTime
-from reachjax.verdicts.specification import Requirement
+from reachjax.verdicts.specification import Requirement, parts_of_periods
 
 BETWEEN = 4
 """So many states of a period are simulated where requirements hold at all times."""
@@ -134,23 +134,24 @@ class Certified(Replaceable):
                 inside[here] = True
             else:
                 outside.setdefault(ends, np.zeros((steps + 1, 1), bool))[each.item.time] = True
-        between = bool(whole.any())
+        between = parts_of_periods(batch.required)
         kept = {"counted": False, "columns": COLUMNS_IN_TRAINING}
 
         def of_cell(lower: Array, upper: Array) -> Array:
             box, later = Box(lower, upper), jnp.asarray(directions[1:])
             found = unrolled_at_once(loop, box, box, later, batch.start, between=between, **kept)
-            bounds = found.offsets
+            bounds = found.offsets[:, None]
             if between:
-                bounds = jnp.where(whole[1:], found.between, bounds)
+                bounds = jnp.where(whole[1:, None], found.between, bounds)
             first = jnp.maximum(directions[0] * lower, directions[0] * upper).sum(axis=1)
-            bounds = jnp.concatenate([first[None], bounds])
+            first = jnp.broadcast_to(first, (1, *bounds.shape[1:]))
+            room = (limits[:, None] - jnp.concatenate([first, bounds])) / units[:, None]
 
             def rooms() -> Iterator[tuple[bool, Array]]:
-                room = (limits - bounds) / units
-                yield True, jnp.where(inside, room, jnp.inf)
-                for (first, last), times in outside.items():
-                    yield False, jnp.where(times, room[:, first:last], jnp.inf)
+                yield True, jnp.where(inside, room.min(axis=1), jnp.inf)
+                for (first, last), times in outside.items():  # in each part by its own facet
+                    apart = room[:, :, first:last].max(axis=2).min(axis=1, keepdims=True)
+                    yield False, jnp.where(times, apart, jnp.inf)
 
             return batch.missed(rooms()) + self._wider(batch, box, found.offsets, later)
 

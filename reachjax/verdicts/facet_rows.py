@@ -55,19 +55,22 @@ class FacetRows(NamedTuple):
         """The number of the first direction after its own."""
         return self.first + len(self.limits)
 
-    def judged(self, uppers: Float[np.ndarray, " m"]) -> tuple[bool, bool, float]:
-        """Whether it surely holds, or surely fails, and its margin, given bounds at its time."""
-        found, k = uppers[self.first : self.end], len(self.units)
-        room = (self.limits - found)[:k] / self.units
+    def judged(self, uppers: Float[np.ndarray, "*p m"]) -> tuple[bool, bool, float]:
+        """Whether it surely holds, or surely fails, and its margin.
+
+        Args:
+            uppers: bounds at its time, or in each part of the period before.
+        """
+        found, k = np.atleast_2d(uppers)[:, self.first : self.end], len(self.units)
+        room = (self.limits - found)[:, :k] / self.units
         known = np.isfinite(found)
+        below, under = known & (found < self.limits), known & (found <= self.limits)
         if self.item.inside:
-            holds = known[:k].all() and (found[:k] <= self.limits[:k]).all()
-            fails = (known & (found < self.limits))[k:].any()
+            holds, fails = under[:, :k].all(), below[:, k:].any()
             margin = room.min(initial=np.inf)
         else:
-            holds = (known & (found < self.limits))[:k].any()
-            fails = known[k:].all() and (found[k:] <= self.limits[k:]).all()
-            margin = np.fmax.reduce(room)
+            holds, fails = below[:, :k].any(axis=1).all(), under[:, k:].all(axis=1).any()
+            margin = np.fmax.reduce(room, axis=1).min()
         return bool(holds), bool(fails), float(np.nan_to_num(margin, nan=-np.inf))
 
 

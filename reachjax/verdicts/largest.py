@@ -43,6 +43,7 @@ from reachjax.verdicts.specification import (
     Region,
     Requirement,
     Timed,
+    parts_of_periods,
     period_of,
     requirements,
 )
@@ -416,7 +417,7 @@ def _margins(
     rows = [C / norms[:, None] for C, _, norms in facets] + [np.eye(loop.states)]
     directions = np.unique(np.concatenate([*rows, *(-each for each in rows)]), axis=0)
     on_host, rows_of = in_numpy(loop), np.tile(directions, (horizon, 1, 1))
-    between = any(item.throughout for item in required)
+    between = parts_of_periods(required)
 
     def margins(shape: Shape) -> Float[np.ndarray, " r"]:
         try:
@@ -430,12 +431,12 @@ def _margins(
         found = []
         for item, (C, d, norms) in zip(required, facets, strict=True):
             rows, limits = C / norms[:, None], d / norms
-            known: Any = (spans if item.throughout else offsets)[item.time]
+            known = np.atleast_2d((spans if item.throughout else offsets)[item.time])
             if item.inside:
-                found.append(limits - known[_places(directions, rows)])
+                found.append(limits - known[:, _places(directions, rows)].max(axis=0))
             else:
-                room = -known[_places(directions, -rows)] - limits
-                found.append(np.max(room, keepdims=True))
+                room = -known[:, _places(directions, -rows)] - limits
+                found.append(room.max(axis=1).min(keepdims=True))
         return np.concatenate(found)
 
     return margins

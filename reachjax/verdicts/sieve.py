@@ -30,7 +30,7 @@ from reachjax.programs.unrolled import ByForms, along_ways, unrolled, unrolled_f
 from reachjax.sets import AbstractSet, Box
 from reachjax.verdicts.facet_rows import FacetRowsByTime
 from reachjax.verdicts.grounds import Leaves
-from reachjax.verdicts.specification import Requirement
+from reachjax.verdicts.specification import Requirement, parts_of_periods
 
 TOGETHER = 32
 """So many cells are a call: fewer are filled up, so that one shape is compiled."""
@@ -125,6 +125,7 @@ class Sieve:
         self._rows, directions, whole = FacetRowsByTime.of(required, horizon, loop.states)
         self._directions, self._later = directions, jnp.asarray(directions[1:])
         self._whole = jnp.asarray(whole[1:]) if whole.any() else None
+        self._between = parts_of_periods(required)
 
     def pays(self, cells: Sequence[Ends], budget: Budget) -> bool:
         """Whether the compiled call is there, and faster than what these cells take one by one.
@@ -145,8 +146,13 @@ class Sieve:
             evaluations=TOGETHER * steps * passes,
             left=budget.left,
             share=len(cells) / TOGETHER,
-            t=self._start,
+            **self._static,
         )
+
+    @property
+    def _static(self) -> dict[str, int]:
+        """What the compiled call is compiled for."""
+        return {"t": self._start, "between": max(self._between, 1)}
 
     @cached_property
     def _of_subnormals(self) -> bool:
@@ -157,9 +163,8 @@ class Sieve:
         """The seconds that a call takes one by one; None where this cell has no bounds."""
         box, began = in_numpy(Box(*cell)), time.perf_counter()
         try:
-            between = self._whole is not None
             given = self._on_host, box, box, self._directions[1:], self._start
-            steps = unrolled(*given, between=between)
+            steps = unrolled(*given, between=self._between)
             if self._loop.plant.continuous:  # a flow costs about the same in each
                 steps = itertools.islice(steps, MEASURED)
             count = len(list(steps))
@@ -177,9 +182,10 @@ class Sieve:
     def sifted(self, cells: Sequence[Ends]) -> list[Outcome]:
         """What is found of each cell, at most `TOGETHER` of them."""
         _, lower, upper, *_ = given = self._given(cells)
-        bounds = SIFT(*given, t=self._start)
-        first = _at_first(self._directions[0], lower, upper)
-        bounds = np.concatenate([first[:, None], bounds], axis=1)
+        bounds = np.asarray(SIFT(*given, **self._static))
+        first = _at_first(self._directions[0], lower, upper)[:, None, None]
+        first = np.broadcast_to(first, (len(first), 1, *bounds.shape[2:]))
+        bounds = np.concatenate([first, bounds], axis=1)
         with np.errstate(invalid="ignore"):
             return [self._judged(uppers) for uppers in bounds[: len(cells)]]
 
@@ -202,7 +208,7 @@ class Sieve:
         ends = np.asarray(box.lower)[None], np.asarray(box.upper)[None]
         begun = _at_first(self._directions[0], *ends)[0]
         first = ByForms(begun, np.zeros(0), np.zeros((0, 0)))
-        between = self._whole is not None
+        between = self._between
         whole = np.asarray(self._whole) if between else np.zeros(self._later.shape[:2], bool)
         given = self._on_host, part, box, self._directions[1:], self._start
         later = along_ways(*given, between=between, most=most)
@@ -225,7 +231,7 @@ class Sieve:
                 return Outcome(False, margins, open=tuple(still_open))
         return Outcome(True, margins)
 
-    def _judged(self, uppers: Float[np.ndarray, "h+1 m"]) -> Outcome:
+    def _judged(self, uppers: Float[np.ndarray, "h+1 p m"]) -> Outcome:
         """What bounds say of one cell."""
         items, proved, refuted = [rows.item for rows in self._rows], True, False
         margins = no_margins(items, len(uppers) - 1)

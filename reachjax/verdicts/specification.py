@@ -10,7 +10,7 @@ Goals and sets to avoid may be those of some times only.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -189,6 +189,17 @@ class Compared(NamedTuple):
         To be shown and differentiated: of a margin at rounding level, the sign proves nothing.
         """
         return (self.limits - self.attained) / self.units
+
+
+PARTS = 8
+"""Into so many parts the steps of a flow are cut where sets are to be avoided: where states pass a
+corner, another facet is between them and the set in each part."""
+
+
+def parts_of_periods(required: Iterable[Requirement]) -> int:
+    """Into how many parts steps of a flow are cut; 0 where nothing is meant in between samples."""
+    whole = [item for item in required if item.throughout]
+    return PARTS if any(not item.inside for item in whole) else min(len(whole), 1)
 
 
 @dataclasses.dataclass(frozen=True)

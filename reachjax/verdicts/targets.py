@@ -8,7 +8,11 @@ from jaxtyping import Float
 from reachjax.methods.ladder import Ladder, Target
 from reachjax.methods.witnesses import Simulated, Simulations
 from reachjax.programs.affine import AffineForms
-from reachjax.verdicts.specification import Requirement
+from reachjax.programs.horizon import Horizon
+from reachjax.verdicts.specification import PARTS, Requirement
+
+FINEST = 64
+"""Into so many parts steps are cut at last, for states that pass very close by a corner."""
 
 BELOW = 1e-9
 """How far below zero a linear program should be, as a part of its form's range, to prove that."""
@@ -56,28 +60,50 @@ def values_of(
     """Groups of forms: in each, one must be below zero at each state.
 
     In between samples all control points must be on the right side: of a set to be avoided, of one
-    facet that is the same for all of them, as their hull is then too.
+    facet that is the same for all four of a part of the period, as their hull is then too. Periods
+    are cut where that proves it.
 
     Returns:
         The groups, and what a distance of 1 in the units of the state changes their values by.
     """
-    C, d, norms = _facets(item)
-    horizon = ladder.horizon
-    states = [horizon.state]
-    if item.throughout:
-        assert horizon.spans  # they were asked for
-        states = [point.padded(horizon.width) for point in horizon.spans[-1].states]
+    (C, d, norms), horizon = _facets(item), ladder.horizon
+    if not item.throughout:
+        rows = C @ horizon.state
+        if item.inside:
+            return _each(rows + (-d)), norms
+        return [(1 / norms) * (d - rows)], np.ones(1)
+    assert horizon.spans  # they were asked for
+    between = horizon.spans[-1]
     if item.inside:
-        every = [C @ state + (-d) for state in states]
-        return [rows[i : i + 1] for rows in every for i in range(len(d))], np.tile(
-            norms, len(every)
-        )
-    every = [(1 / norms) * (d - C @ state) for state in states]
-    if item.throughout:
-        uppers = np.max([rows.ends(horizon.start)[1] for rows in every], axis=0)
-        best = int(np.argmin(np.nan_to_num(uppers, nan=np.inf)))
-        every = [rows[best : best + 1] for rows in every]
-    return every, np.ones(len(every))
+        rows = between.values(C).padded(horizon.width)
+        count = len(rows) // len(d)
+        return _each(rows + np.tile(-d, count)), np.tile(norms, count)
+    for parts in (1, PARTS, FINEST):
+        found, proved = _apart(between.values(C, parts).padded(horizon.width), d, norms, horizon)
+        if proved:
+            return found, np.ones(len(found))
+    found, _ = _apart(between.values(C).padded(horizon.width), d, norms, horizon)
+    return found, np.ones(len(found))
+
+
+def _each(rows: AffineForms) -> list[AffineForms]:
+    """A group for each of some forms."""
+    return [rows[i : i + 1] for i in range(len(rows))]
+
+
+def _apart(
+    rows: AffineForms,
+    d: Float[np.ndarray, " m"],
+    norms: Float[np.ndarray, " m"],
+    horizon: Horizon,
+) -> tuple[list[AffineForms], bool]:
+    """Depths in a set at control points, of each part's best facet; whether they prove it."""
+    count = len(rows) // len(d)
+    depths = np.tile(1 / norms, count) * (np.tile(d, count) - rows)
+    ends = depths.ends(horizon.start)[1].reshape(-1, 4, len(d)).max(axis=1)
+    best = np.nan_to_num(ends, nan=np.inf).argmin(axis=1)
+    places = np.arange(count) * len(d) + np.repeat(best, 4)
+    return _each(depths[places]), bool((np.take_along_axis(ends, best[:, None], axis=1) < 0).all())
 
 
 def _facets(item: Requirement) -> list[np.ndarray]:

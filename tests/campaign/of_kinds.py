@@ -70,7 +70,7 @@ def _merged(
     case, rows = trial.case, np.asarray(names["template"].directions)
     names["rows"] = np.broadcast_to(rows, (case.kind.horizon, *rows.shape))
     names["bounds"] = unrolled_from_boxes
-    call = "bounds(case.loop, case.X0.lower[None], case.X0.upper[None], rows, columns={})[0]"
+    call = "bounds(case.loop, case.X0.lower[None], case.X0.upper[None], rows, columns={})[0, :, 0]"
     call = call.format(case.kind.columns)
     found = trial.attempt("merged columns", call, names)
     if found is None:

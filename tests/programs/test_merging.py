@@ -90,7 +90,7 @@ def test_merged_horizons_hold_trajectories_and_are_hardly_wider():
     loop, X0 = pendulum()
     rows = np.broadcast_to(np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1]]), (80, 5, 2))
     whole = unrolled_at_once(loop, X0, X0, rows).offsets
-    few = unrolled_from_boxes(loop, X0.lower[None], X0.upper[None], rows, columns=16)[0]
+    few = unrolled_from_boxes(loop, X0.lower[None], X0.upper[None], rows, columns=16)[0, :, 0]
     widths = [offsets[:, [0, 2]] + offsets[:, [1, 3]] for offsets in (few, whole)]
     assert (widths[0] <= 1.1 * widths[1]).all()
     states = X0.sample(jax.random.key(0), 200)

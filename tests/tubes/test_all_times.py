@@ -9,6 +9,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.loops.batches import in_between
+from reachjax.programs.unrolled import unrolled_from_boxes
 
 TURN = 2 * math.pi
 X0 = rj.Box([-0.01, 0.99], [0.01, 1.01])
@@ -135,3 +136,26 @@ def test_a_trajectory_that_escapes_is_refuted_where_it_is_still_enclosed():
     verdict = rj.decide(loop, wide, 6, safe=rj.Box([-50.0, -5.0], [50.0, 5.0]), cells=64)
     assert verdict.refuted
     assert verdict.counterexample.states[-1][0] > 50.0
+
+
+@pytest.mark.parametrize("loop", loops(), ids=["function", "matrices"])
+def test_states_may_pass_a_corner_within_a_period(loop):
+    """The corner is at a radius of 0.96 or 1.02, states are at 0.99 to 1.01."""
+    within, beyond = (rj.Box([0.3, 0.3], [corner, corner]) for corner in (0.68, 0.72))
+    for cells in (None, (2, 1)):
+        assert rj.decide(loop, X0, 1, avoid=[within], cells=cells).proved
+        assert rj.decide(loop, X0, 1, avoid=[beyond], cells=cells).refuted
+
+
+def test_bounds_of_each_part_of_a_period_hold_the_states_in_it():
+    loop = rj.ClosedLoop(rj.SampledPlant(turning, 2, 1, 0.5, steps=4), STILL)
+    axes = jnp.tile(jnp.concatenate([jnp.eye(2), -jnp.eye(2)]), (2, 1, 1))
+    ends, whole = (X0.lower[None], X0.upper[None]), jnp.ones(axes.shape[:2], bool)
+    (bounds,) = np.asarray(unrolled_from_boxes(loop, *ends, axes, whole, between=8))
+    points = jnp.concatenate([X0.corners(), X0.sample(jax.random.key(0), 50)])
+    parts = bounds.shape[1]
+    states = np.asarray(loop.simulate(points, 2, parts=4 * parts))
+    values = np.concatenate([states, -states], axis=-1)
+    for number, upper in enumerate(bounds.reshape(2 * parts, -1)):
+        assert np.all(values[:, 4 * number : 4 * number + 5] <= upper + 1e-9)
+    assert np.all(bounds.min(axis=1) < bounds.max(axis=1) - 0.9)  # the circle has a radius of one

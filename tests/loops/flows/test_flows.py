@@ -12,6 +12,7 @@ import reachjax as rj
 from reachjax.loops.flows.steps import WORTH
 from reachjax.loops.flows.taylor_models import Symbols
 from reachjax.loops.units import UnboundedError
+from reachjax.numerics.numbers import split
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.flows import flowed_forms
@@ -20,6 +21,7 @@ from tests.loops.flows.fields import KINDS, field, solution
 
 STATES = 1, 2, 3, 6
 PARTS = 0.0, 0.1, 0.37, 0.5, 0.83, 1.0
+CUT = 4
 DENSE = tuple(k / 50 for k in range(1, 51))
 
 
@@ -87,6 +89,8 @@ def missed(
     for _ in range(periods):
         forms, between = flowed_forms(plant.flow, (forms, gain @ forms), start, between=True)
         hulls = [[directions @ point for point in four] for four in between.points]
+        cut = split(between.values(directions, CUT), CUT * len(hulls))
+        cut = [split(part, 4) for part in cut]
         for n, first in enumerate(firsts):
             w = columns_of(start, first)
             u = [sum(mpf(g) * a for g, a in zip(row, states[n], strict=True)) for row in gain]
@@ -94,10 +98,11 @@ def missed(
             ends = (0.0, *between.ends)
             moments = [mpf(ends[k]) + part * (mpf(ends[k + 1]) - mpf(ends[k])) for k, part in times]
             exact = solution_of(own, states[n], u, [mpf(float(plant.period)) * m for m in moments])
-            for (k, _), x in zip(times, exact, strict=True):
-                uppers = [sum(value(point, w)) for point in hulls[k]]
+            for (k, part), x in zip(times, exact, strict=True):
                 reached = directions @ np.array([float(a) for a in x])
-                wrong += np.sum(~(reached <= np.max(uppers, axis=0) + 1e-12))
+                for four in (hulls[k], cut[k * CUT + min(int(CUT * part), CUT - 1)]):
+                    uppers = [sum(value(point, w)) for point in four]
+                    wrong += np.sum(~(reached <= np.max(uppers, axis=0) + 1e-12))
             states[n] = exact[-1]
             middle, error = value(forms, w)
             apart = abs(np.array([float(a) for a in exact[-1]]) - middle)

@@ -1,4 +1,4 @@
-"""Nonlinear units and the activations made of them: one file each, which is all that knows them."""
+"""Nonlinear units and the activations made of them, one file a family."""
 
 from reachjax.loops.units.base import (
     AbstractActivation,

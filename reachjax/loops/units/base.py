@@ -1,4 +1,4 @@
-"""What a nonlinear unit says of itself, so that nothing else has to know which one it is.
+"""What a nonlinear unit says of itself, so that no bound has to know which one it is.
 
 A **unit** is a relation `z = f(y)` between two numbers. It states its value, its interval, an
 affine function below and one above it, and its facts: what is never negative, and which products of

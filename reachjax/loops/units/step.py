@@ -57,6 +57,7 @@ class Step(AbstractUnit):
 
     nonexpansive: ClassVar[bool] = False
     jumps: ClassVar[bool] = True
+    breaks: ClassVar[bool] = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`1` above zero, `0` below; derivatives are zero."""
@@ -124,6 +125,7 @@ class Gated(AbstractUnit):
 
     separable: ClassVar[bool] = False
     nonexpansive: ClassVar[bool] = False
+    breaks: ClassVar[bool] = True
 
     def __call__(self, y: Float[Array, "*c n"]) -> Float[Array, "*c n"]:
         """The products, of an `s` that is not zero or one with the nearer one of these."""
@@ -260,6 +262,7 @@ class Floor(AbstractUnit):
     even: bool = True
 
     nonexpansive: ClassVar[bool] = False
+    breaks: ClassVar[bool] = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """The whole number; its derivative is zero."""

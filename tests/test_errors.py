@@ -110,6 +110,9 @@ BAD_TYPES = {
     r"ClosedLoop\.input_box must .* a tuple": lambda: rj.ClosedLoop(PLANT, NET, (-1, 1)),
     r"X0 must be .*\[\[0, 0\], \[1, 1\]\]": lambda: reach(X0=[[0, 0], [1, 1]]),
     "loop must be a ClosedLoop": lambda: reach(loop=NET),
+    "loop must be a ClosedLoop, but an MLP": lambda: reach(loop=NET, template=None),
+    "loop must be a ClosedLoop, but a Box": lambda: rj.volume_penalty(X0, X0, 1),
+    "template must be .*, or None, but a Box arrived": lambda: reach(template=X0),
     "template must be a template": lambda: reach(template=TEMPLATE.directions),
     "relaxation must be a relaxation object.*class.*LocalBounds": lambda: reach(
         relaxation=rj.LocalBounds

@@ -60,6 +60,10 @@ class Batch(AbstractNumber):
         """The numbers as they are: values know nothing of errors."""
         return self
 
+    def flowed(self, flow: Any, given: tuple[Any, ...], unit: Callable[..., Any]) -> Any:
+        """The state after one period of a flow, simulated."""
+        return flow.simulated(given, unit)
+
     def _standing(self, idle: Bool[np.ndarray, " c"]) -> Batch:
         """One point standing for all that are idle."""
         values = self.values

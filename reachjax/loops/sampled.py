@@ -17,12 +17,11 @@ from reachjax.loops.flows.series import Tape
 from reachjax.loops.flows.steps import Settings
 from reachjax.loops.plants import AbstractPlant, AffinePlant
 from reachjax.loops.tracing.functions import Function
-from reachjax.loops.tracing.limits import Limits
 from reachjax.loops.tracing.values import UnsupportedError, Value
 from reachjax.loops.units import AtUnit, UnboundedError, evaluate
 from reachjax.numerics.checks import Numbers, is_concrete, real_number, require_kind, whole_number
 from reachjax.numerics.pytrees import converted, pytree, static
-from reachjax.numerics.rounding import Ball, namespace
+from reachjax.numerics.rounding import namespace
 
 NAME = "SampledPlant"
 
@@ -89,43 +88,21 @@ class AbstractSampledPlant(AbstractPlant):
     ) -> Any:
         """The state a period after `x` under input `u` and disturbances `w`.
 
-        Of plain numbers it is integrated, of intervals enclosed. What other kinds of number make of
-        it is done at a layer of units, the `Flow`.
+        Of plain numbers it is integrated; what other kinds of number make of it they say.
 
         Raises:
+            TypeError: they are rows over a basis.
             UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
         """
         if self.disturbances and w is None:
             w = np.zeros((self.disturbances, self.states)) @ x
-        if isinstance(x, Ball) and type(x) is not Ball:
-            raise TypeError(
-                "the flow of a differential equation has no rows over a basis: give "
-                "relaxation=LinearBounds() or BranchAndCut(), and a template of facets"
-            )
         given = (x, u) if w is None else (x, u, w)
-        flow = self.flow_at(t)
-        if isinstance(x, np.ndarray | jax.Array):  # units of the equation are none of the loop
-            return flow.simulated(given, evaluate)
-        if hasattr(x, "values"):
-            return flow.simulated(given, unit)
         try:
             with np.errstate(all="ignore"):  # what overflows has no bounds
-                if type(x) is Ball:
-                    return flow.enclosed(tuple(map(_interval, given)))
-                if isinstance(x, Limits):
-                    return self._limits(flow, (x, *given[1:]))
-                return unit(flow, *given)
+                return self.flow_at(t)(given, unit)
         except UnboundedError as error:
             unit_of, _, lower, upper = error.given
             raise UnboundedError(unit_of, int(t), lower, upper, line=error.line) from None
-
-    def _limits(self, flow: AbstractFlow, given: tuple[Limits, ...]) -> Limits:
-        """What limits lead to; nothing is known if they are infinite."""
-        ends = [(each.least, each.most) for each in given]
-        if not np.isfinite(ends[0]).all() or not np.isfinite(ends[1]).all():
-            return Limits.unknown(self.states)
-        found = flow.enclosed(tuple(Ball.between(*each) for each in ends))
-        return Limits(np.asarray(found.lower), np.asarray(found.upper))
 
 
 @pytree
@@ -342,10 +319,6 @@ class SampledPlant(AbstractSampledPlant):
         A = Numbers("(n_x, n_x)")(A, "SampledPlant.affine's A")
         c = jnp.zeros(len(A)) if c is None else c
         return SampledAffinePlant(A, B, c, period, E, bool(held))
-
-
-def _interval(number: Any) -> Ball:
-    return number if isinstance(number, Ball) else Ball.exact(number)
 
 
 def _taped(f: Function) -> Tape:

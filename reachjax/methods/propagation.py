@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from functools import singledispatch
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -32,9 +32,11 @@ from reachjax.numerics.checks import (
 from reachjax.numerics.derivatives import first_order
 from reachjax.programs.relaxations import AbstractRelaxation, BranchAndCut, LinearBounds
 from reachjax.proofs.certificates import AbstractProof
-from reachjax.sets import AbstractSet, AbstractTemplate
+from reachjax.sets import AbstractSet, AbstractTemplate, Template
 from reachjax.sets.unusable import ThinSetError, UnusableSetError
 from reachjax.solvers import AbstractSolver, Auto
+
+T = TypeVar("T")
 
 
 @singledispatch
@@ -89,7 +91,10 @@ GAP = 1e-4
 KINDS = {
     "loop": (ClosedLoop, "a ClosedLoop"),
     "X0": (AbstractSet, "a set such as Box(lower, upper) or Polytope(A, b)"),
-    "template": (AbstractTemplate, "a template, such as Template.box(n) or EllipsoidTemplate()"),
+    "template": (
+        AbstractTemplate,
+        "a template, such as Template.box(n) or EllipsoidTemplate(), or None",
+    ),
     "relaxation": (
         (AbstractRelaxation, AbstractMethod),
         "a relaxation object, such as BranchAndCut()",
@@ -272,6 +277,18 @@ def require_kinds(**arguments: Any) -> None:
     """Raise a `TypeError` that names the first argument that is not of the kind of its name."""
     for name, value in arguments.items():
         require_kind(name, value, *KINDS[name])
+
+
+def template_of(loop: ClosedLoop, template: T | None) -> T | Template:
+    """The template that is given, or the default one of a loop's states.
+
+    Raises:
+        TypeError: none is given, and the loop is none.
+    """
+    if template is not None:
+        return template
+    require_kinds(loop=loop)
+    return Template.default(loop.states)
 
 
 def check_problem(problem: Problem, options: Options) -> None:

@@ -41,9 +41,9 @@ class CompiledBeside:
 
     How long XLA takes for a large function nobody knows, and nothing can interrupt it. So it has a
     thread of its own, for which neither a limit nor Ctrl-C waits, but the end of Python does: JAX
-    must not be taken down under it. It begins once callers have spent so much in numpy that
-    compiling would have paid, or at once if it is cheap, and only if what is left of their time is
-    longer than it takes. What it finds is of use only where it is faster.
+    must not be taken down under it. It begins once callers have spent as much in numpy as
+    compiling takes; at once if one call takes as much, or if it is cheap; and only if what is left
+    of their time is longer. What it finds is of use only where it is faster.
 
     Args:
         function: made by `jax.jit`, with keywords for what is static.

@@ -65,6 +65,16 @@ class AbstractNumber(abc.ABC):
         """Products with plain numbers that these factors are off by a few roundings."""
         return factor * self
 
+    def flowed(self, flow: Any, given: tuple[Any, ...], unit: Callable[..., Any]) -> Any:
+        """The state after one period of a flow: what is done at a layer of units.
+
+        Args:
+            flow: of a differential equation (`loops.flows`).
+            given: these numbers, the input, and disturbances if there are any.
+            unit: what is done at a layer of units.
+        """
+        return unit(flow, *given)
+
     def met(self, held: Callable[..., Any], *given: Any) -> Self:
         """The numbers with what is known of them besides, from other numbers, if that is kept."""
         return self

@@ -372,6 +372,10 @@ class Ball(AbstractNumber):
         """The numbers up to an error of so much each."""
         return self._rebuilt(self.mid, self.rad, by)
 
+    def flowed(self, flow: Any, given: tuple[Any, ...], unit: Callable[..., Any]) -> Any:
+        """The state after one period of a flow, enclosed."""
+        return flow.enclosed(tuple(map(self.lift, given)))
+
     def met(self, held: Callable[..., Self], *given: Self) -> Self:
         """What these hold and what others say of them."""
         return self.meeting(held(*given))

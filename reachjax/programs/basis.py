@@ -47,6 +47,17 @@ class Rows(Ball):
         """Rows whose values may be off by so much."""
         return Rows(self.mid, self.rad.at[:, -1].add(by))
 
+    def flowed(self, flow: Any, given: tuple[Any, ...], unit: Any) -> Any:
+        """Nothing: what a flow makes of rows is none.
+
+        Raises:
+            TypeError: always.
+        """
+        raise TypeError(
+            "the flow of a differential equation has no rows over a basis: give "
+            "relaxation=LinearBounds() or BranchAndCut(), and a template of facets"
+        )
+
     def met(self, held: Any, *given: Any) -> Rows:
         """The rows: what numbers are between is no matter of theirs."""
         return self

@@ -160,6 +160,16 @@ class Template(AbstractTemplate):
         return cls(fit.octagonal(dimension))
 
     @classmethod
+    def default(cls, dimension: int) -> Template:
+        """Where none is given: octagonal in two dimensions, in others boxes.
+
+        Example:
+            >>> [len(Template.default(n)) for n in (1, 2, 3)]
+            [2, 8, 6]
+        """
+        return cls.octagonal(dimension) if dimension == 2 else cls.box(dimension)
+
+    @classmethod
     def regular(cls, facets: int) -> Template:
         """Normals at equal angles in the plane, the first along `x_1`.
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.methods.problem import AbstractMethod, Problem
-from reachjax.methods.propagation import Options, check_problem, require_kinds
+from reachjax.methods.propagation import Options, check_problem, require_kinds, template_of
 from reachjax.numerics.checks import described, is_concrete, whole_number
 from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
@@ -45,7 +45,7 @@ def volume_penalty(
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
-    template: AbstractTemplate,
+    template: AbstractTemplate | None = None,
     *,
     measure: Callable[[AbstractSet], Float[Array, ""]] = log_volume,
     cells: Sequence[int] | None = None,
@@ -61,7 +61,8 @@ def volume_penalty(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number of steps.
-        template: what every set looks like: facet directions, ellipsoids, or both.
+        template: what every set looks like: facet directions, ellipsoids, or both. None: octagons
+            in two dimensions, boxes in others (`Template.default`).
         measure: the size of one set. Logarithms weigh all steps alike, and are -inf for a flat set;
             `volume` is in the units of the states and weighs large sets most.
         cells: into how many equal parts each coordinate of `X0`, a box, is cut; the penalty is the
@@ -107,7 +108,7 @@ def specification_penalty(
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
-    template: AbstractTemplate,
+    template: AbstractTemplate | None = None,
     *,
     goal: Timed | None = None,
     safe: Region | None = None,
@@ -126,7 +127,8 @@ def specification_penalty(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number of steps.
-        template: what every set looks like: facet directions, ellipsoids, or both.
+        template: what every set looks like: facet directions, ellipsoids, or both. None: octagons
+            in two dimensions, boxes in others (`Template.default`).
         goal: where every state must be at the horizon; or a mapping from times, or from ranges of
             times, to where it must be then.
         safe: where every state must be at all times.
@@ -170,11 +172,12 @@ def _penalised(
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
-    template: AbstractTemplate,
+    template: AbstractTemplate | None,
     cells: Sequence[int] | None,
     options: dict[str, Any],
 ) -> Float[Array, ""]:
     """The penalty of a tube, or its mean over those from the cells of an initial set."""
+    template = template_of(loop, template)
     require_kinds(loop=loop, X0=X0, template=template)
     options = _completed(loop, X0, template, options)
     by_forms = isinstance(options["relaxation"], LinearBounds) and not loop.plant.continuous

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from reachjax.loops import ClosedLoop
 from reachjax.methods.cell_tree import CellTree, Node
 from reachjax.methods.problem import AbstractMethod, Problem
-from reachjax.methods.propagation import GAP, SAMPLES, Options
+from reachjax.methods.propagation import GAP, SAMPLES, Options, template_of
 from reachjax.methods.searches import AbstractSearch, Bar, Question
 from reachjax.numerics.archives import writable
 from reachjax.numerics.budget import Budget, Interrupted
@@ -174,7 +174,7 @@ def reach_partitioned(
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
-    template: Template,
+    template: Template | None = None,
     relaxation: AbstractRelaxation | AbstractMethod = BranchAndCut(),  # noqa: B008
     window: int | None = None,
     solver: AbstractSolver = Auto(),  # noqa: B008
@@ -195,7 +195,8 @@ def reach_partitioned(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number `N` of steps.
-        template: the facets of every set.
+        template: the facets of every set. None: octagons in two dimensions, boxes in others
+            (`Template.default`).
         relaxation: which products of facts are used.
         window: over how many steps each program reaches back; None: as many as the solver bears.
         solver: what solves the semidefinite programs.
@@ -232,7 +233,8 @@ def reach_partitioned(
     """
     require_kind("loop", loop, ClosedLoop, "a ClosedLoop")
     require_kind("X0", X0, AbstractSet, "a set such as Box(lower, upper)")
-    require_kind("template", template, Template, "a template of facets, such as Template.box(n)")
+    facets = "a template of facets, such as Template.box(n), or None"
+    template = require_kind("template", template_of(loop, template), Template, facets)
     require_double_precision(loop=loop, X0=X0, template=template)
     if not is_concrete(loop, X0, template):
         raise ValueError("partitions need numbers: call reach_partitioned outside of jax.jit")

@@ -25,6 +25,7 @@ from reachjax.methods.propagation import (
     Progress,
     check_problem,
     propagated,
+    template_of,
 )
 from reachjax.methods.witnesses import initial_states
 from reachjax.numerics.archives import writable
@@ -320,7 +321,7 @@ def tube_of(
 def reach_step(
     loop: ClosedLoop,
     X: AbstractSet,
-    template: AbstractTemplate,
+    template: AbstractTemplate | None = None,
     *,
     t: int = 0,
     relaxation: AbstractRelaxation = BranchAndCut(),  # noqa: B008  (immutable)
@@ -333,7 +334,8 @@ def reach_step(
     Args:
         loop: the closed loop.
         X: the set of states at time `t`.
-        template: what the sets look like: facet directions, ellipsoids, or both.
+        template: what the sets look like: facet directions, ellipsoids, or both. None: octagons in
+            two dimensions, boxes in others (`Template.default`).
         t: the time, for time-varying loops.
         relaxation: which products of facts are used.
         solver: what solves the semidefinite programs.
@@ -366,7 +368,7 @@ def reach(
     loop: ClosedLoop,
     X0: AbstractSet,
     horizon: int,
-    template: AbstractTemplate,
+    template: AbstractTemplate | None = None,
     relaxation: AbstractRelaxation | AbstractMethod = BranchAndCut(),  # noqa: B008  (immutable)
     window: int | None = None,
     solver: AbstractSolver = Auto(),  # noqa: B008
@@ -384,7 +386,8 @@ def reach(
         loop: the closed loop.
         X0: the set of initial states.
         horizon: the number `N` of steps.
-        template: what every set looks like: facet directions, ellipsoids, or both.
+        template: what every set looks like: facet directions, ellipsoids, or both. None: octagons
+            in two dimensions, boxes in others (`Template.default`).
         relaxation: which products of facts are used; or a method of its own (`AbstractMethod`).
         window: over how many steps each program reaches back, as far as there are steps: 1 is the
             paper's recursion, the horizon goes back to `X0` in one shot. Longer ones are tighter,
@@ -436,4 +439,5 @@ def reach(
         True
     """
     options = Options(relaxation, window, solver, samples, seed, progress, gap, time_limit)
-    return tube_of(Problem(loop, X0, template, horizon, start), options)
+    problem = Problem(loop, X0, template_of(loop, template), horizon, start)
+    return tube_of(problem, options)

@@ -14,7 +14,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.batches import PARTS
 from reachjax.loops.closed_loop import Scenario
 from reachjax.loops.scenarios import Runs, Scenarios
-from reachjax.loops.units import AbstractUnit, UnboundedError
+from reachjax.loops.units import UnboundedError
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
@@ -125,7 +125,7 @@ def closest_decision(
     (_, w, v), found = scenario, list[float]()
 
     def apply(unit: Any, *y: Any) -> Any:
-        if isinstance(unit, AbstractUnit) and unit.jumps:
+        if unit.jumps:
             found.append(unit.distance(*y))
         return unit(*y)
 

@@ -95,7 +95,18 @@ def test_what_is_dear_is_compiled_once_as_much_was_spent():
             break
         time.sleep(0.05)
     else:
-        pytest.fail("it was not compiled after fifteen seconds had been spent")
+        pytest.fail("it was not compiled after thirty seconds had been spent")
+
+
+def test_what_takes_no_longer_than_one_call_in_numpy_is_compiled_at_once():
+    found, x = beside(8)
+    given = {"seconds": lambda: 20.0, "evaluations": 3000, "left": np.inf}
+    assert not found.pays(x, by=2.0, share=0.9, **given)  # eighteen seconds of twenty
+    for _ in range(1000):
+        if found.pays(x, by=2.0, **given):
+            return
+        time.sleep(0.05)
+    pytest.fail("it was not compiled, though a call takes as long")
 
 
 def test_what_is_slower_than_numpy_or_cannot_be_measured_is_not_used():

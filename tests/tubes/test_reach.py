@@ -29,6 +29,27 @@ def planar():
     return tube_of(2)[2]
 
 
+@pytest.mark.parametrize("n_x", [1, 2, 3])
+def test_without_a_template_sets_are_octagons_in_the_plane_and_boxes_elsewhere(n_x):
+    region = box_region(n_x, seed=n_x)
+    X0 = rj.Box(region.corners.min(axis=0), region.corners.max(axis=0))
+    loop, forms = closed_loop(random_loop(n_x, seed=n_x)), rj.LinearBounds()
+    template = rj.Template.octagonal(2) if n_x == 2 else rj.Template.box(n_x)
+    given = {"template": template, "relaxation": forms}
+
+    def outcomes(**options):
+        yield rj.reach(loop, X0, 2, **options).sets
+        yield rj.reach_step(loop, X0, **options)[0]
+        yield rj.reach_partitioned(loop, X0, 1, cells=2, **options).sets(1)
+        yield rj.volume_penalty(loop, X0, 1, **options)
+        yield rj.specification_penalty(loop, X0, 1, safe=X0, **options)
+
+    expected = [jax.tree.leaves(each) for each in outcomes(**given)]
+    for options in ({}, {"template": None}):
+        found = map(jax.tree.leaves, outcomes(relaxation=forms, **options))
+        jax.tree.map(np.testing.assert_array_equal, [*found], expected)
+
+
 @pytest.mark.costly
 def test_a_start_time_shifts_a_time_varying_loop():
     data, region = random_loop(2, steps=5), box_region(2, seed=0)

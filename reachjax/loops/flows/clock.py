@@ -19,6 +19,7 @@ from reachjax.loops.flows.flow import AbstractFlow
 from reachjax.loops.flows.steps import Control, Flowed
 from reachjax.loops.flows.taylor_models import Symbols, TaylorModels, joined
 from reachjax.loops.units import AtUnit
+from reachjax.numerics.numbers import size
 from reachjax.numerics.rounding import TINY, Ball, gamma, namespace
 
 
@@ -48,7 +49,7 @@ def successor_at(f: Callable[..., Any], *given: Any) -> Any:
 
 def appended(x: Any, now: Any) -> Any:
     """The numbers, and a constant behind them, of any kind of number."""
-    n = len(getattr(x, "mid", x))
+    n = size(x)
     xp = namespace(now) if isinstance(now, jax.Array) else np
     place = np.eye(n + 1, n)
     return place @ x + xp.concatenate([xp.zeros(n), xp.reshape(xp.asarray(now, float), (1,))])

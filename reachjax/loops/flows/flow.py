@@ -11,7 +11,8 @@ from reachjax.loops.flows.series import Tape
 from reachjax.loops.flows.steps import Flowed, Settings, flowed
 from reachjax.loops.flows.taylor_models import TaylorModels, joined
 from reachjax.loops.tracing.functions import Function
-from reachjax.loops.units import AtUnit
+from reachjax.loops.units import AtUnit, evaluate
+from reachjax.numerics.numbers import AbstractNumber
 from reachjax.numerics.rounding import Ball
 
 LEAST_STEPS = 2
@@ -20,6 +21,13 @@ LEAST_STEPS = 2
 
 class AbstractFlow(abc.ABC):
     """What a state is led to within a period, under an input that is held."""
+
+    def __call__(self, given: tuple[Any, ...], unit: AtUnit) -> Any:
+        """The state afterwards, of any kind of number; arguments as of `rate`."""
+        x = given[0]
+        if isinstance(x, AbstractNumber):
+            return x.flowed(self, given, unit)
+        return self.simulated(given, evaluate)  # units of the equation are none of the loop
 
     @abc.abstractmethod
     def rate(self, given: tuple[Any, ...], unit: AtUnit) -> Any:

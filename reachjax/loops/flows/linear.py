@@ -74,7 +74,7 @@ class LinearFlow(AbstractFlow):
         """The derivative of the state, of any kind of number."""
         found, first = self.matrix[:, -1], 0
         for each in given:
-            count = size(getattr(each, "values", each))
+            count = size(each)
             found = self.matrix[:, first : first + count] @ each + found
             first += count
         return found

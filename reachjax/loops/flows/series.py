@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -36,32 +36,12 @@ from reachjax.loops.flows.taylor_models import (
 )
 from reachjax.loops.tracing.recording import Recorder
 from reachjax.loops.tracing.values import Step, UnsupportedError, Value
-from reachjax.loops.units import (
-    ISRU,
-    AbstractUnit,
-    Asin,
-    Asinh,
-    Atan,
-    Bilinear,
-    Cos,
-    Erf,
-    Exp,
-    Floor,
-    Log,
-    OneHot,
-    Reciprocal,
-    Sin,
-    Softplus,
-    Sqrt,
-    Square,
-    Tanh,
-    Within,
-    XLogX,
-    evaluate,
-)
-from reachjax.loops.units import Step as Jump
+from reachjax.loops.units import AbstractUnit, Sin, SmoothUnit, evaluate
 from reachjax.numerics.numbers import AbstractNumber, size, widened
 from reachjax.numerics.rounding import UNIT, Ball, is_counted, namespace
+
+Apply = Callable[..., Any] | None
+"""What is done at a unit, where that was recorded."""
 
 
 class Node(NamedTuple):
@@ -69,13 +49,13 @@ class Node(NamedTuple):
 
     Attributes:
         parents: the numbers that it is made of.
-        apply: an affine function of them, or what is done at a unit; None of a product.
-        unit: which one it is the value of, if it is of one.
+        first: its first coefficient, from theirs.
+        following: any later one, from the columns of all numbers and its place.
     """
 
     parents: tuple[int, ...]
-    apply: Callable[..., Any] | None = None
-    unit: AbstractUnit | None = None
+    first: Callable[..., Any]
+    following: Callable[[list[Any], Any], Any]
 
 
 class Tape:
@@ -99,22 +79,19 @@ class Tape:
         self.sizes = [value.size for value in recorder.inputs]
         self.slopes: dict[int, int] = {}
         self._units: dict[tuple[AbstractUnit, int], int] = {}
+        self._waves: dict[int, tuple[int, int]] = {}
         found = {value.place: value.place for value in recorder.inputs}
         for place in recorder.between(wanted):
             step = recorder.steps[place]
             if step is None:
                 continue
-            if isinstance(step.unit, Bilinear):
-                factors = (found[parent] for parent in step.parents)
-                found[place] = self.product(*factors, terms=step.unit.terms)
-            elif step.unit is not None:
-                (parent,) = step.parents
-                _require_no_jump(step)
-                found[place] = self.unit(step.unit, found[parent], step.apply)
-            else:
-                parents = tuple(found[parent] for parent in step.parents)
+            parents = tuple(found[parent] for parent in step.parents)
+            if step.unit is None:
                 size = recorder.values[place].size
-                found[place] = self._added(Node(parents, step.apply), size)
+                found[place] = self._added(_affine(parents, step.apply), size)
+            else:
+                _require_no_jump(step)
+                found[place] = step.unit.on_tape(self, parents, step.apply)
         self.result = found[wanted.place]
         self.needed = self._of_values()
 
@@ -136,20 +113,26 @@ class Tape:
 
     def affine(self, apply: Callable[..., Any], *parents: int, size: int | None = None) -> int:
         """An affine function of numbers, of as many as they are unless a size is given."""
-        node = Node(parents, lambda unit, *given: apply(*given))
+        node = _affine(parents, lambda unit, *given: apply(*given))
         return self._added(node, size or self.sizes[parents[0]])
 
     def product(self, one: int, other: int, terms: int = 1) -> int:
         """A product, or the sum of so many, which stand one behind the other."""
-        found = self._added(Node((one, other)), self.sizes[one])
+        node = Node((one, other), product, lambda by, k: _convolved(by[one], by[other], k))
+        found = self._added(node, self.sizes[one])
         if terms == 1:
             return found
         size = self.sizes[one] // terms
         matrix = np.kron(np.ones(terms), np.eye(size))
         return self.affine(lambda number: matrix @ number, found, size=size)
 
-    def _wave(self, y: int) -> tuple[int, int]:
+    def wave(self, y: int) -> tuple[int, int]:
         """The sine and the cosine, by one layer: the cosine is the sine a quarter turn on."""
+        if y not in self._waves:
+            self._waves[y] = self._wave(y)
+        return self._waves[y]
+
+    def _wave(self, y: int) -> tuple[int, int]:
         n = self.sizes[y]
         eye, none = np.eye(n), np.zeros((n, n))
         twice, turn = np.vstack([eye, eye]), np.repeat([0.0, math.pi / 2], n)
@@ -160,13 +143,21 @@ class Tape:
             return widened(twice @ number + turn, error)
 
         angles = self.affine(turned, y, size=2 * n)
-        both = self._added(Node((angles,), lambda at, y: at(Sin(), y), Sin()), 2 * n)
+        both = self._value(Sin(), angles, None, self._by_slope(angles))
         self.slopes[both] = self.affine(lambda number: quarter @ number, both)
         sine = self.affine(lambda number: number[:n], both, size=n)
         return sine, self.affine(lambda number: number[n:], both, size=n)
 
-    def unit(self, unit: AbstractUnit, y: int, apply: Callable[..., Any] | None = None) -> int:
-        """The value of a unit, and its slope as another number, which may be made of it.
+    def unit(self, unit: AbstractUnit, y: int) -> int:
+        """The value of a unit.
+
+        Raises:
+            UnsupportedError: it has no derivative that is known.
+        """
+        return unit.on_tape(self, (y,))
+
+    def smooth(self, unit: SmoothUnit, y: int, apply: Apply = None) -> int:
+        """The value of a smooth unit, and its slope as another number, which may be made of it.
 
         Args:
             unit: which one.
@@ -174,27 +165,75 @@ class Tape:
             apply: what is done at it, where that was recorded.
 
         Raises:
-            UnsupportedError: it has no derivative that is known.
+            UnsupportedError: its derivative is not known.
         """
-        key = (type(unit)() if type(unit) in (Sin, Cos) else unit.kind), y
-        if key in self._units:
-            return self._units[key]
-        if type(unit) in (Sin, Cos):
-            self._units[Sin(), y], self._units[Cos(), y] = self._wave(y)
-            return self._units[type(unit)(), y]
-        z = self._added(Node((y,), apply or (lambda at, y: at(unit, y)), unit), self.sizes[y])
-        self._units[key] = z
-        if unit.curved and type(unit) not in (Square, Within):
-            slope = SLOPES.get(type(unit))
+        z = self._value(unit, y, apply, self._by_slope(y))
+        if z not in self.slopes:
+            slope = unit.slope_on_tape(self, y, z)
             if slope is None:
                 raise UnsupportedError(
                     f"the derivatives of {type(unit).__name__} are not known, of which the flow of "
                     "a differential equation is made"
                 )
-            self.slopes[z] = slope(self, y, z)
-        elif not unit.separable or unit.free:
-            raise UnsupportedError(f"{type(unit).__name__} has no derivatives")
+            self.slopes[z] = slope
         return z
+
+    def squared(self, unit: AbstractUnit, y: int, apply: Apply = None) -> int:
+        """The value of a unit that is a number times itself; arguments as of `smooth`."""
+        return self._value(unit, y, apply, lambda by, z, k: _convolved(by[y], by[y], k))
+
+    def same(self, unit: AbstractUnit, y: int, apply: Apply = None) -> int:
+        """The value of a unit that is its input; arguments as of `smooth`."""
+        return self._value(unit, y, apply, lambda by, z, k: _newest(by[y]))
+
+    def straight(self, unit: AbstractUnit, y: int, apply: Apply = None) -> int:
+        """The value of a unit that is straight but for bends; arguments as of `smooth`.
+
+        Raises:
+            UnsupportedError: it is no function of each input alone.
+        """
+        if not unit.separable or unit.free:
+            raise UnsupportedError(f"{type(unit).__name__} has no derivatives")
+
+        def following(by: list[Any], z: int, k: Any) -> Any:
+            first = by[y].first if isinstance(by[y], _Stack) else by[y][0]
+            return _slope(unit, first) * _newest(by[y])
+
+        return self._value(unit, y, apply, following)
+
+    def _by_slope(self, y: int) -> Callable[[list[Any], int, Any], Any]:
+        """How the coefficients of a smooth unit follow from those of its input and slope."""
+        slopes = self.slopes
+
+        def following(by: list[Any], z: int, k: Any) -> Any:
+            slope = slopes[z]
+            return _convolved(by[y], by[slope], k, True, slope < z)
+
+        return following
+
+    def _value(
+        self,
+        unit: AbstractUnit,
+        y: int,
+        apply: Apply,
+        following: Callable[[list[Any], int, Any], Any],
+    ) -> int:
+        """The value of a unit, once for each input."""
+        key = unit.kind, y
+        if key not in self._units:
+            apply, z = apply or (lambda at, y: at(unit, y)), len(self.nodes)
+            node = Node((y,), partial(apply, valued), lambda by, k: following(by, z, k))
+            self._units[key] = self._added(node, self.sizes[y])
+        return self._units[key]
+
+
+def _affine(parents: tuple[int, ...], apply: Callable[..., Any]) -> Node:
+    """An affine step, from what is done at a unit and the numbers of others."""
+
+    def following(by: list[Any], k: Any) -> Any:
+        return apply(None, *(Change(_newest(by[parent])) for parent in parents)).number
+
+    return Node(parents, partial(apply, valued), following)
 
 
 def _require_no_jump(step: Step) -> None:
@@ -203,69 +242,12 @@ def _require_no_jump(step: Step) -> None:
     Raises:
         UnsupportedError: it is one.
     """
-    if isinstance(step.unit, Jump | OneHot | Floor):
+    if step.unit is not None and step.unit.breaks:
         raise UnsupportedError(
             f"it jumps{step.line}, and solutions may slide along where it does: let the "
             "controller decide, whose input is held from one sample to the next, or take a "
             "function without jumps, such as jnp.tanh(50 * y) for jnp.sign(y)"
         )
-
-
-def _less_square(tape: Tape, one: float, y: int) -> int:
-    """`one - y^2`."""
-    return tape.affine(lambda square: one - square, tape.unit(Square(), y))
-
-
-def _inverse_of_more(tape: Tape, y: int) -> int:
-    """`1 / (1 + y^2)`."""
-    more = tape.affine(lambda square: square + 1.0, tape.unit(Square(), y))
-    return tape.unit(Reciprocal(least=1.0), more)
-
-
-def _inverse_root(tape: Tape, y: int) -> int:
-    return tape.unit(Reciprocal(), tape.unit(Sqrt(), y))
-
-
-def _inverse_length(tape: Tape, y: int) -> int:
-    """`1 / sqrt(1 + y^2)`."""
-    more = tape.affine(lambda square: square + 1.0, tape.unit(Square(), y))
-    return _inverse_root(tape, more)
-
-
-def _negative(tape: Tape, y: int) -> int:
-    return tape.affine(lambda number: -1.0 * number, y)
-
-
-def _bell(tape: Tape, y: int) -> int:
-    """`2 / sqrt(pi) exp(-y^2)`, whose factor is not exact."""
-    bell = tape.unit(Exp(), _negative(tape, tape.unit(Square(), y)))
-    return tape.affine(lambda number: 2 / math.sqrt(math.pi) * number, bell)
-
-
-def _logistic(tape: Tape, y: int) -> int:
-    half = tape.unit(Tanh(), tape.affine(lambda number: 0.5 * number, y))
-    return tape.affine(lambda number: 0.5 * number + 0.5, half)
-
-
-def _cube(tape: Tape, y: int) -> int:
-    return tape.product(tape.unit(Square(), y), y)
-
-
-SLOPES: dict[type[AbstractUnit], Callable[[Tape, int, int], int]] = {
-    Exp: lambda tape, y, z: z,
-    Log: lambda tape, y, z: tape.unit(Reciprocal(), y),
-    XLogX: lambda tape, y, z: tape.affine(lambda number: number + 1.0, tape.unit(Log(), y)),
-    Tanh: lambda tape, y, z: _less_square(tape, 1.0, z),
-    Softplus: lambda tape, y, z: _logistic(tape, y),
-    Sqrt: lambda tape, y, z: tape.affine(lambda n: 0.5 * n, tape.unit(Reciprocal(), z)),
-    Reciprocal: lambda tape, y, z: _negative(tape, tape.unit(Square(), z)),
-    Atan: lambda tape, y, z: _inverse_of_more(tape, y),
-    Asin: lambda tape, y, z: _inverse_root(tape, _less_square(tape, 1.0, y)),
-    Asinh: lambda tape, y, z: _inverse_length(tape, y),
-    Erf: lambda tape, y, z: _bell(tape, y),
-    ISRU: lambda tape, y, z: _cube(tape, _inverse_length(tape, y)),
-}
-"""Derivatives of units, from their inputs and values."""
 
 
 class Change(AbstractNumber):
@@ -323,7 +305,7 @@ class Series:
             if node is None:
                 found = inputs[place]
             else:
-                found = self._first(node) if k == 0 else settled_number(self._next(place, node, k))
+                found = self._first(node) if k == 0 else self._next(node, k)
             self.columns[place].append(found)
         return self.columns[self._tape.result][k]
 
@@ -345,30 +327,14 @@ class Series:
     def coefficient(self, k: Any, inputs: Sequence[Any]) -> None:
         """All coefficients at another place than the first, in compiled code."""
         for place, node in enumerate(self._tape.nodes):
-            found = inputs[place] if node is None else settled_number(self._next(place, node, k))
+            found = inputs[place] if node is None else self._next(node, k)
             self.columns[place] = self.columns[place].set(k, found)
 
     def _first(self, node: Node) -> Any:
-        given = [self.columns[parent][0] for parent in node.parents]
-        found = product(*given) if node.apply is None else node.apply(valued, *given)
-        return settled_number(found)
+        return settled_number(node.first(*(self.columns[each][0] for each in node.parents)))
 
-    def _next(self, place: int, node: Node, k: Any) -> Any:
-        one, *others = (self.columns[parent] for parent in node.parents)
-        if node.apply is None:
-            return _convolved(one, others[0], k)
-        if node.unit is None:
-            return node.apply(None, *(Change(_newest(each)) for each in (one, *others))).number
-        if isinstance(node.unit, Square):
-            return _convolved(one, one, k)
-        if isinstance(node.unit, Within):
-            return _newest(one)
-        if not node.unit.curved:
-            return _slope(node.unit, one.first if isinstance(one, _Stack) else one[0]) * _newest(
-                one
-            )
-        slope = self._tape.slopes[place]
-        return _convolved(one, self.columns[slope], k, True, slope < place)
+    def _next(self, node: Node, k: Any) -> Any:
+        return settled_number(node.following(self.columns, k))
 
 
 def _newest(column: Any) -> Any:

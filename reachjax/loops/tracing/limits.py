@@ -15,7 +15,7 @@ from reachjax.loops.tracing.values import Parameter
 from reachjax.loops.units import AbstractUnit
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.numbers import AbstractNumber
-from reachjax.numerics.rounding import TINY, gamma, underflow
+from reachjax.numerics.rounding import TINY, Ball, gamma, underflow
 
 
 class Limits(AbstractNumber):
@@ -118,6 +118,13 @@ class Limits(AbstractNumber):
             lost = underflow(over, one != 0) + underflow(under, other != 0)
             off.append(error * abs(terms).sum(axis=1) + np.where(picking, 0.0, lost))
         return self._outward(*ends, *off)
+
+    def flowed(self, flow: Any, given: tuple[Limits, ...], unit: Any) -> Limits:
+        """The state after one period of a flow; nothing is known of it if limits are infinite."""
+        if not all(np.isfinite(end).all() for each in given for end in (each.least, each.most)):
+            return self.unknown(len(self))
+        found = flow.enclosed(tuple(Ball.between(each.least, each.most) for each in given))
+        return type(self)(np.asarray(found.lower), np.asarray(found.upper))
 
     def meeting(self, other: Limits) -> Limits:
         """Limits that both hold."""

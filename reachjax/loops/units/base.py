@@ -144,6 +144,7 @@ class AbstractUnit(AbstractActivation):
         stated: whether its facts are known of its inputs, so that they count where it is affine.
         closed: whether these bound the free units before it by themselves.
         jumps: whether its value changes at once where an input changes its sign, and nowhere else.
+        breaks: whether its value is no continuous function of its inputs.
         line: where a user wrote it, of one that jumps.
     """
 
@@ -154,6 +155,7 @@ class AbstractUnit(AbstractActivation):
     free: ClassVar[bool] = False
     stated: ClassVar[bool] = False
     jumps: ClassVar[bool] = False
+    breaks: ClassVar[bool] = False
     closed: bool = False
     line: str = ""
 
@@ -244,6 +246,19 @@ class AbstractUnit(AbstractActivation):
             lower: `(k,)`.
             upper: `(k,)`.
         """
+
+    def on_tape(self, tape: Any, y: tuple[int, ...], apply: Any = None) -> int:
+        """Its value on a tape of Taylor series (`loops.flows.series`): straight but for bends.
+
+        Args:
+            tape: the tape.
+            y: the places of its inputs there.
+            apply: what is done at it, where that was recorded.
+
+        Returns:
+            The place of the value.
+        """
+        return tape.straight(self, *y, apply)
 
     def propagate(self, y: Any, unit: AtUnit) -> Any:
         """What is done at this unit."""

@@ -153,6 +153,10 @@ class Bilinear(AbstractUnit):
         products = (Product(left, right, Mark.BOUND) for left in below for right in above)
         return Facts(tuple(blocks), (), tuple(products))
 
+    def on_tape(self, tape: Any, y: tuple[int, ...], apply: Any = None) -> int:
+        """Its value on a tape of Taylor series: a product."""
+        return tape.product(*y, terms=self.terms)
+
     def _flushed(self, lower: Array, upper: Array) -> Any:
         """What is lost of each product where it, or a factor, is too small for compiled code.
 

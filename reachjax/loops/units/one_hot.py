@@ -49,6 +49,7 @@ class OneHot(AbstractUnit):
     separable: ClassVar[bool] = False
     nonexpansive: ClassVar[bool] = False
     jumps: ClassVar[bool] = True
+    breaks: ClassVar[bool] = True
 
     @property
     def pairs(self) -> list[tuple[int, int]]:

@@ -40,6 +40,10 @@ class Within(SmoothUnit):
         """The derivative one."""
         return namespace(y).ones_like(y)
 
+    def on_tape(self, tape: Any, y: tuple[int, ...], apply: Any = None) -> int:
+        """The input on a tape."""
+        return tape.same(self, *y, apply)
+
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`f' = 1` everywhere: `f(y) - s y` is extreme at an end."""
         return ()
@@ -85,6 +89,10 @@ class Square(SmoothUnit):
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """The derivative `2 y`."""
         return 2 * y
+
+    def on_tape(self, tape: Any, y: tuple[int, ...], apply: Any = None) -> int:
+        """A product with itself on a tape."""
+        return tape.squared(self, *y, apply)
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`2 y = s` at `s / 2`."""
@@ -145,6 +153,10 @@ class Sqrt(SmoothUnit):
         xp = namespace(y)
         return xp.where(y == 0, math.inf, 0.5 / xp.sqrt(xp.where(y == 0, 1.0, y)))
 
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `1 / (2 z)`."""
+        return tape.affine(lambda number: 0.5 * number, tape.unit(Reciprocal(), z))
+
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`1 / (2 sqrt y) = s` at `1 / (2 s)^2`."""
         root = 0.5 / slope
@@ -192,6 +204,10 @@ class Reciprocal(SmoothUnit):
         """`-1 / y^2`."""
         return -1 / (y * y)
 
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `-z^2`."""
+        return tape.affine(lambda number: -1.0 * number, tape.unit(Square(), z))
+
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`-1 / y^2 = s` at `1 / sqrt(-s)` and its negative."""
         point = 1 / namespace(slope, lower).sqrt(larger(-slope, TINY))
@@ -226,6 +242,10 @@ class Exp(SmoothUnit):
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """The derivative `exp y`."""
         return self(y)
+
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `z`."""
+        return z
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`exp y = s` at `log s`."""
@@ -262,6 +282,10 @@ class Log(SmoothUnit):
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`1 / y`."""
         return 1 / y
+
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `1 / y`."""
+        return tape.unit(Reciprocal(), y)
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`1 / y = s` at `1 / s`."""
@@ -301,6 +325,10 @@ class XLogX(SmoothUnit):
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`1 + log y`."""
         return 1 + namespace(y).log(y)
+
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `1 + log y`."""
+        return tape.affine(lambda number: number + 1.0, tape.unit(Log(), y))
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`1 + log y = s` at `exp(s - 1)`."""

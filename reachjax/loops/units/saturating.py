@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.loops.units.base import AbstractActivation, AtUnit
+from reachjax.loops.units.powers import Exp, Reciprocal, Sqrt, Square
 from reachjax.loops.units.smooth import POLE, SLACK, SmoothUnit, farthest, nearest
 from reachjax.numerics.rounding import TINY, larger, namespace, smaller
 
@@ -40,6 +41,10 @@ class Tanh(SmoothUnit):
         """`w = 4 e / (1 + e)^2` with `e = exp(-2 |y|)`, which loses no digits far out."""
         e = namespace(y).exp(-2 * abs(y))
         return 4 * e / ((1 + e) * (1 + e))
+
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `1 - z^2`."""
+        return tape.affine(lambda square: 1.0 - square, tape.unit(Square(), z))
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`w = s` where `sinh^2 y = (1 - s) / s`."""
@@ -94,6 +99,11 @@ class Softplus(SmoothUnit):
         xp = namespace(y)
         e = xp.exp(-abs(y))
         return xp.where(y < 0, e, 1.0) / (1 + e)
+
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The logistic function, as a hyperbolic tangent."""
+        half = tape.unit(Tanh(), tape.affine(lambda number: 0.5 * number, y))
+        return tape.affine(lambda number: 0.5 * number + 0.5, half)
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`p = s` at `log(s / (1 - s))`."""
@@ -167,6 +177,11 @@ class Erf(SmoothUnit):
         """`2 / sqrt(pi) exp(-y^2)`."""
         return SLOPE * namespace(y).exp(-y * y)
 
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `2 / sqrt(pi) exp(-y^2)`, whose factor is not exact."""
+        less = tape.affine(lambda square: -1.0 * square, tape.unit(Square(), y))
+        return tape.affine(lambda bell: 2 / math.sqrt(math.pi) * bell, tape.unit(Exp(), less))
+
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`2 / sqrt(pi) exp(-y^2) = s` where `y^2 = log(2 / (sqrt(pi) s))`."""
         xp, slope = namespace(slope, lower), smaller(larger(slope, TINY), SLOPE)
@@ -219,6 +234,11 @@ class Asin(SmoothUnit):
         xp, rest = namespace(y), (1 - y) * (1 + y)
         return xp.where(rest <= 0, math.inf, 1 / xp.sqrt(xp.where(rest <= 0, 1.0, rest)))
 
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `1 / sqrt(1 - y^2)`."""
+        less = tape.affine(lambda square: 1.0 - square, tape.unit(Square(), y))
+        return tape.unit(Reciprocal(), tape.unit(Sqrt(), less))
+
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`1 / sqrt(1 - y^2) = s` where `y^2 = 1 - 1/s^2`."""
         slope = larger(slope, 1.0)
@@ -254,6 +274,10 @@ class Asinh(SmoothUnit):
         """`1 / sqrt(1 + y^2)`; beyond 1e150, where squares overflow, as there."""
         size = smaller(abs(y), LARGE)
         return 1 / namespace(y).sqrt(1 + size * size)
+
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `1 / sqrt(1 + y^2)`."""
+        return _inverse_length(tape, y)
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`1 / sqrt(1 + y^2) = s` where `y^2 = 1/s^2 - 1`."""
@@ -300,6 +324,11 @@ class ISRU(SmoothUnit):
         more = 1 + size * size
         return 1 / (more * namespace(y).sqrt(more))
 
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `1 / sqrt(1 + y^2)^3`."""
+        inverse = _inverse_length(tape, y)
+        return tape.product(tape.unit(Square(), inverse), inverse)
+
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`(1 + y^2)^(-3/2) = s` where `y^2 = s^(-2/3) - 1`."""
         xp, slope = namespace(slope, lower), smaller(larger(slope, TINY), 1.0)
@@ -317,3 +346,9 @@ class ISRU(SmoothUnit):
             return (abs(12 * square - 3) + 24 * SLACK) / (more * more * more * xp.sqrt(more))
 
         return _largest(low, high, size, ((math.sqrt(0.75), 6 / 1.75**3.5),))
+
+
+def _inverse_length(tape: Any, y: int) -> int:
+    """The number `1 / sqrt(1 + y^2)` on a tape."""
+    more = tape.affine(lambda square: square + 1.0, tape.unit(Square(), y))
+    return tape.unit(Reciprocal(), tape.unit(Sqrt(), more))

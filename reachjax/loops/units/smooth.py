@@ -203,6 +203,14 @@ class SmoothUnit(AbstractUnit):
     def third(self, lower: Array, upper: Array) -> Float[Array, " k"]:
         """An upper bound of `|f'''|` on `[lower, upper]`, infinite next to a pole."""
 
+    def on_tape(self, tape: Any, y: tuple[int, ...], apply: Any = None) -> int:
+        """Its value on a tape of Taylor series, and its slope."""
+        return tape.smooth(self, *y, apply)
+
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int | None:
+        """The derivative on a tape, made of the input and the value; None if it is not known."""
+        return None
+
     def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
         """Where `f` is defined on all of `[lower, upper]`, and its value can be trusted."""
         return (abs(lower) < math.inf) & (abs(upper) < math.inf)

@@ -57,13 +57,14 @@ class Step(AbstractUnit):
 
     nonexpansive: ClassVar[bool] = False
     jumps: ClassVar[bool] = True
+    breaks: ClassVar[bool] = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`1` above zero, `0` below; derivatives are zero."""
         return namespace(y).where(y >= 0 if self.at_zero else y > 0, 1.0, 0.0)
 
     def implied(self, other: AbstractUnit, above: bool) -> bool:
-        """Of one number `>` is no more than `>=`."""
+        """Whether one of the same inputs being above (below) says so: `>` says `>=`."""
         if not isinstance(other, Step):
             return False
         return other.at_zero <= self.at_zero if above else other.at_zero >= self.at_zero
@@ -124,6 +125,7 @@ class Gated(AbstractUnit):
 
     separable: ClassVar[bool] = False
     nonexpansive: ClassVar[bool] = False
+    breaks: ClassVar[bool] = True
 
     def __call__(self, y: Float[Array, "*c n"]) -> Float[Array, "*c n"]:
         """The products, of an `s` that is not zero or one with the nearer one of these."""
@@ -260,6 +262,7 @@ class Floor(AbstractUnit):
     even: bool = True
 
     nonexpansive: ClassVar[bool] = False
+    breaks: ClassVar[bool] = True
 
     def __call__(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """The whole number; its derivative is zero."""

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from reachjax.loops.units.powers import Reciprocal, Square
 from reachjax.loops.units.smooth import SLACK, SmoothUnit, farthest, nearest
 from reachjax.numerics.rounding import (
     TINY,
@@ -115,6 +116,10 @@ class Sin(WaveUnit):
         """The derivative `cos y`."""
         return namespace(y).cos(y)
 
+    def on_tape(self, tape: Any, y: tuple[int, ...], apply: Any = None) -> int:
+        """The first part of a wave on a tape."""
+        return tape.wave(*y)[0]
+
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`cos y = s` at `arccos s`, its negative, and a period apart from these."""
         angle = namespace(slope, lower).arccos(smaller(larger(slope, -1.0), 1.0))
@@ -146,6 +151,10 @@ class Cos(WaveUnit):
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """The derivative `-sin y`."""
         return -namespace(y).sin(y)
+
+    def on_tape(self, tape: Any, y: tuple[int, ...], apply: Any = None) -> int:
+        """The second part of a wave on a tape."""
+        return tape.wave(*y)[1]
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`-sin y = s` at `-arcsin s`, at `pi + arcsin s`, and a period apart from these."""
@@ -281,6 +290,11 @@ class Atan(SmoothUnit):
         """`1 / (1 + y^2)`; beyond 1e150, where squares overflow, as there."""
         size = smaller(abs(y), 1e150)
         return 1 / (1 + size * size)
+
+    def slope_on_tape(self, tape: Any, y: int, z: int) -> int:
+        """The derivative `1 / (1 + y^2)`."""
+        more = tape.affine(lambda square: square + 1.0, tape.unit(Square(), y))
+        return tape.unit(Reciprocal(least=1.0), more)
 
     def stationary(self, slope: Array, lower: Array, upper: Array) -> tuple[Array, ...]:
         """`v = s` where `y^2 = (1 - s) / s`."""

@@ -9,12 +9,15 @@ import pytest
 from mpmath import mpf
 
 import reachjax as rj
+from reachjax.loops.batches import Batch
 from reachjax.loops.flows.steps import WORTH
 from reachjax.loops.flows.taylor_models import Symbols
+from reachjax.loops.tracing.limits import Limits
 from reachjax.loops.units import UnboundedError
 from reachjax.numerics.numbers import split
 from reachjax.numerics.rounding import Ball
 from reachjax.programs.affine import AffineForms
+from reachjax.programs.basis import columns
 from reachjax.programs.flows import flowed_forms
 from reachjax.programs.initial import InitialColumns
 from tests.loops.flows.fields import KINDS, field, solution
@@ -300,3 +303,41 @@ def test_solutions_that_meet_a_kink_are_refused_at_its_line():
             plant.propagate(Ball.exact(np.full(1, x)), Ball.exact(np.full(1, 1.5)))
     away = plant.propagate(Ball.exact(np.full(1, 0.5)), Ball.exact(np.zeros(1)))
     assert abs(away.mid - 0.5 * np.exp(0.1)) <= away.rad + 1e-15
+
+
+@pytest.mark.parametrize("clock", [False, True])
+@pytest.mark.parametrize("affine", [False, True])
+def test_a_number_of_any_kind_says_how_it_goes_through_a_flow(clock, affine):
+    """What holds a state holds its successor, whatever the kind; forms are asked at a layer."""
+    rng = np.random.default_rng(2 * clock + affine)
+    A, B = rng.uniform(-1, 1, size=(2, 2)), rng.uniform(-1, 1, size=(2, 1))
+    rate = (lambda x, u, t: A @ jnp.sin(x) + B @ u * t) if clock else lambda x, u: A @ jnp.sin(x)
+    plant = on_host(
+        rj.SampledPlant.affine(A, B, period=0.3)
+        if affine
+        else rj.SampledPlant(rate, 2, 1, period=0.3, clock=clock)
+    )
+    points, inputs = rng.uniform(-0.1, 0.1, size=(20, 2)), rng.uniform(-1, 1, size=(20, 1))
+    exact = np.stack([plant.propagate(x, u, 3, None) for x, u in zip(points, inputs, strict=True)])
+    simulated = plant.propagate(Batch(points), Batch(inputs), 3, Batch.evaluated).values
+    np.testing.assert_allclose(simulated, exact, rtol=0, atol=1e-12)
+    ends = (points.min(axis=0), points.max(axis=0)), (inputs.min(axis=0), inputs.max(axis=0))
+    ball = plant.propagate(*(Ball.between(*each) for each in ends), 3, None)
+    limits = plant.propagate(*(Limits(*each) for each in ends), 3, None)
+    for lower, upper in ((ball.lower, ball.upper), (limits.least, limits.most)):
+        assert np.all((lower <= exact + 1e-12) & (exact - 1e-12 <= upper))
+        assert np.all(upper - lower <= 2)
+    unknown = plant.propagate(Limits.unknown(2), Limits(*ends[1]), 3, None)
+    assert not np.isfinite(unknown.least).any()
+    start = InitialColumns.of(*[rj.Box(*ends[0])] * 2, curved=True)
+    forms = AffineForms.beginning(on_host(start))
+    flows = []
+    found = plant.propagate(forms, B.T @ forms, 3, lambda *given: flows.append(given) or "asked")
+    assert found == "asked"
+    assert [type(each) for each in flows[0][1:]] == [AffineForms] * 2
+
+
+def test_rows_over_a_basis_are_refused_by_name():
+    plant = rj.SampledPlant(lambda x, u: jnp.sin(x) + u, 1, 1, period=0.1)
+    with pytest.raises(TypeError, match="has no rows over a basis: give relaxation=LinearBounds"):
+        plant.propagate(columns(0, 1, 3), columns(1, 1, 3))

@@ -11,6 +11,7 @@ bounded once more in the calling process, as are all that come after them.
 from __future__ import annotations
 
 import abc
+import importlib.util
 import pickle
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -38,6 +39,9 @@ WORKERS = 4
 
 Kept = TypeVar("Kept")
 
+UNSENT = pickle.PicklingError, AttributeError, TypeError
+"""How it is said that a value cannot be packed."""
+
 DEAD = "KilledWorker", "CommClosedError", "FutureCancelledError"
 """What dask calls workers that have died: its classes are not imported for their names."""
 
@@ -54,7 +58,17 @@ def _answered(job: bytes, rest: bytes) -> bytes:
     """The answer to a job, wherever it is, in 64-bit floats."""
     with jax.enable_x64(True):
         function, first = _unpacked(job)
-        return pickle.dumps(function(first, *pickle.loads(rest)))
+        return _dumps(function(first, *pickle.loads(rest)))
+
+
+def _dumps(value: Any) -> bytes:
+    """A value packed: functions that stand in no module as what they are, by what dask brings."""
+    try:
+        return pickle.dumps(value)
+    except UNSENT:
+        if importlib.util.find_spec("cloudpickle") is None:
+            raise
+        return importlib.import_module("cloudpickle").dumps(value)
 
 
 @lru_cache(maxsize=4)
@@ -106,11 +120,10 @@ class CellJobs(Generic[Kept]):
         if isinstance(self._executor, ThreadPoolExecutor):
             return function, *given
         first, *rest = given
+        dumps = pickle.dumps if isinstance(self._executor, ProcessPoolExecutor) else _dumps
         try:
-            return _answered, pickle.dumps((function, first)), pickle.dumps(rest)
-        except (pickle.PicklingError, AttributeError, TypeError) as error:
-            if not isinstance(self._executor, ProcessPoolExecutor):
-                return function, *jax.device_get(given)
+            return _answered, dumps((function, first)), dumps(rest)
+        except UNSENT as error:
             raise TypeError(
                 "executor sends the loop to other processes, but a function that is a lambda or "
                 f"stands within another one cannot be sent ({error}): define it at the top of a "

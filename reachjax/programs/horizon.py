@@ -34,6 +34,9 @@ from reachjax.sets import AbstractSet, Box
 OF_SET, OF_PRODUCTS = -1, -2
 """In the place of a step: facts of the initial set, and of products of its columns."""
 
+ASIDE = 1e-7
+"""A move away from ties, as a part of half of a set's width: more than programs leave open."""
+
 Multipliers = Callable[
     [AffineForms], tuple[Float[np.ndarray, "k m"], Float[np.ndarray, "k n"]] | None
 ]
@@ -283,6 +286,27 @@ class Horizon:
             )
             for layers in self.steps
         ]
+
+    def settled(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n"]:
+        """Columns beside these, where what is chosen wins by a little more.
+
+        Programs end at ties, where what is computed may choose otherwise. A choice `z` among
+        numbers `y` makes `z . y` largest; initial states and what is drawn move along the slope of
+        all `(z - 1/2) . y`, of which what units add counts as constant.
+        """
+        slopes = np.zeros_like(columns)
+        for layer in itertools.chain.from_iterable(self.steps):
+            chosen = np.flatnonzero(layer.unit.jumps & (layer.places >= 0))
+            if len(chosen):
+                z, y = layer.outputs[chosen], np.nan_to_num(layer.inputs[chosen].columns)
+                values = z.rows[:, 0] + columns[:, : z.columns.shape[1]] @ z.columns.T
+                slopes[:, : y.shape[1]] += (values - 0.5) @ y
+        moving = np.append(np.arange(self.start.spread.shape[1]), self.free)
+        along, moved = slopes[:, moving], columns.copy()
+        size = abs(along).max(axis=1, initial=0.0, keepdims=True)
+        steps = ASIDE * along / np.where(size > 0, size, 1.0)
+        moved[:, moving] = np.clip(columns[:, moving] + steps, -1.0, 1.0)
+        return moved
 
     @property
     def kinds(self) -> int:

@@ -56,7 +56,8 @@ def test_where_decisions_are_settled_derivatives_are_those_of_the_branch(name, s
     assert gradient[side] == pytest.approx(difference, rel=1e-6)
     assert abs(gradient[side]) > 0.01
     others = np.delete(gradient, side)
-    np.testing.assert_array_equal(others, 0.0)  # of the other branch, and of the place of the jump
+    # of the other branch, and of the place of the jump: no more than what rounding is counted by
+    np.testing.assert_allclose(others, 0.0, atol=1e-12)
 
 
 def test_forms_of_an_open_decision_have_no_slope_in_the_place_of_the_jump():

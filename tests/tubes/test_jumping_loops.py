@@ -180,7 +180,7 @@ def test_a_relay_whose_state_keeps_its_mode_is_decided_both_ways(side):
     for _ in range(LONG):
         spans = [after for span in spans for after in heated(*span)]
         every += spans
-    assert {on for *_, on in every[-len(spans) :]} == {0, 1}
+    assert {on for *_, on in every} == {0, 1}
     attained = float((max if side else min)(span[side] for span in every))
     for by, status in ((0.01, "PROVED"), (-0.01, "REFUTED")):
         ends = np.array([[-9.0, -9.0], [9.0, 9.0]])

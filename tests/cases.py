@@ -128,6 +128,18 @@ def friction(p: Any, x: Any, u: Any) -> Any:
     return jnp.stack([x[0] + p * x[1] / 4, x[1] - (x[0] + jnp.sign(x[1]) / 2) / 4])
 
 
+def piloted(p: Any, x: Any, u: Any, w: Any) -> Any:
+    """A pilot takes any of three pushes."""
+    pushes = [[0.0, -0.25], [0.125, 0.0], [0.0, 0.5]]
+    return jnp.stack([x[0] + p * x[1] / 4, x[1] + u[0] / 4]) + rj.one_of(pushes, w)
+
+
+def advised(p: Any, x: Any, u: Any) -> Any:
+    """A place, and which of two advisories it was sent by, as zeros and a one."""
+    advisory = jax.nn.one_hot(jnp.argmax(u), 2)
+    return jnp.append(p * x[0] / 2 + (advisory[0] - advisory[1]) / 4, advisory)
+
+
 def swinging(x: Any, u: Any) -> Any:
     """The pendulum's differential equation."""
     return jnp.stack([x[1], jnp.sin(x[0]) - 0.2 * x[1] + u[0]])
@@ -154,9 +166,19 @@ def side(x: Any) -> Any:
     return (x[0] > 0.1).astype(int)
 
 
+def last(x: Any) -> Any:
+    """Which of two controllers acts: the one of the last advisory."""
+    return jnp.argmax(x[1:])
+
+
 def net(activation: Any = rj.Tanh(), seed: int = 0, n: int = 2) -> rj.MLP:  # noqa: B008  (immutable)
     """So many states, one input."""
     return rj.MLP.from_layers(he_network((n, 4, 3, 1), seed), activation)
+
+
+def scores(seed: int) -> rj.MLP:
+    """Of two advisories, after one of them."""
+    return rj.MLP.from_layers(he_network((3, 4, 2), seed))
 
 
 def nonlinear(f: Callable, activation: Any = None, n: int = 2, **options: Any) -> rj.ClosedLoop:
@@ -194,11 +216,11 @@ def of_functions(make: Callable[[], rj.ClosedLoop], **more: Any) -> Loop:
     return Loop(make, **({"initial": small, "kept": False, "smooth": True} | more))
 
 
-def jumping(make: Callable, size: float = 0.5, smooth: bool = False, kept: bool = False) -> Loop:
+def jumping(make: Callable, size: float = 0.5, smooth: bool = False, **more: Any) -> Loop:
     """A loop that jumps, from around where it does."""
     around = lambda: rj.Box([-size, -0.8 * size], [0.8 * size, size])  # noqa: E731
-    given = {"smooth": smooth, "kept": kept, "options": {"gap": 1e-2}}
-    return of_functions(make, initial=around, **given)
+    given = {"initial": around, "smooth": smooth, "options": {"gap": 1e-2}}
+    return of_functions(make, **(given | more))
 
 
 FILE = "tests/data/networks/torch_tanh.onnx"
@@ -266,6 +288,21 @@ LOOPS = {
     "switched": jumping(
         lambda: rj.ClosedLoop(LINE, rj.Switched([net(rj.ReLU()), net(rj.ReLU(), 1)], by=side)),
         size=0.15,
+    ),
+    "piloted": jumping(
+        lambda: rj.ClosedLoop(
+            rj.NonlinearPlant(Partial(piloted, 1.5), 2, 1, disturbances=3),
+            net(rj.ReLU()),
+            disturbance=rj.Box(np.zeros(3), np.ones(3)),
+        )
+    ),
+    "advised": jumping(
+        lambda: rj.ClosedLoop(
+            rj.NonlinearPlant(Partial(advised, 1.5), 3, 2),
+            rj.Switched([scores(seed) for seed in range(2)], by=last),
+        ),
+        n=3,
+        initial=lambda: rj.Box([-0.5, 1.0, 0.0], [0.4, 1.0, 0.0]),
     ),
     "sampled": of_functions(
         lambda: rj.ClosedLoop(rj.SampledPlant(swinging, 2, 1, period=0.2), net(rj.ReLU()))

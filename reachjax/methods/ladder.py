@@ -134,6 +134,7 @@ class Ladder:
         self._note, self._scenarios = note, scenarios
         self._middle = scenarios.middle(np.asarray(box.center))
         self._loop, self._t, self._nodes, self._budget = loop, t, nodes, budget
+        self._jumps = loop.jumps
         self.horizon = Horizon(loop, X0, box, t, between)
         start = self.horizon.start
         columns = start.spread.shape[1]
@@ -295,7 +296,10 @@ class Ladder:
             def attained(columns: list[np.ndarray], number: int = number) -> float:
                 if target.values is None:
                     return -np.inf
-                begun = self._scenarios_at(np.array(columns))
+                tried = np.array(columns)
+                if self._jumps:
+                    tried = np.concatenate([self.horizon.settled(tried), tried])
+                begun = self._scenarios_at(tried)
                 ended.extend(begun)
                 steps = len(horizon.steps)
                 after = self._scenarios.runs(self._loop, begun, steps, self._t)[:, -1]
@@ -358,7 +362,8 @@ class Ladder:
 
     def scenarios_of(self, climbed: StepBounds) -> Float[np.ndarray, "f s"]:
         """The scenarios at which bounds would be attained, were they attained."""
-        return self._scenarios_at(climbed.columns)
+        columns = climbed.columns
+        return self._scenarios_at(self.horizon.settled(columns) if self._jumps else columns)
 
     def _scenarios_at(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c s"]:
         """The scenarios that columns stand for.

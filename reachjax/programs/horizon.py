@@ -34,6 +34,9 @@ from reachjax.sets import AbstractSet, Box
 OF_SET, OF_PRODUCTS = -1, -2
 """In the place of a step: facts of the initial set, and of products of its columns."""
 
+ASIDE = 1e-7
+"""A move away from ties, as a part of half of a set's width: more than programs leave open."""
+
 Multipliers = Callable[
     [AffineForms], tuple[Float[np.ndarray, "k m"], Float[np.ndarray, "k n"]] | None
 ]
@@ -284,6 +287,38 @@ class Horizon:
             for layers in self.steps
         ]
 
+    def settled(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c n"]:
+        """Columns beside these, where what is chosen wins by a little more.
+
+        Programs end at ties, where what is computed may choose otherwise. Initial states and what
+        is drawn move to where all that is tied is won by as much, what units add being constant.
+        """
+        moving = np.append(np.arange(self.start.spread.shape[1]), self.free)
+        moved = columns.copy()
+        for number, slopes in enumerate(map(self._tied, columns)):
+            own = slopes[:, moving]
+            size = abs(own).max(axis=1, initial=0.0, keepdims=True)
+            own = own[size[:, 0] > 0] / size[size > 0][:, None]
+            aside = ASIDE * np.linalg.pinv(own).sum(axis=1)
+            moved[number, moving] = np.clip(columns[number, moving] + aside, -1.0, 1.0)
+        return moved
+
+    def _tied(self, columns: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k n"]:
+        """The slopes of what is no more than nearly zero where something wins."""
+        found = [np.zeros((0, self.width))]
+        deciding = (each for step in self.steps for each in step if each.unit.jumps)
+        with np.errstate(all="ignore"):
+            for layer in deciding:
+                y, z = (
+                    part.rows[:, 0] + part.columns @ columns[: part.columns.shape[1]]
+                    for part in (layer.inputs, layer.outputs)
+                )
+                won = layer.unit.won(z)
+                slopes = won @ layer.inputs.padded(self.width).columns
+                size = abs(slopes).sum(axis=1)
+                found.append(slopes[(won @ y <= 2 * ASIDE * size) & (size < np.inf)])
+        return np.concatenate(found)
+
     @property
     def kinds(self) -> int:
         """How many facts a unit may have."""
@@ -348,9 +383,9 @@ class Horizon:
             self._add(block.rows, np.stack([step, before + switching, kind], axis=1))
         pairs = [np.stack([first[one], first[other]], axis=1) for one, other in facts.zero]
         self._zero += pairs
-        self.columns = np.append(self.columns, np.tile(layer.places[switching], len(pairs)))
-        if pairs:
-            self._varying = np.append(self._varying, layer.places[switching])
+        places = layer.places[switching]
+        self.columns = np.append(self.columns, np.tile(places, len(pairs)))
+        self._varying = np.append(self._varying, places[places >= 0])
         self.gaps = np.append(self.gaps, np.tile(layer.gap[switching], len(pairs)))
 
     def _add(self, rows: AffineForms, origins: Int[np.ndarray, "k 3"]) -> None:

@@ -15,6 +15,8 @@ import mpmath
 import numpy as np
 from scipy.special import erf
 
+import reachjax as rj
+
 PLACES, HEIGHTS = (-1.0, -0.25, 0.5, 2.0), (0.5, -1.0, 0.75, 0.0)
 TENTHS = 7
 
@@ -36,6 +38,7 @@ JAX = SimpleNamespace(
     constant=_sum_of_tenths,
     above=lambda y: (y > 0).astype(float),
     best=lambda scores, values: values[jnp.argmax(scores)],
+    one_of=lambda values, w: rj.one_of(values[:, None], w)[0],
 )
 
 
@@ -65,6 +68,7 @@ def _plain(m: Any, **functions: Any) -> SimpleNamespace:
     return SimpleNamespace(
         above=lambda y: int(y > 0),
         best=best,
+        one_of=lambda values, w: best(w, values),
         hypot=lambda a, b: m.sqrt(a * a + b * b),
         inverse=inverse,
         solve=lambda A, b: inverse(A) @ b,
@@ -122,6 +126,20 @@ def switched_waves(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
     """The same beside a sine, whose sign decides too."""
     wave = m.sin(x[0])
     return switched(m, x, u, w, p) + m.stack([0 * wave, wave * of(m).above(wave) / 4])
+
+
+def piloted(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
+    """A pendulum under any of three pushes: the one whose number is the largest."""
+    a = p["a"]
+    turned = a[0] * m.sin(x[0]) + u[0] / 8 + of(m).one_of(a, w) / 4
+    return m.stack([x[0] + x[1] / 8, x[1] + turned])
+
+
+def advised(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:
+    """A place, and which of two advisories it was sent by, as a one and a zero."""
+    a, first = p["a"], of(m).above(u[0])
+    sent = a[1] * first + a[2] * (1 - first)
+    return m.stack([(1 + a[0] / 4) * x[0] + sent / 4, 0 * sent + first, 0 * sent + 1 - first])
 
 
 def masses(m: Any, x: Any, u: Any, w: Any, p: dict[str, Any]) -> Any:

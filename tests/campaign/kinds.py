@@ -17,6 +17,7 @@ import mpmath
 import numpy as np
 
 import reachjax as rj
+from tests.campaign import functions
 from tests.campaign.functions import by_cases, masses, switched, switched_waves
 from tests.campaign.oracle import WIDE, Region, exact
 from tests.input_polytopes import exact_multipliers
@@ -127,6 +128,7 @@ class Kind:
         template: of the sets.
         initial: the kinds of initial sets.
         disturbed: the kinds of sets of disturbances; none if there are none.
+        pushes: how many numbers disturb a plant that is not affine.
         noisy: whether states are measured with noise.
         facets: of a polytope of inputs; 0 for a box.
         skips: whether the network is traced, with a connection that skips it.
@@ -134,6 +136,7 @@ class Kind:
         columns: what old columns of forms are merged into, from a box; 0 where that is not tried.
         period: of a plant in continuous time, of which `step` is the field; 0 in discrete time.
         jumps: whether decisions of the plant are tied in the middle of the initial box.
+        advised: whether the two last states, a one and a zero, say which of two networks acts.
     """
 
     name: str
@@ -145,6 +148,7 @@ class Kind:
     template: Callable[[int], rj.AbstractTemplate] = rj.Template.box
     initial: tuple[str, ...] = ("box", "flat", "point", "polytope")
     disturbed: tuple[str, ...] = ()
+    pushes: int = 1
     noisy: bool = False
     facets: int = 0
     skips: bool = False
@@ -152,6 +156,7 @@ class Kind:
     columns: int = 0
     period: float = 0.0
     jumps: bool = False
+    advised: bool = False
 
     @property
     def loop(self) -> tuple:
@@ -191,6 +196,8 @@ KINDS = (
     Kind("unicycle, sampled", unicycle, "relu", states=3, hidden=(4,), period=0.125),
     Kind("switched", switched, "relu", initial=EDGED, template=OCTAGONAL, jumps=True),
     Kind("switched waves", switched_waves, "tanh", initial=EDGED, jumps=True),
+    Kind("piloted", functions.piloted, "relu", disturbed=("box",), pushes=3),
+    Kind("advised", functions.advised, "relu", states=3, initial=EDGED, advised=True, horizon=3),
 )
 
 
@@ -353,7 +360,25 @@ def _network(m: Any, x: Any, layers: Sequence[tuple[Any, Any]], kind: Kind) -> A
     for W, b in layers[:-1]:
         y = UNITS[kind.unit](m, W @ y + b)
     W, b = layers[-1]
-    return W @ y + b - (x[:1] / 4 if kind.skips else 0)
+    u = W @ y + b - (x[:1] / 4 if kind.skips else 0)
+    return u * functions.of(m).best(x[-2:], SIGNS) if kind.advised else u
+
+
+SIGNS = (1, -1)
+"""Of the outputs of two networks that are else the same."""
+
+
+def _after_advisories(layers: Any, kind: Kind) -> rj.Network:
+    """Of two networks the one that the last advisory says."""
+    *inner, (W, b) = layers
+    nets = [
+        rj.MLP.from_layers([*inner, (sign * W, sign * b)], ACTIVATIONS[kind.unit]) for sign in SIGNS
+    ]
+    return rj.Switched(nets, by=_last_advisory)
+
+
+def _last_advisory(x: Any) -> Any:
+    return jnp.argmax(x[-2:])
 
 
 def _traced_network(layers: Any, x: Any, kind: Kind) -> Any:
@@ -385,7 +410,7 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
         (rng.normal(size=(k, j)) * 10 ** rng.uniform(-1, 0.5), 0.5 * rng.normal(size=k))
         for j, k in pairwise((n, *kind.hidden, n_u))
     ]
-    n_w = n if kind.step is affine else 1
+    n_w = n if kind.step is affine else kind.pushes
     p = {"a": rng.normal(size=3) * 10 ** rng.uniform(-1.5, 0.3, size=3)}
     if kind.step is affine:
         p["A"] = np.eye(n) + rng.normal(size=(n, n)) * 10 ** rng.uniform(-2, 0)
@@ -396,14 +421,18 @@ def drawn(kind: Kind, number: int, seed: int = 0) -> KindCase:
     inputs, allowed = _inputs(kind, rng)
     region = str(rng.choice(kind.initial))
     X0 = _initial(region, n, rng)
+    if kind.advised:
+        X0 = _with_advisory(X0, rng)
     if kind.jumps:
         p["at"] = np.array(X0.center[:1])
     network, step = _functions(kind)
-    net = (
+    net: Any = (
         rj.Network(jax.tree_util.Partial(network, layers), n, n_u)
         if kind.skips or kind.unit not in ACTIVATIONS
         else rj.MLP.from_layers(layers, ACTIVATIONS[kind.unit])
     )
+    if kind.advised:
+        net = _after_advisories(layers, kind)
     if kind.step is affine:
         plant: Any = rj.AffinePlant(p["A"], p["B"], E=p["E"] if W is not None else None)
     else:
@@ -468,3 +497,11 @@ def _initial(region: str, n: int, rng: np.random.Generator) -> Any:
         offsets = np.hstack([radii, radii, 0.5 * radii.min()]) + rows @ center
         return rj.Polytope(rows, offsets)
     return rj.Box(center - radii, center + radii)
+
+
+def _with_advisory(X0: rj.Box, rng: np.random.Generator) -> rj.Box:
+    """A box whose two last entries are a one and a zero, or anything between."""
+    known = [(1.0, 1.0), (0.0, 0.0)]
+    last = [known, known[::-1], [(0.0, 1.0)] * 2][rng.integers(3)]
+    ends = zip((X0.lower, X0.upper), np.transpose(last), strict=True)
+    return rj.Box(*(np.append(end[:-2], own) for end, own in ends))

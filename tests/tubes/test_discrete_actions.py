@@ -38,7 +38,13 @@ class Policy:
         return rj.ClosedLoop(rj.AffinePlant(self.A, self.B), net)
 
     def largest(self, direction, steps):
-        """The largest value of a direction after some steps, by a program with whole numbers."""
+        """The largest value of a direction after some steps, by a program with whole numbers.
+
+        The solver has no indicator constraints `z = 1 implies r >= 0`. Stated are
+        `r >= least (1 - z)`, where `least` is below every value of `r` over bounds of what it is
+        made of: at `z = 1` that is `r >= 0`, at `z = 0` it is true of all points. So the points
+        with whole `z` are the same; only what lies between them differs, which the search closes.
+        """
         rows, ends, columns, whole = [], [], [], []
 
         def column(low, high, is_whole=False):

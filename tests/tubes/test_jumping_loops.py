@@ -147,7 +147,43 @@ def test_verdicts_are_those_of_the_extremes(name):
     most = float(max(x[0] for x in states))
     loop, X0 = loop_of(name), rj.Box(*ends)
     wide, narrow = (rj.Box([-9.0, -9.0], [most + by, 9.0]) for by in (0.01, -0.01))
-    proved = rj.decide(loop, X0, 2, goal=wide)
-    refuted = rj.decide(loop, X0, 2, goal=narrow)
-    assert proved.status is not rj.VerdictStatus.REFUTED
-    assert refuted.status is rj.VerdictStatus.REFUTED
+    assert rj.decide(loop, X0, 2, goal=wide).status is rj.VerdictStatus.PROVED
+    assert rj.decide(loop, X0, 2, goal=narrow).status is rj.VerdictStatus.REFUTED
+
+
+LONG = 6
+"""Steps in which a thermostat switches both ways."""
+
+ROOM = rj.Box([1.25, 0.0], [1.75, 0.0])
+"""Temperatures of a room whose heating is off."""
+
+
+def heated(low, high, on):
+    """Temperatures after a step, and whether it is heated: from below 1 on, up to 2."""
+    one, two = Fraction(1), Fraction(2)
+    parts = (low, min(high, one), 1), (max(low, two), high, 0), (max(low, one), min(high, two), on)
+    return [(low * 3 / 4 + on, high * 3 / 4 + on, on) for low, high, on in parts if low <= high]
+
+
+def thermostat_loop():
+    def keeps(x):
+        return jnp.where(x[:1] < 1, 1.0, jnp.where(x[:1] > 2, 0.0, x[1:]))
+
+    plant = rj.NonlinearPlant(lambda x, u: jnp.append(x[:1] * 3 / 4 + u, u), 2, 1)
+    return rj.ClosedLoop(plant, rj.Network(keeps, 2, 1))
+
+
+@pytest.mark.parametrize("side", [0, 1], ids=["cold", "warm"])
+def test_a_relay_whose_state_keeps_its_mode_is_decided_both_ways(side):
+    spans = [(Fraction(ROOM.lower[0].item()), Fraction(ROOM.upper[0].item()), 0)]
+    every = [*spans]
+    for _ in range(LONG):
+        spans = [after for span in spans for after in heated(*span)]
+        every += spans
+    assert {on for *_, on in every} == {0, 1}
+    attained = float((max if side else min)(span[side] for span in every))
+    for by, status in ((0.01, "PROVED"), (-0.01, "REFUTED")):
+        ends = np.array([[-9.0, -9.0], [9.0, 9.0]])
+        ends[side, 0] = attained + (by if side else -by)
+        verdict = rj.decide(thermostat_loop(), ROOM, LONG, safe=rj.Box(*ends))
+        assert verdict.status.name == status

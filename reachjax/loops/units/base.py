@@ -236,6 +236,10 @@ class AbstractUnit(AbstractActivation):
         """How far inputs are from where the value jumps."""
         return math.inf
 
+    def won(self, z: Float[np.ndarray, " k"], /) -> Float[np.ndarray, "m inputs"]:
+        """Rows over the inputs that are not negative where the value of one that jumps is `z`."""
+        return np.zeros((0, len(z)))
+
     @abc.abstractmethod
     def facts(self, y: Any, z: Any, lower: Array, upper: Array) -> Facts:
         """What holds for inputs `y`, values `z` and bounds `lower <= y <= upper`.

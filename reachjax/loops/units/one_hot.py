@@ -68,6 +68,12 @@ class OneHot(AbstractUnit):
         *_, second, first = np.sort(y[: self.count])
         return float(first - second)
 
+    def won(self, z: Float[np.ndarray, " n"], /) -> Float[np.ndarray, "k n"]:
+        """The largest number less each of the others."""
+        places = np.eye(self.count, len(z))
+        first = int(np.argmax(z[: self.count]))
+        return places[first] - np.delete(places, first, axis=0)
+
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """Zero of what surely loses, and one of what alone may win."""
         xp, possible = namespace(lower, upper), self._possible(lower, upper)

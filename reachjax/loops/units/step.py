@@ -73,6 +73,10 @@ class Step(AbstractUnit):
         """How far the closest input is from where the value changes."""
         return float(abs(y).min(initial=np.inf))
 
+    def won(self, z: Float[np.ndarray, " k"], /) -> Float[np.ndarray, "k k"]:
+        """The inputs, or those below zero turned."""
+        return np.diag(np.where(z > 0.5, 1.0, -1.0))
+
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """`[0, 1]`, or one of the two where the sign is known."""
         xp, (always, never) = namespace(lower, upper), _decided(lower, upper)

@@ -63,7 +63,7 @@ class Step(AbstractUnit):
         return namespace(y).where(y >= 0 if self.at_zero else y > 0, 1.0, 0.0)
 
     def implied(self, other: AbstractUnit, above: bool) -> bool:
-        """Of one number `>` is no more than `>=`."""
+        """Whether it is, as `y >= 0` is where `y > 0` is, but not the other way round."""
         if not isinstance(other, Step):
             return False
         return other.at_zero <= self.at_zero if above else other.at_zero >= self.at_zero

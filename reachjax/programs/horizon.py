@@ -310,7 +310,7 @@ class Horizon:
         with np.errstate(all="ignore"):
             for layer in deciding:
                 y, z = (
-                    part.rows[:, 0] + part.columns @ columns[: part.columns.shape[1]]
+                    np.asarray(part.rows[:, 0] + part.columns @ columns[: part.columns.shape[1]])
                     for part in (layer.inputs, layer.outputs)
                 )
                 won = layer.unit.won(z)

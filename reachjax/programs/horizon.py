@@ -313,7 +313,7 @@ class Horizon:
                     np.asarray(part.rows[:, 0] + part.columns @ columns[: part.columns.shape[1]])
                     for part in (layer.inputs, layer.outputs)
                 )
-                won = layer.unit.won(np.asarray(z))
+                won = layer.unit.won(z)
                 slopes = won @ layer.inputs.padded(self.width).columns
                 size = abs(slopes).sum(axis=1)
                 found.append(slopes[(won @ y <= 2 * ASIDE * size) & (size < np.inf)])

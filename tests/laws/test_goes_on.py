@@ -7,7 +7,7 @@ import pytest
 
 import reachjax as rj
 from tests.cases import FEW, HORIZON, Case, each
-from tests.laws.changes import alike, same
+from tests.laws.changes import same
 
 GAP = 1e-4
 """What `reach` may leave open by default, as a part of a facet's range."""
@@ -35,12 +35,12 @@ def claims(tube):
     return tube.sets, [(proof.bounds, proof.witnesses) for proof in tube.certificates[1:]]
 
 
-def as_one_call(one, other):
-    """Whether sets and bounds are the same; trajectories are run in batches of other sizes."""
-    (sets, found), (its_sets, its_found) = claims(one), claims(other)
-    bounds, witnesses = zip(*found, strict=True)
-    its_bounds, its_witnesses = zip(*its_found, strict=True)
-    return same((sets, bounds), (its_sets, its_bounds)) and alike(witnesses, its_witnesses)
+def bounds(tube):
+    """Sets and bounds, to the last digit.
+
+    Witnesses are of the trajectories that were found on the way, in batches of other sizes.
+    """
+    return tube.sets, [proof.bounds for proof in tube.certificates[1:]]
 
 
 def as_tight(one, other):
@@ -62,7 +62,7 @@ def test_a_tube_that_was_interrupted_goes_on_as_if_it_had_not_been(case):
     assert same(claims(pickle.loads(pickle.dumps(stopped.value)).tube), claims(tube))
     rest = tube.extended(HORIZON - 1, **case.options)
     if case.method in EXACT:
-        assert as_one_call(rest, case.tube)
+        assert same(bounds(rest), bounds(case.tube))
     else:
         assert as_tight(rest, case.tube)
 

@@ -20,7 +20,8 @@ import resource
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import nullcontext, suppress
+from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,18 +106,18 @@ def decided(title: str, settings: Settings) -> Iterator[dict]:
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", None)
     instance, loop = instances()[title], loop_of(title, settings)
-    given = loop, instance.X0, instance.horizon
-    options: dict[str, Any] = {**instance.required, "time_limit": settings.limit}
     yield {}
-    with workers(settings.processes) if settings.processes > 1 else nullcontext() as executor:
-        options |= {"executor": executor}
-        yield from _decided(instance, loop, given, options, settings)
+    with workers(settings.processes) as executor:
+        yield from _decided(instance, loop, executor, settings)
 
 
 def _decided(
-    instance: Instance, loop: rj.ClosedLoop, given: Any, options: dict[str, Any], settings: Settings
+    instance: Instance, loop: rj.ClosedLoop, executor: Executor | None, settings: Settings
 ) -> Iterator[dict]:
-    title, began = instance.title, time.perf_counter()
+    title, given = instance.title, (loop, instance.X0, instance.horizon)
+    options: dict[str, Any] = {**instance.required, "time_limit": settings.limit}
+    options |= {"executor": executor}
+    began = time.perf_counter()
     verdict = rj.decide(*given, **options)
     first = time.perf_counter() - began
     found = {"verdict": verdict.status.name, "first": first, "cells": max(len(verdict.cells), 1)}

@@ -10,10 +10,8 @@ Source: the docking benchmark of Ravaioli, Cunningham, McCarroll, Gangal, Dunlap
 the form of ARCH-COMP AINNCS, with a network that is trained here.
 """
 
-import multiprocessing
 import os
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +28,7 @@ from tqdm import tqdm
 
 import reachjax as rj
 from experiments import report
+from experiments.benchmark.rivals.processes import workers
 from experiments.command import configure_jax, require_options, run_experiment
 from experiments.imitation import train_network
 from experiments.sampling import Samples
@@ -144,10 +143,7 @@ def decided(loop: rj.ClosedLoop, X0: rj.Box, settings: Settings) -> tuple[rj.Ver
     options: dict[str, Any] = {"cells": 1_000_000, "time_limit": settings.time_limit}
     options |= {"safe": limit(), "progress": tqdm}
     began = time.perf_counter()
-    if settings.processes == 1:
-        return rj.decide(loop, X0, HORIZON, **options), time.perf_counter() - began
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(settings.processes, mp_context=context) as executor:
+    with workers(settings.processes) as executor:
         verdict = rj.decide(loop, X0, HORIZON, executor=executor, **options)
         return verdict, time.perf_counter() - began
 

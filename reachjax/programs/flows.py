@@ -34,11 +34,6 @@ class Between(NamedTuple):
     points: tuple[tuple[AffineForms, ...], ...]
     ends: tuple[float, ...]
 
-    @property
-    def states(self) -> list[AffineForms]:
-        """The control points, the last of which are states at the next sample."""
-        return [point for four in self.points for point in four]
-
     def values(self, directions: Float[Array | np.ndarray, "m n_x"], parts: int = 1) -> AffineForms:
         """Forms of directions at control points: part by part, four points each, `m` of each.
 

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from reachjax.methods.ladder import Ladder, Target
 from reachjax.methods.witnesses import Simulated, Simulations
+from reachjax.numerics.numbers import split
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon
 from reachjax.verdicts.specification import PARTS, Requirement
@@ -70,25 +71,21 @@ def values_of(
     if not item.throughout:
         rows = C @ horizon.state
         if item.inside:
-            return _each(rows + (-d)), norms
+            return split(rows + (-d), len(d)), norms
         return [(1 / norms) * (d - rows)], np.ones(1)
     assert horizon.spans  # they were asked for
     between = horizon.spans[-1]
     if item.inside:
         rows = between.values(C).padded(horizon.width)
         count = len(rows) // len(d)
-        return _each(rows + np.tile(-d, count)), np.tile(norms, count)
-    for parts in (1, PARTS, FINEST):
-        found, proved = _apart(between.values(C, parts).padded(horizon.width), d, norms, horizon)
-        if proved:
-            return found, np.ones(len(found))
-    found, _ = _apart(between.values(C).padded(horizon.width), d, norms, horizon)
+        return split(rows + np.tile(-d, count), len(rows)), np.tile(norms, count)
+    tried = (
+        _apart(between.values(C, parts).padded(horizon.width), d, norms, horizon)
+        for parts in (1, PARTS, FINEST)
+    )
+    whole, proved = next(tried)
+    found = whole if proved else next((cut for cut, proves in tried if proves), whole)
     return found, np.ones(len(found))
-
-
-def _each(rows: AffineForms) -> list[AffineForms]:
-    """A group for each of some forms."""
-    return [rows[i : i + 1] for i in range(len(rows))]
 
 
 def _apart(
@@ -103,7 +100,8 @@ def _apart(
     ends = depths.ends(horizon.start)[1].reshape(-1, 4, len(d)).max(axis=1)
     best = np.nan_to_num(ends, nan=np.inf).argmin(axis=1)
     places = np.arange(count) * len(d) + np.repeat(best, 4)
-    return _each(depths[places]), bool((np.take_along_axis(ends, best[:, None], axis=1) < 0).all())
+    proved = bool((np.take_along_axis(ends, best[:, None], axis=1) < 0).all())
+    return split(depths[places], len(places)), proved
 
 
 def _facets(item: Requirement) -> list[np.ndarray]:

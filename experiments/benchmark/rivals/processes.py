@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -54,8 +55,13 @@ def from_process(
     raise Stopped(f"it took more than {patience} seconds")
 
 
-def workers(count: int) -> ProcessPoolExecutor:
-    """So many processes for cells, each begun once it is needed; they end with this one."""
+def workers(count: int) -> AbstractContextManager[ProcessPoolExecutor | None]:
+    """So many processes for cells, each begun once it is needed; none for one.
+
+    They end with this one.
+    """
+    if count == 1:
+        return nullcontext()
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent)
 

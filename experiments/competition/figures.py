@@ -1,5 +1,6 @@
 """Figures as the competition asks for: which coordinates over which."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ DRAWN = 300
 def draw(
     instance: Instance,
     runs: Float[np.ndarray, "c t n"],
-    tube: rj.ReachTube | None,
+    tubes: Sequence[rj.ReachTube],
     verdict: rj.Verdict,
     path: Path,
 ) -> None:
@@ -26,7 +27,7 @@ def draw(
     Args:
         instance: the instance.
         runs: trajectories at samples.
-        tube: boxes at samples; None where there are no bounds over the whole set.
+        tubes: boxes at samples, which together hold all states; none where there are no bounds.
         verdict: what is decided.
         path: of the figure.
     """
@@ -34,9 +35,8 @@ def draw(
     figure, (axes,) = report.panels(1, len(planes), (5 * len(planes), 4))
     for ax, (one, other) in zip(axes, planes, strict=True):
         x, y = (_along(runs[:DRAWN], k) for k in (one, other))
-        if tube is not None:
-            for k, X in enumerate(tube.sets):
-                _box(ax, X.bounding_box(), k, (one, other), x, y)
+        for k, X in ((k, X) for tube in tubes for k, X in enumerate(tube.sets)):
+            _box(ax, X.bounding_box(), k, (one, other), x, y)
         ax.plot(x.T, y.T, color="tab:blue", linewidth=0.4, alpha=0.5)
         if one:
             _regions(ax, instance, (one, other))

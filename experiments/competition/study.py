@@ -50,7 +50,7 @@ NOTE = """\
 first: wall seconds of `decide` in a new process, where nothing is compiled, reading apart
 warm: of one more call;  recheck: of proving the verdict's file anew in another process
 margin: the least certified one, or by how much a trajectory breaks the requirement
-width: at the end, of affine forms over the whole set, over that of sampled states
+width: at the end, of affine forms over the cells of the proof, over that of sampled states
 GB: the most memory that the process took, and those that it gave cells to"""
 
 
@@ -167,27 +167,41 @@ def peak() -> float:
 def width(
     instance: Instance, loop: rj.ClosedLoop, verdict: rj.Verdict, settings: Settings
 ) -> float | None:
-    """How much wider forms over the whole set are at the end than sampled states; a figure too.
+    """How much wider forms over the cells are at the end than sampled states; a figure too.
 
-    None where forms over the whole set have no bounds.
+    None where they have no bounds at the end.
     """
     states = instance.X0.sample(jax.random.key(0), settings.simulations)
     states = np.concatenate([corners(instance.X0), np.asarray(states)])
     runs = np.asarray(loop.simulate(states, instance.horizon))
-    tube = None
-    try:
-        box = rj.Template.box(loop.states)
-        given = loop, instance.X0, instance.horizon, box, rj.LinearBounds()
-        tube = rj.reach(*given, time_limit=settings.limit)
-    except (ValueError, RuntimeError):  # no bounds over the whole set
-        pass
-    figures.draw(instance, runs, tube, verdict, settings.output / f"{instance.title}.png")
-    if tube is None or tube.horizon < instance.horizon:
+    tubes = tubes_of(instance, loop, verdict, settings)
+    figures.draw(instance, runs, tubes, verdict, settings.output / f"{instance.title}.png")
+    if not tubes or min(tube.horizon for tube in tubes) < instance.horizon:
         return None
-    last = tube.sets[-1].bounding_box()
-    certified, seen = np.asarray(last.upper - last.lower), np.ptp(runs[:, -1], axis=0)
+    last = [tube.sets[-1].bounding_box() for tube in tubes]
+    lower, upper = np.min([box.lower for box in last], 0), np.max([box.upper for box in last], 0)
+    certified, seen = upper - lower, np.ptp(runs[:, -1], axis=0)
     moves = seen > 1e-9 * max(seen.max(), 1e-300)
     return float((certified[moves] / seen[moves]).max()) if moves.any() else None
+
+
+def tubes_of(
+    instance: Instance, loop: rj.ClosedLoop, verdict: rj.Verdict, settings: Settings
+) -> list[rj.ReachTube]:
+    """Boxes at samples by forms, from each cell that a proof takes, else from the whole set.
+
+    None where forms have no bounds, or take longer than a decision may.
+    """
+    cells = [rj.Box(cell.lower, cell.upper) for cell in verdict.cells if verdict.proved]
+    template, until = rj.Template.box(loop.states), time.monotonic() + settings.limit
+    found = []
+    for X0 in cells or [instance.X0]:
+        given = loop, X0, instance.horizon, template, rj.LinearBounds()
+        try:
+            found.append(rj.reach(*given, time_limit=max(until - time.monotonic(), 0.0)))
+        except (ValueError, RuntimeError):
+            return []
+    return found
 
 
 def corners(box: rj.Box) -> np.ndarray:

@@ -23,6 +23,7 @@ from reachjax.loops.input_polytope import InputPolytope, input_set
 from reachjax.loops.networks import AbstractNetwork
 from reachjax.loops.plants import AbstractPlant
 from reachjax.loops.tracing.functions import Compiled
+from reachjax.loops.tracing.traces import description
 from reachjax.loops.units import AbstractUnit, AtUnit, clipped, evaluate, projected
 from reachjax.numerics.checks import (
     Numbers,
@@ -32,7 +33,8 @@ from reachjax.numerics.checks import (
     whole_number,
 )
 from reachjax.numerics.host import in_numpy
-from reachjax.numerics.pytrees import Replaceable, converted, pytree
+from reachjax.numerics.pytrees import Replaceable, converted, pytree, written_elsewhere
+from reachjax.numerics.seals import AbstractSealed
 from reachjax.sets import AbstractSet, Box
 from reachjax.sets.unusable import ThinSetError
 
@@ -68,7 +70,7 @@ NETWORK = (
 
 
 @pytree
-class ClosedLoop(Replaceable):
+class ClosedLoop(Replaceable, AbstractSealed):
     """`x[t+1] = A_t x[t] + B_t proj(pi(x[t] + v[t])) + c_t + E_t w[t]`, for all `w` and `v`.
 
     Sizes are checked here, once.
@@ -296,6 +298,24 @@ class ClosedLoop(Replaceable):
     ) -> Any:
         """The state at `t + 1`, for any kind of number; arguments as of `measured` and `moved`."""
         return self.moved(x, self.input(x, t, unit, v), t, unit, w)
+
+    def equations(self) -> str:
+        """What JAX traces of a step in which a class of a user has a part; nothing of others.
+
+        The name of such a class does not say what it computes.
+        """
+        if not written_elsewhere((self.plant, self.controller)):
+            return ""
+
+        def step(loop: ClosedLoop, x: Array, t: Array, w: Array | None, v: Array | None) -> Any:
+            return loop.step(x, t, w=w, v=v)
+
+        def drawn_from(W: AbstractSet | None) -> Any:
+            return None if W is None else jax.ShapeDtypeStruct((W.dimension,), float)
+
+        x, t = jax.ShapeDtypeStruct((self.states,), float), jax.ShapeDtypeStruct((), int)
+        draws = map(drawn_from, (self.disturbance, self.noise))
+        return str(description(jax.make_jaxpr(step)(self, x, t, *draws)))
 
     def simulate(
         self,

@@ -119,7 +119,8 @@ class CompiledBeside:
         Where no core is idle callers go first.
         """
         if sys.platform == "linux":  # where threads have priorities of their own
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BEHIND)
+            own = os.PRIO_PROCESS, threading.get_native_id()
+            os.setpriority(*own, max(os.getpriority(*own), BEHIND))
         with jax.enable_x64(True):
             call = self._function.lower(*given, **static).compile()
             jax.block_until_ready(call(*given))

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from enum import Enum
 from typing import Any, Self, TypeVar, dataclass_transform
 
 import jax
+import numpy as np
 
 from reachjax.numerics.flags import made_lenient
 
@@ -65,6 +67,30 @@ def pytree(cls: type[T]) -> type[T]:
     cls.__getstate__ = fields_alone  # type: ignore[attr-defined]
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten)
     return cls
+
+
+DATA = str, bytes, int, float, complex, type(None), np.ndarray, np.generic, jax.Array, Enum
+"""What is all that it shows."""
+
+PACKAGE = __name__.partition(".")[0]
+
+
+def written_elsewhere(value: Any) -> bool:
+    """Whether a class that is not of this package, or a function, is among the parts of a tree.
+
+    Traced functions are none of them: their traces say what they compute.
+    """
+    kind = type(value)
+    if isinstance(value, tuple | list) and kind.__module__ == "builtins":
+        return any(map(written_elsewhere, value))
+    if isinstance(value, dict):
+        return any(map(written_elsewhere, value.values()))
+    if isinstance(value, (*DATA, jax.ShapeDtypeStruct)):
+        return False
+    if kind.__module__.partition(".")[0] != PACKAGE:
+        return True
+    fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
+    return any(written_elsewhere(getattr(value, field.name)) for field in fields)
 
 
 def unchecked(cls: type[T], **values: Any) -> T:

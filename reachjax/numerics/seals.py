@@ -7,6 +7,7 @@ the seal does not fit, and nothing is decided from the tube.
 
 from __future__ import annotations
 
+import abc
 import hashlib
 import re
 from typing import Any
@@ -25,8 +26,16 @@ SIZE = 32
 """Bytes: two trees never have one seal."""
 
 
+class AbstractSealed(abc.ABC):
+    """A tree of which names and numbers need not say what it computes."""
+
+    @abc.abstractmethod
+    def equations(self) -> str:
+        """What it computes, as far as its structure does not say so; the same in any process."""
+
+
 def seal_of(*parts: Any, start: int = 0) -> Seal:
-    """The hash of trees of arrays: of their structure, and of every bit of their numbers.
+    """The hash of trees of arrays: of their structure, of every bit of their numbers, of equations.
 
     Works inside `jax.jit` and `vmap` too, where it costs nothing if it is not used.
 
@@ -45,6 +54,7 @@ def seal_of(*parts: Any, start: int = 0) -> Seal:
     leaves, structure = jax.tree.flatten(fixed)
     # an object that does not say what it is, is called by its address: not so in another process
     named = re.sub(r" at 0x[0-9a-f]+", "", f"{structure}, start={start}")
+    named += "".join(part.equations() for part in parts if isinstance(part, AbstractSealed))
 
     def digest(leaves: list[np.ndarray]) -> np.ndarray:
         found = hashlib.blake2b(named.encode(), digest_size=SIZE)

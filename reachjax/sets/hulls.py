@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull, Delaunay, HalfspaceIntersection, QhullErro
 
 from reachjax.sets.balance import Balanced, balanced, lengths
 from reachjax.sets.linear_programs import NOTHING, boxed, chebyshev, maximiser
-from reachjax.sets.unusable import ThinSetError
+from reachjax.sets.unusable import ThinSetError, UnusableSetError
 
 TOO_THIN = "the polytope is too thin for its corners to be told apart"
 
@@ -57,7 +57,7 @@ def _corners(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, np.ndarray]:
     radii = np.where(radii > FLAT * radii.max(), radii, radii.max() or 1.0)
     try:
         return region, middle + radii * _unit_vertices(*balanced(A * radii, b - A @ middle))
-    except QhullError as error:
+    except (QhullError, UnusableSetError) as error:  # in these coordinates, which are rounded
         raise ThinSetError(f"{TOO_THIN}: {str(error).splitlines()[0]}") from None
 
 

@@ -25,6 +25,16 @@ UNEVEN = 10
 TOO_LARGE = 1e15
 """From numbers of this size on linear programs are not believed to have no solution."""
 
+REACH = 1e10
+"""Points that are further away than this many times a polytope's largest offset are none of it."""
+
+EMPTY = "the polytope A x <= b is empty: no point satisfies all its facets"
+
+NEARLY_EMPTY = (
+    "the polytope A x <= b is empty, or it is thinner than linear programs tell: give it facets "
+    "that leave more room, or a Box if it is one"
+)
+
 NOTHING = 1e-290
 """Coordinates that are no larger, where facets are about 1 away, are zero but for underflow."""
 
@@ -37,8 +47,10 @@ def maximiser(A: np.ndarray, b: np.ndarray, direction: np.ndarray) -> tuple[np.n
         RuntimeError: the linear program was not solved.
     """
     result = linprog(-direction, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
-    if result.status == 2 or (result.status == 4 and is_empty(A, b)):
-        raise UnusableSetError("the polytope A x <= b is empty: no point satisfies all its facets")
+    if result.status in (2, 4) and is_empty(A, b):
+        raise UnusableSetError(EMPTY)
+    if result.status == 2:
+        raise ThinSetError(NEARLY_EMPTY)
     if result.status == 3:
         raise UnusableSetError(
             f"the polytope A x <= b is unbounded in direction {np.round(direction, 6).tolist()}"
@@ -67,12 +79,27 @@ def maximisers(
 
 
 def is_empty(A: np.ndarray, b: np.ndarray) -> bool:
-    """Whether a linear program says that no point is in a polytope, which may be unbounded."""
+    """Whether surely no point is in a polytope, which may be unbounded; False if that is not seen.
+
+    By Farkas' lemma: for `y >= 0` with `y'A = 0` and `y'b < 0`, rounding included, and what is left
+    of `y'A` by points of up to `REACH` times the largest offset.
+    """
     A, b = balanced(A, b)
     if not (np.all(abs(A) < TOO_LARGE) and np.all(abs(b) < TOO_LARGE)):
-        return False  # what it says of such numbers is often wrong
-    zero = np.zeros(A.shape[1])
-    return linprog(zero, A_ub=A, b_ub=b, bounds=(None, None), method="highs").status == 2
+        return False  # what a linear program says of such numbers is often wrong
+    (m, n), norms = A.shape, lengths(A)
+    if np.any((norms == 0) & (b < 0)):
+        return True
+    b = np.ldexp(b, -np.frexp(abs(b).max(initial=0.0))[1])  # exactly, but for underflow
+    facets = np.hstack([A, -norms[:, None]])
+    ends = [*[(None, None)] * n, (0, None)]
+    found = linprog(np.eye(n + 1)[-1], A_ub=facets, b_ub=b, bounds=ends, method="highs")
+    if found.status != 0:
+        return False
+    y, error = np.maximum(-found.ineqlin.marginals, 0.0), gamma(m + n + 8)
+    lost = TINY * (m + 2 + y.sum())
+    leak = (abs(y @ A) + error * (y @ abs(A)) + lost).sum()
+    return bool(y @ b + error * (y @ abs(b)) + lost + leak * REACH < 0)
 
 
 def bounding_box(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -199,7 +226,7 @@ def chebyshev(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
         method="highs",
     )
     if result.status == 2:
-        raise UnusableSetError("the polytope A x <= b is empty: no point satisfies all its facets")
+        raise UnusableSetError(EMPTY) if is_empty(A, b) else ThinSetError(NEARLY_EMPTY)
     if result.status != 0:
         raise UnusableSetError("the polytope A x <= b is unbounded")
     return result.x[:-1], float(result.x[-1])

@@ -216,7 +216,9 @@ class Sieve:
             still_open |= dict.fromkeys(decision for one in each for decision in one.open)
             uppers = [np.asarray(one.offsets) for one in each]
             if between and k:
-                both = zip((np.asarray(one.between) for one in each), uppers, strict=True)
+                # without states there is nothing in between them
+                inner = (one.offsets if one.between is None else one.between for one in each)
+                both = zip(map(np.asarray, inner), uppers, strict=True)
                 uppers = [np.where(whole[k - 1], *pair) for pair in both]
             uppers = [upper for upper in uppers if not np.isneginf(upper).all()]  # no states
             for rows in self._rows:

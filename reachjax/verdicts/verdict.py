@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
 from reachjax.numerics.archives import writable
-from reachjax.numerics.checks import Numbers, require_kind, same_size
+from reachjax.numerics.checks import Numbers, require_double_precision, require_kind, same_size
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.seals import Seal
 from reachjax.programs.followed import OpenDecision
@@ -493,6 +493,7 @@ class WinningSet:
         return self._in(states, VerdictStatus.REFUTED)
 
     def _in(self, states: Float[ArrayLike, "*batch n"], status: VerdictStatus) -> np.ndarray:
+        require_double_precision()
         points = np.asarray(Numbers("(n,)", "(batch, n)")(states, "states"))
         same_size(
             "the domain's dimension is",

@@ -85,6 +85,22 @@ def test_the_largest_ball_of_an_unbounded_or_empty_polytope_is_refused():
         linear_programs.chebyshev(np.array([[1.0], [-1.0]]), np.array([0.0, -1.0]))
 
 
+@pytest.mark.parametrize(
+    ("A", "b", "empty"),
+    [
+        ([[1.0, 0.0], [-1.0, 0.0]], [1.0, -2.0], True),
+        ([[1.0, 0.0], [-1.0, 0.0]], [1.0, -1.0], False),  # a line
+        ([[1.0, 0.0], [-1.0, 0.0]], [1.0, -1.0 - 1e-12], False),  # by less than programs tell
+        ([[0.0, 0.0]], [-1.0], True),
+        ([[1e9, 1e9], [-1e9, 0.0], [0.0, -1e9]], [-1.0, 0.0, 0.0], True),
+        ([[1.0, 0.0]], [1.0], False),
+        ([[1.0, 1e-9], [-1.0, 0.0]], [0.0, -1.0], False),  # far away there are points
+    ],
+)
+def test_what_is_said_to_be_empty_surely_is(A, b, empty):
+    assert linear_programs.is_empty(np.array(A), np.array(b)) == empty
+
+
 # Boxes around the origin against a box whose nearest facet is `gap` away: margins are known.
 @pytest.mark.parametrize("gap", [2.0, 0.25, 0.0, -0.5])
 @pytest.mark.parametrize("n", [1, 2, 3, 6])

@@ -1,5 +1,6 @@
 """Claims about polytopes: known shapes, sheared by integer matrices so that corners are exact."""
 
+import contextlib
 import itertools
 from fractions import Fraction
 from math import factorial
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.sets.unusable import ThinSetError
 
 DIMENSIONS = [1, 2, 3, 6]
 fractions = np.vectorize(Fraction, otypes=[object])
@@ -184,6 +186,28 @@ def test_an_empty_polytope_says_so(ask):
     for polytope in (strip, triangle):
         with pytest.raises(ValueError, match="is empty"):
             ask(polytope)
+
+
+@pytest.mark.parametrize("ask", [*UNANSWERED.values()][1:], ids=[*UNANSWERED.keys()][1:])
+def test_a_polytope_that_a_linear_program_calls_infeasible_is_not_said_to_be_empty(ask):
+    A = [[0.04278881913116914, 0, 0], [0, 88.75759809568211, 0], [0, 0, 1932.6254809933992]]
+    A += [[-1.416967214416641, 0, 0], [0, -995.8051198913226, 0], [0, 0, -54.792655654112764]]
+    A += [[2063.407565280635, 1209.9649586781413, 526.7145036912622]]
+    A += [[0.1355315913783207, -0.31707284467892216, -0.08470070074143014]]
+    b = [81.29697988440091, -248455.7037955008, -45033003.822574005, -2692.176863671695]
+    b += [2787518.6712358524, 1276750.7739225973, -11739842.594842771, 3118.7281105908028]
+    ends = [[Fraction(b[row]) / Fraction(A[row][i]) for i in range(3) for row in (i, i + 3)]]
+    points = itertools.product(*(ends[0][2 * i : 2 * i + 2] for i in range(3)))
+    exact = [[Fraction(a) for a in row] for row in A]
+    assert any(
+        all(
+            sum(a * x for a, x in zip(row, point, strict=True)) <= c
+            for row, c in zip(exact, b, strict=True)
+        )
+        for point in points
+    )
+    with contextlib.suppress(ThinSetError):  # a ValueError would say that there is no point
+        ask(rj.Polytope(A, b))
 
 
 @pytest.mark.parametrize("ask", UNANSWERED.values(), ids=UNANSWERED.keys())

@@ -187,3 +187,23 @@ def test_a_relay_whose_state_keeps_its_mode_is_decided_both_ways(side):
         ends[side, 0] = attained + (by if side else -by)
         verdict = rj.decide(thermostat_loop(), ROOM, LONG, safe=rj.Box(*ends))
         assert verdict.status.name == status
+
+
+@pytest.mark.costly
+def test_a_bound_is_closed_by_states_of_the_set_alone():
+    # two decisions that are nearly one: to win both by as much leads far out of the set
+    def f(x):
+        ahead, behind = x[0] - x[1] > 0, (1 + 1e-9) * x[1] - x[0] > 0
+        extra = 0.3 * (x[0] > 0.9) + 1e-3 * (ahead.astype(float) + behind)
+        return jnp.array([x[0] + x[1] + extra, 0.0 * x[1]])
+
+    plant = rj.AffinePlant(np.zeros((2, 2)), np.eye(2))
+    X0 = rj.Polytope([[1.0, 0.5], [0.5, 1.0], [-1.0, 0.0], [0.0, -1.0]], [1.05, 1.05, 1.0, 1.0])
+    loop = rj.ClosedLoop(plant, rj.Network(f, 2, 2))
+    proof = rj.reach(loop, X0, 1, rj.Template.box(2), samples=300).proof(1)
+    solved = np.array([each is rj.SolverStatus.SOLVED for each in proof.statuses])
+    ranges = np.repeat(proof.bounds[:2] + proof.bounds[2:], 1)
+    half = np.concatenate([ranges, ranges]) / 2
+    assert (np.asarray(proof.gaps) <= 1e-4 * half + 1e-9)[solved].all()
+    inside = X0.contains(np.asarray(proof.witness_states), 1e-9)
+    assert np.asarray(inside).all()

@@ -1,5 +1,7 @@
 """Claims about tubes as proofs: they hold for their own loop, set and start only."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -141,3 +143,52 @@ def test_64_bit_floats_may_be_on_in_a_scope_also_inside_jit():
     finally:
         jax.config.update("jax_enable_x64", True)
     np.testing.assert_allclose(bounds, expected, rtol=0, atol=1e-7)
+
+
+def edited_plant(gain):
+    """A user's plant before and after an edit of a constant in its equation."""
+
+    @jax.tree_util.register_dataclass
+    @dataclasses.dataclass(frozen=True)
+    class Tank(rj.AbstractPlant):
+        A: jax.Array
+        states, inputs, steps = 1, 1, None
+
+        def propagate(self, x, u, t=0, unit=None, w=None):
+            return gain * (self.A @ x) + np.array([[1.0]]) @ u
+
+    return rj.ClosedLoop(Tank(jnp.ones((1, 1))), rj.MLP.from_layers([([[0.0]], [0.0])]))
+
+
+class Gained(rj.AbstractActivation):
+    """A user's activation, with a number that is no leaf."""
+
+    def __init__(self, gain):
+        self.gain = gain
+
+    def propagate(self, y, unit):
+        return self.gain * unit(rj.ReLU(), y)
+
+
+def edited_activation(gain):
+    layers = [([[1.0]], [0.0]), ([[1.0]], [0.0])]
+    net = rj.MLP.from_layers(layers, activation=Gained(gain))
+    return rj.ClosedLoop(rj.AffinePlant([[0.5]], [[0.0]]), net)
+
+
+@pytest.mark.parametrize("edited", [edited_plant, edited_activation])
+def test_what_is_proved_is_of_the_equations_that_a_user_wrote_then(edited, tmp_path):
+    before, after, box = edited(0.5), edited(5.0), rj.Box([1.0], [2.0])
+    proved = rj.decide(before, box, 2, goal=rj.Box([0.0], [2.0]), samples=10)
+    tube = recursion(before, box, 1, rj.Template.box(1), samples=10)
+    assert proved.proved
+    proved.save(tmp_path / "kept.verdict")
+    tube.save(tmp_path / "kept.reach")
+    assert rj.load(
+        tmp_path / "kept.verdict", edited(0.5)
+    ).proved  # another class, the same equations
+    for name in ("kept.verdict", "kept.reach"):
+        with pytest.raises(ValueError, match="another one arrived"):
+            rj.load(tmp_path / name, after)
+    with pytest.raises(ValueError, match=TORN):
+        tube.replace(loop=after)

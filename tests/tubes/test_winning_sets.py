@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
+import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -187,3 +188,13 @@ def test_of_a_flat_domain_parts_are_of_what_is_wide():
     found = rj.winning_set(halves, domain, 1, safe=rj.Box([-1.0] * 2, [1.0] * 2), cells=8)
     assert "nan" not in str(found) + found._repr_html_()
     assert "50.00%" in str(found)
+
+
+def test_in_32_bits_nothing_is_said_of_a_state():
+    cell = rj.DecidedCell(np.zeros(1), np.ones(1), PROVED, 1.0)
+    found = rj.WinningSet(rj.Box([0.0], [1.0]), (cell,), jnp.zeros(32, jnp.uint8))
+    beside = np.array([1.0 + 1e-12])
+    assert not found.contains(beside)
+    for ask in (found.contains, found.excludes):
+        with jax.enable_x64(False), pytest.raises(RuntimeError, match="needs 64-bit floats"):
+            ask(beside)

@@ -152,7 +152,18 @@ def edited_plant(gain):
     @dataclasses.dataclass(frozen=True)
     class Tank(rj.AbstractPlant):
         A: jax.Array
-        states, inputs, steps = 1, 1, None
+
+        @property
+        def states(self):
+            return 1
+
+        @property
+        def inputs(self):
+            return 1
+
+        @property
+        def steps(self):
+            return None
 
         def propagate(self, x, u, t=0, unit=None, w=None):
             return gain * (self.A @ x) + np.array([[1.0]]) @ u

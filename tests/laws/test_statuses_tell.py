@@ -37,7 +37,12 @@ SOLVED = (
 """Loops whose gaps phases and cells close."""
 
 
-@each(rows=map(Case, SOLVED))
+@each(
+    rows=(
+        *map(Case, SOLVED),
+        *(Case("relu", "default", kind) for kind in ("polytope", "ellipsoid")),
+    )
+)
 def test_gaps_are_closed_by_default(case):
     """So bounds are as tight as is asked for: witnesses attain all but a ten-thousandth."""
     for k in range(1, HORIZON + 1):
@@ -58,6 +63,7 @@ def test_what_a_tube_says_of_its_ends_its_verdicts_and_tables_say(case):
     assert verdict.unsolved == open_ones
     table = case.tube.to_dataframe()
     assert [*table.status] == [status.name for status in ends]
+    assert case.method != "forms" or np.all(table.seconds > 0)
     np.testing.assert_array_equal(
         table.bound, np.concatenate([case.tube.proof(k).bounds for k in range(1, HORIZON + 1)])
     )

@@ -85,7 +85,12 @@ def test_without_time_sets_hold_and_none_says_that_more_was_done(case):
             assert status is not rj.SolverStatus.SOLVED or is_closed or case.X0.parts[1] is not None
 
 
-@each(lambda case: case.method in ("programs", "paper") and case.loop in ("relu", "varying"))
+@each(
+    lambda case: (
+        case.method in ("programs", "paper")
+        and case.loop.startswith(("relu", "varying", "disturbed"))
+    )
+)
 def test_programs_of_sets_that_are_not_flat_are_solved(case):
     if case.initial not in ("point", "flat", "thin"):
         for k in range(1, HORIZON + 1):

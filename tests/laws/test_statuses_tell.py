@@ -52,6 +52,13 @@ def test_gaps_are_closed_by_default(case):
         assert np.all(np.asarray(proof.gaps) <= room)
 
 
+@each(rows=[Case("car")])
+def test_what_cells_leave_open_is_less_than_a_quarter_of_what_is_reached(case):
+    for k in range(1, HORIZON + 1):
+        reached = np.ptp(case.runs[:, k], axis=0)
+        assert np.all(case.tube.sets[k].bounding_box().widths <= 1.25 * reached)
+
+
 @each()
 def test_what_a_tube_says_of_its_ends_its_verdicts_and_tables_say(case):
     ends = [status for k in range(1, HORIZON + 1) for status in case.tube.proof(k).statuses]

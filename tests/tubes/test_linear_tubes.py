@@ -93,6 +93,14 @@ def test_a_training_step_compiles_once_whatever_switches():
 
 
 @pytest.mark.costly
+def test_loops_whose_plants_and_input_boxes_differ_are_mapped_over():
+    loops, X0 = [closed_loop(random_loop(2, seed=seed)) for seed in range(3)], initial_set("box", 2)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loops)
+    values = jax.vmap(penalty, in_axes=(0, None))(stacked, X0)
+    np.testing.assert_allclose(values, [float(penalty(loop, X0)) for loop in loops], rtol=1e-9)
+
+
+@pytest.mark.costly
 def test_penalties_take_it():
     loop, X0, template = closed_loop(random_loop(2)), initial_set("box", 2), rj.Template.box(2)
     options = {"relaxation": rj.LinearBounds()}

@@ -1,5 +1,7 @@
 """Law: compiled, batched and plain code say the same, and other numbers compile nothing."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,6 +55,26 @@ def test_compiled_batched_and_plain_bounds_agree_and_one_compilation_serves_all(
     assert np.all(abs(found - plain) <= size)
     batch = jax.vmap(of)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *nets))
     assert np.all(abs(batch - plain) <= size)
+
+
+SMOOTH = (
+    *(Case(loop, "forms") for loop in ("car", "bell", "sigmoid", "traced")),
+    *(Case("sine, tanh", "forms", initial) for initial in ("point", "wide", "ellipsoid")),
+    Case("oscillator", "forms", "polytope"),
+)
+
+
+@each(rows=SMOOTH)
+@pytest.mark.costly
+def test_forms_are_those_of_the_host_whatever_loop_and_set_are_compiled(case):
+    """From a polytope they are no less: in compiled code the box around it is all that is known."""
+    of = functools.partial(limits, case)
+    found, plain = (np.asarray(each(case.closed_loop, case.X0)) for each in (jax.jit(of), of))
+    flat, _ = case.X0.parts
+    if flat is not None and flat.needs_programs:
+        assert np.all(found >= plain - 1e-12)
+    else:
+        np.testing.assert_allclose(found, plain, rtol=1e-9, atol=1e-12)
 
 
 @each(rows=[row for row in ROWS if row.method == "forms"][:6])

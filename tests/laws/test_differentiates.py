@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.cases import Case, each
+from tests.cases import BASIC, Case, each
 from tests.differences import central_difference, dot
 
 LENGTHS, STEPS = (1e-4, 1e-2), 2
@@ -80,6 +80,12 @@ def errors(case, seeds):
     return found
 
 
+ALONE = (
+    *(Case(loop) for loop in ("tank", "disturbed in a polytope", "disturbed in a ball")),
+    Case("relu", "forms", "far intersection"),
+)
+"""Rows of a kind that no other row is of: none of them is left to `-m long`."""
+
 SOME = (
     *(Case(loop, "forms") for loop in ("relu", "leaky", "hard", "residual", "disturbed in a ball")),
     *(Case(loop, "forms") for loop in ("inputs in a cube", "sine", "tank", "oscillator")),
@@ -92,6 +98,7 @@ SOME = (
     Case("relu", "programs", "simplex"),
     Case("relu", "programs", "ellipsoid", "ellipsoids"),
     Case("one state", "programs", "own", "mixed"),
+    *ALONE,
 )
 """Rows that are quick to compile."""
 
@@ -105,7 +112,7 @@ REST = [
 
 
 @pytest.mark.costly
-@each(rows=SOME, every=2)
+@each(rows=SOME, basic=(*BASIC, *ALONE), every=2)
 def test_a_derivative_is_the_difference(case):
     found = errors(case, range(2))
     assert found, "no generic point"

@@ -107,6 +107,9 @@ def test_what_is_no_number_is_refused(case):
             garbage.flat[garbage.size // 2] = bad
             with pytest.raises(ValueError, match=rf"{name}.*(finite|NaN)"):
                 proof.recheck(garbage)
+            if not isinstance(proof, rj.BranchCertificate):  # forms bound its facets as well
+                with pytest.raises(ValueError, match=rf"{name}.*(finite|NaN)"):
+                    proof.replace(**{name: garbage}).recheck()
 
 
 @each()

@@ -23,6 +23,8 @@ def test_a_tube_is_read_as_it_was(case, tmp_path):
     path = tmp_path / "tube.reach"
     again = read(path, case.tube, None if case.of.kept else case.closed_loop)
     assert alike(unclaimed(again), unclaimed(case.tube))
+    ends = {status for k in range(1, HORIZON + 1) for status in again.proof(k).statuses}
+    assert ends == {rj.SolverStatus.RECHECKED}
     assert str(again) == str(case.tube)
     kinds = [[type(proof) for proof in tube.certificates] for tube in (again, case.tube)]
     assert kinds[0] == kinds[1]

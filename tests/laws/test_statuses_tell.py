@@ -37,7 +37,12 @@ SOLVED = (
 """Loops whose gaps phases and cells close."""
 
 
-@each(rows=map(Case, SOLVED))
+@each(
+    rows=(
+        *map(Case, SOLVED),
+        *(Case("relu", "default", kind) for kind in ("polytope", "ellipsoid")),
+    )
+)
 def test_gaps_are_closed_by_default(case):
     """So bounds are as tight as is asked for: witnesses attain all but a ten-thousandth."""
     for k in range(1, HORIZON + 1):
@@ -45,6 +50,13 @@ def test_gaps_are_closed_by_default(case):
         assert set(proof.statuses) == {rj.SolverStatus.SOLVED}
         room = HALF * case.options.get("gap", 1e-4) * ranges(case, k) + 1e-9
         assert np.all(np.asarray(proof.gaps) <= room)
+
+
+@each(rows=[Case("car")])
+def test_what_cells_leave_open_is_less_than_a_quarter_of_what_is_reached(case):
+    for k in range(1, HORIZON + 1):
+        reached = np.ptp(case.runs[:, k], axis=0)
+        assert np.all(case.tube.sets[k].bounding_box().widths <= 1.25 * reached)
 
 
 @each()
@@ -58,6 +70,7 @@ def test_what_a_tube_says_of_its_ends_its_verdicts_and_tables_say(case):
     assert verdict.unsolved == open_ones
     table = case.tube.to_dataframe()
     assert [*table.status] == [status.name for status in ends]
+    assert case.method != "forms" or np.all(table.seconds > 0)
     np.testing.assert_array_equal(
         table.bound, np.concatenate([case.tube.proof(k).bounds for k in range(1, HORIZON + 1)])
     )
@@ -79,7 +92,12 @@ def test_without_time_sets_hold_and_none_says_that_more_was_done(case):
             assert status is not rj.SolverStatus.SOLVED or is_closed or case.X0.parts[1] is not None
 
 
-@each(lambda case: case.method in ("programs", "paper") and case.loop in ("relu", "varying"))
+@each(
+    lambda case: (
+        case.method in ("programs", "paper")
+        and case.loop.startswith(("relu", "varying", "disturbed"))
+    )
+)
 def test_programs_of_sets_that_are_not_flat_are_solved(case):
     if case.initial not in ("point", "flat", "thin"):
         for k in range(1, HORIZON + 1):

@@ -39,6 +39,19 @@ def checked(case, verdict, **asked):
         bool(verdict)
 
 
+def certified(verdict, X0):
+    """Certificates prove the signs of what they are of; witnesses begin in the initial set."""
+    for (name, k), proof in verdict.certificates.items():
+        bounds = np.asarray(proof.bounds)
+        assert bounds.max() < 0 or (bounds.max() == 0 and not proof.least)
+        assert k >= 1
+        for value, state in zip(proof.witnesses, proof.witness_states, strict=True):
+            assert value <= bounds.max()
+            assert X0.contains(state)
+        assert verdict.margins[name][k] >= 0
+        np.testing.assert_allclose(proof.recheck(), bounds, atol=1e-12)
+
+
 def genuine(case, example, goal=None, safe=None, avoid=()):
     """The loop itself runs so from its initial set, and breaks what is asked for."""
     loop, start, states = case.closed_loop, case.of.start, np.asarray(example.states)
@@ -113,3 +126,4 @@ def test_verdicts_change_where_bounds_are(case):
             for verdict in verdicts(case, **asked):
                 assert verdict.status.name == status
                 checked(case, verdict, **asked)
+                certified(verdict, case.X0)

@@ -82,6 +82,7 @@ def test_a_larger_gap_leaves_no_more_than_that_open(case):
         ranges = np.ptp(runs[:, k] @ np.asarray(tube.template.directions).T, axis=0) / 2
         assert np.all(np.asarray(loose.proof(k).gaps) <= 0.31 * ranges)
         assert np.all(loose.sets[k].b >= np.asarray(tube.sets[k].b) - 2e-4 * ranges)
+        assert np.sum(loose.proof(k).nodes) <= np.sum(tube.proof(k).nodes)
     assert above_samples(loose) >= -1e-12
 
 

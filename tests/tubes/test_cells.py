@@ -45,6 +45,16 @@ def tube(request) -> rj.ReachTube:
 
 
 @pytest.mark.costly
+def test_cells_prove_no_less_than_one_cell_does(tube):
+    for t in (1, 2, 3):
+        proof = tube.proof(t)
+        assert isinstance(proof, rj.CellCertificate)
+        assert 1 <= proof.cells <= 24
+        assert (proof.recheck() == proof.bounds).all()
+        assert (proof.recheck([-1]) >= proof.bounds - 1e-12).all()
+
+
+@pytest.mark.costly
 def test_a_gap_that_may_stay_open_takes_fewer_cells():
     given = loop_of(2), STARTS["two"], 3, rj.Template.box(2)
     few, many = (rj.reach(*given, gap=gap).proof(3).cells for gap in (0.1, 1e-4))

@@ -6,6 +6,7 @@ import pytest
 
 import reachjax as rj
 from tests.closed_loops import autonomous, initial_set, switching_loop
+from tests.laws.test_verdicts_tell import certified
 
 PROVED, REFUTED, UNKNOWN = (
     rj.VerdictStatus.PROVED,
@@ -70,15 +71,7 @@ def checked(verdict, loop, X0, start=0):
         np.testing.assert_allclose(example.states, run, atol=1e-9)
         assert example.violation >= 0
         assert verdict.simulated[example.requirement][example.time] <= 1e-12
-    for (name, k), proof in verdict.certificates.items():
-        bounds = np.asarray(proof.bounds)
-        assert bounds.max() < 0 or (bounds.max() == 0 and not proof.least)
-        assert k >= 1
-        for value, state in zip(proof.witnesses, proof.witness_states, strict=True):
-            assert value <= bounds.max()
-            assert X0.contains(state)
-        assert verdict.margins[name][k] >= 0
-        np.testing.assert_allclose(proof.recheck(), bounds, atol=1e-12)
+    certified(verdict, X0)
 
 
 @pytest.mark.parametrize(("X0", "required", "status"), KNOWN.values(), ids=KNOWN.keys())

@@ -8,6 +8,7 @@ import pytest
 import reachjax as rj
 from experiments.tightness.exact import exact_tube
 from reachjax.proofs.branches import Rung
+from tests.cases import Case
 from tests.closed_loops import initial_set
 from tests.differences import PARTS, along, relative_error
 from tests.input_polytopes import SETS, box_facets, polytope_loop
@@ -32,6 +33,10 @@ def often_projected(loop):
     states = np.asarray(X0.sample(jax.random.key(0), 500))
     given, projected = (np.asarray(jax.vmap(f)(states)) for f in (loop.controller, loop.input))
     return np.mean(np.any(abs(given - projected) > 1e-9, axis=1))
+
+
+def test_what_laws_say_of_a_pentagon_is_of_inputs_that_are_often_projected():
+    assert 0.2 < often_projected(Case("inputs in a pentagon").closed_loop) < 1
 
 
 @pytest.mark.parametrize("name", SETS)

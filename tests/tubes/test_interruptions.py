@@ -113,3 +113,12 @@ def test_bad_continuations_are_named(task, steps, options, error, match):
     tube = rj.reach(*task, 1, rj.Template.box(2), rj.LinearBounds())
     with pytest.raises(error, match=match):
         tube.extended(steps, **options)
+
+
+def test_a_time_varying_loop_goes_on_where_it_stopped():
+    A = np.stack([np.eye(2) * factor for factor in (0.5, 2.0, 0.25, 1.0)])
+    plant = rj.AffinePlant(A, np.zeros((4, 2, 1)))
+    loop = rj.ClosedLoop(plant, rj.MLP.from_layers(he_network((2, 3, 1), 0)))
+    X0 = rj.Box([0.0, 0.0], [1.0, 2.0])
+    tube = rj.reach(loop, X0, 1, rj.Template.box(2), start=1)
+    assert same(tube.extended(2), rj.reach(loop, X0, 3, rj.Template.box(2), start=1))

@@ -9,7 +9,7 @@ import reachjax as rj
 from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
 from tests.networks import directions
 
-HORIZON = 5
+HORIZON, START = 5, 2
 ROUNDING = 1e-13
 """Of what is simulated, as a part of its size."""
 
@@ -25,6 +25,16 @@ def assert_holds(tube, start=0):
         slack = ROUNDING * abs(values).max()
         assert (values <= np.asarray(tube.sets[t].b) + slack).all()
         assert (tube.proof(t).gaps >= -slack).all()
+
+
+def test_plants_may_vary_in_time_without_an_input_box():
+    loop = closed_loop(random_loop(2, boxed=False, steps=START + HORIZON))
+    given = initial_set("box", 2), rj.Template.octagonal(2)
+    tube = tube_of(loop, *given, start=START)
+    assert_holds(tube)
+    tight = rj.reach(loop, given[0], HORIZON, given[1], start=START)
+    for one, other in zip(tube.sets[1:], tight.sets[1:], strict=True):
+        assert (one.b >= other.b - 1e-7).all()
 
 
 @pytest.mark.parametrize("width", [0.0, 1e-12])
@@ -80,6 +90,14 @@ def test_a_training_step_compiles_once_whatever_switches():
         assert np.isfinite(value)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
     assert len(traced) == 1
+
+
+@pytest.mark.costly
+def test_loops_whose_plants_and_input_boxes_differ_are_mapped_over():
+    loops, X0 = [closed_loop(random_loop(2, seed=seed)) for seed in range(3)], initial_set("box", 2)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loops)
+    values = jax.vmap(penalty, in_axes=(0, None))(stacked, X0)
+    np.testing.assert_allclose(values, [float(penalty(loop, X0)) for loop in loops], rtol=1e-9)
 
 
 @pytest.mark.costly

@@ -64,6 +64,16 @@ def test_facets_tell_a_program_what_the_ellipsoid_does_not():
 
 
 @pytest.mark.costly
+def test_units_that_never_switch_may_be_kept():
+    loop, X0 = case(2, 1, hidden=(3,))
+    relaxation = rj.LocalBounds(remove_stable=False)
+    tube = recursion(loop, X0, 2, rj.MixedTemplate(FACETS[2]), relaxation)
+    reached = tube.simulate(2000)
+    for t in (1, 2):
+        assert bool(tube.sets[t].contains(reached[:, t], 1e-9).all())
+
+
+@pytest.mark.costly
 def test_flat_images_and_flat_parts_hold():
     plant = rj.AffinePlant([[1.0, 1.0], [2.0, 2.0]], [[0.0], [0.0]])
     loop = rj.ClosedLoop(plant, rj.MLP.from_layers([([[0.0, 0.0]], [0.0])]))

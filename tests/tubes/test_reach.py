@@ -92,6 +92,13 @@ def test_an_affine_loop_without_units_is_exact(n_x):
 
 
 @pytest.mark.costly
+def test_one_step_equals_the_first_step_of_a_tube(planar):
+    following, certificate = one_step(planar.loop, planar.sets[0], planar.template)
+    np.testing.assert_array_equal(following.b, planar.sets[1].b)
+    assert certificate.gaps.shape == (len(planar.template),)
+
+
+@pytest.mark.costly
 def test_a_tube_continued_from_its_last_set_is_the_longer_tube(planar):
     short = recursion(planar.loop, planar.sets[0], 2, planar.template)
     more = recursion(planar.loop, short.sets[2], 1, planar.template)

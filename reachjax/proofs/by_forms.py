@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.units import UnboundedError
 from reachjax.numerics.checks import floats_of, require_double_precision
 from reachjax.numerics.pytrees import pytree, static
 from reachjax.programs.unrolled import unrolled
 from reachjax.proofs.certificates import AbstractProof, told
-from reachjax.sets import AbstractSet
+from reachjax.sets import AbstractSet, Box
 from reachjax.sets.cells import from_tree
 
 
@@ -49,7 +50,8 @@ class LinearCertificate(AbstractProof):
         """Prove the offsets anew, step by step from the initial set, with these or other slopes.
 
         Sound for any slopes: where two lines of this slope must lie to hold a unit between them is
-        found again on the intervals that are proved on the way. Infinite where they overflow.
+        found again on the intervals that are proved on the way. Infinite where they overflow, or
+        where a unit has no bounds on them.
 
         Raises:
             ValueError: the slopes contain NaN or infinity, or have another shape.
@@ -75,8 +77,24 @@ class LinearCertificate(AbstractProof):
             )
         directions = np.broadcast_to(self.directions, (self.k, *self.directions.shape))
         box = self.X0.bounding_box()
-        *_, last = unrolled(self.loop, self.X0, box, directions, self.start, chosen)
-        return np.where(np.isnan(last.offsets), np.inf, last.offsets)
+        return _proved(self.loop, self.X0, box, directions, self.start, chosen)
+
+
+def _proved(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[np.ndarray, "k f n_x"],
+    start: int,
+    slopes: Float[np.ndarray, "k units"] | None = None,
+    most: int = 1,
+) -> Float[np.ndarray, " f"]:
+    """The offsets of the last step; infinite where they overflow or a unit has no bounds."""
+    try:
+        *_, last = unrolled(loop, X0, box, directions, start, slopes, most=most)
+    except UnboundedError:
+        return np.full(len(directions[-1]), np.inf)
+    return np.where(np.isnan(last.offsets), np.inf, last.offsets)
 
 
 @pytree
@@ -124,7 +142,7 @@ class CellCertificate(AbstractProof):
     def recheck(self, axes: Int[np.ndarray, " nodes"] | None = None) -> Float[np.ndarray, " f"]:
         """Prove the offsets anew, cell by cell, or by forms over other cells.
 
-        Infinite where numbers overflow.
+        Infinite where numbers overflow, or where a unit has no bounds over a cell.
 
         Raises:
             ValueError: the axes are no tree: its cells would leave something out.
@@ -149,7 +167,6 @@ class CellCertificate(AbstractProof):
         found = []
         for cell, own in zip(cells, proofs, strict=True):
             given = self.loop, cell.part, cell.box, directions, self.start
-            *_, last = unrolled(*given, most=self.ways)
-            bounds = np.where(np.isnan(last.offsets), np.inf, last.offsets)
+            bounds = _proved(*given, most=self.ways)
             found.append(np.fmin(bounds, own[-1].recheck()) if own else bounds)
         return np.max(found, axis=0)

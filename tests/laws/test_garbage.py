@@ -2,6 +2,7 @@
 
 import inspect
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -124,3 +125,16 @@ def test_another_shape_is_refused(case):
         if name == "axes" or np.shape(each_bad) != given.shape:
             with pytest.raises(ValueError, match=rf"{name} must"):
                 proof.recheck(each_bad)
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_slopes_by_which_a_unit_has_no_bounds_prove_nothing(sampled):
+    def f(x, u):
+        return 0.5 * x / (2.0 + u)
+
+    plant = rj.SampledPlant(f, 1, 1, 0.5) if sampled else rj.NonlinearPlant(f, 1, 1)
+    loop = rj.ClosedLoop(plant, rj.Network(jnp.tanh, 1, 1))
+    X0, box = rj.Box([0.0], [0.5]), rj.Template.box(1)
+    proof = rj.reach(loop, X0, 2, box, rj.LinearBounds()).proof(2)
+    assert np.isfinite(proof.recheck()).all()
+    assert np.isposinf(proof.recheck(1e3 + 0 * proof.slopes)).all()

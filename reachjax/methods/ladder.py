@@ -366,7 +366,7 @@ class Ladder:
 
     def _settled(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "k s"]:
         """The scenarios beside columns where what is tied is won, those that there are."""
-        moved = self._scenarios_at(self.horizon.settled(columns))
+        moved = self._scenarios.clipped(self._scenarios_at(self.horizon.settled(columns)))
         return moved[np.asarray(self._scenarios.nearly_contains(padded(moved)))[: len(moved)]]
 
     def _scenarios_at(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c s"]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from reachjax.loops.batches import trajectories
 from reachjax.loops.closed_loop import ClosedLoop, Scenario, split
-from reachjax.loops.draws import framed
+from reachjax.loops.draws import Frame, framed
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.sets import AbstractSet
 
@@ -315,12 +315,12 @@ class Scenarios(Replaceable):
         if not self._draws or not drawn:
             return states
         found: list[list[np.ndarray]] = [[] for _ in self._draws]
+        frames = [_frames(draws, len(drawn)) for draws in self._draws]
         for k, values in enumerate(drawn):
             done = 0
             for which, draws in reversed(list(enumerate(self._draws))):
                 n = draws.middles.shape[1]
-                frame = framed(draws.at_start, draws.start + k)
-                found[which].append(frame.values(values[:, done : done + n]))
+                found[which].append(frames[which][k].values(values[:, done : done + n]))
                 done += n
         return self.joined(states, *(np.stack(each, axis=1) for each in found))
 
@@ -328,20 +328,22 @@ class Scenarios(Replaceable):
         """The values of the units of each step in a scenario, noise first."""
         _, *drawn = self.split(scenario)
         given = [
-            (draws, points)
+            (_frames(draws, self.steps), points)
             for draws, points in zip((self.disturbances, self.noises), drawn, strict=True)
             if draws is not None
         ]
         return [
-            np.concatenate(
-                [
-                    framed(draws.at_start, draws.start + k).inverse(points[k])
-                    for draws, points in reversed(given)
-                ]
-            )
+            np.concatenate([frames[k].inverse(points[k]) for frames, points in reversed(given)])
             for k in range(self.steps)
             if given
         ]
+
+
+def _frames(draws: Draws, steps: int) -> list[Frame]:
+    """What is drawn from at each step; a set that stays the same is framed once."""
+    if draws.at_start.steps is None:
+        return [framed(draws.at_start)] * steps
+    return [framed(draws.at_start, draws.start + k) for k in range(steps)]
 
 
 @jax.jit

@@ -1,5 +1,6 @@
 """The library's loops from the arrays of `tests.networks`."""
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -39,6 +40,33 @@ def autonomous(A: Any, input_box: rj.Box | None = None) -> rj.ClosedLoop:
     n_x = len(A)
     net = rj.MLP.from_layers([(np.zeros((1, n_x)), np.zeros(1))])
     return rj.ClosedLoop(rj.AffinePlant(A, np.zeros((n_x, 1))), net, input_box)
+
+
+def own_plant(gain: float = 1.0) -> Any:
+    """A class of a user's for `x+ = gain A x + B u`, whose arrays are not those of the proofs."""
+
+    @jax.tree_util.register_dataclass
+    @dataclasses.dataclass(frozen=True)
+    class OwnPlant(rj.AbstractPlant):
+        A: jax.Array
+        B: jax.Array
+
+        @property
+        def states(self):
+            return len(self.A)
+
+        @property
+        def inputs(self):
+            return self.B.shape[1]
+
+        @property
+        def steps(self):
+            return None
+
+        def propagate(self, x, u, t=0, unit=None, w=None):
+            return gain * (self.A @ x) + self.B @ u
+
+    return OwnPlant
 
 
 def double_integrator() -> rj.ClosedLoop:

@@ -190,7 +190,7 @@ def tubes_of(
 ) -> list[rj.ReachTube]:
     """Boxes at samples by forms, from each cell that a proof takes, else from the whole set.
 
-    None where forms have no bounds, or take longer than a decision may.
+    Nothing where forms have no bounds, or take longer than a decision may.
     """
     cells = [rj.Box(cell.lower, cell.upper) for cell in verdict.cells if verdict.proved]
     template, until = rj.Template.box(loop.states), time.monotonic() + settings.limit

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
-from reachjax.methods.witnesses import Simulated, padded
+from reachjax.methods.witnesses import Simulated, in_blocks
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.rounding import namespace
 from reachjax.programs.affine import AffineForms
@@ -296,9 +296,10 @@ class Ladder:
             def attained(columns: list[np.ndarray], number: int = number) -> float:
                 if target.values is None:
                     return -np.inf
-                begun = self._scenarios_at(np.array(columns))
+                tried = np.array(columns)
+                begun = self._scenarios_at(tried)
                 if self._jumps:
-                    begun = np.concatenate([self._settled(np.array(columns)), begun])
+                    begun = np.concatenate([self._settled(tried), begun])
                 ended.extend(begun)
                 steps = len(horizon.steps)
                 after = self._scenarios.runs(self._loop, begun, steps, self._t)[:, -1]
@@ -367,7 +368,7 @@ class Ladder:
     def _settled(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "k s"]:
         """The scenarios beside columns where what is tied is won, those that there are."""
         moved = self._scenarios.clipped(self._scenarios_at(self.horizon.settled(columns)))
-        return moved[np.asarray(self._scenarios.nearly_contains(padded(moved)))[: len(moved)]]
+        return moved[in_blocks(self._scenarios.nearly_contains, moved)]
 
     def _scenarios_at(self, columns: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "c s"]:
         """The scenarios that columns stand for.

@@ -12,8 +12,9 @@ tolerance, and a few steps remove that.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -113,7 +114,7 @@ def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, 
         states = states.copy()
         states[::2] = (middle + PULL * (surface[:count] - middle))[::2]
     states = np.concatenate([jax.device_get(X0.corners()), states])
-    moved, inside = jax.device_get(_brought_inside(X0, padded(states)))
+    moved, inside = jax.device_get(_brought_inside(X0, _padded(states)))
     states, inside = moved[: len(states)], inside[: len(states)]
     return states[inside] if inside.any() else states  # a flat set contains none exactly
 
@@ -123,9 +124,14 @@ def _blocks(count: int) -> int:
     return -(-count // BLOCK) * BLOCK
 
 
-def padded(points: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "b n"]:
+def _padded(points: Float[np.ndarray, "c n"]) -> Float[np.ndarray, "b n"]:
     """The same points and some of them again, so that there are few numbers of them."""
     return np.resize(points, (_blocks(len(points)), points.shape[1]))
+
+
+def in_blocks(function: Callable[[Any], Any], points: Float[np.ndarray, "c n"]) -> np.ndarray:
+    """What a function says of each point, of as many at once as it is compiled for."""
+    return np.asarray(function(_padded(points)))[: len(points)]
 
 
 @jax.jit
@@ -257,7 +263,7 @@ class Simulations:
 
     def _inside(self, scenarios: Float[np.ndarray, "m s"]) -> Bool[np.ndarray, " m"]:
         """Which scenarios have every part in its set."""
-        return np.asarray(self._all.contains(padded(scenarios)))[: len(scenarios)]
+        return in_blocks(self._all.contains, scenarios)
 
     def _values(self, k: int, region: AbstractSet) -> Float[np.ndarray, "c m"]:
         """What a set bounds, at each trajectory after `k` steps: facets in numpy."""
@@ -265,7 +271,7 @@ class Simulations:
         flat, curved = region.parts
         values = [] if flat is None else [points @ np.asarray(flat.facets[0]).T]
         if curved is not None:
-            values.append(np.asarray(curved.bounded_values(padded(points)))[: len(points)])
+            values.append(in_blocks(curved.bounded_values, points))
         return np.concatenate(values, axis=1)
 
     def attained(

@@ -75,6 +75,11 @@ DATA = str, bytes, int, float, complex, type(None), np.ndarray, np.generic, jax.
 PACKAGE = __name__.partition(".")[0]
 
 
+def is_own(module: str) -> bool:
+    """Whether a module is of this package."""
+    return module.partition(".")[0] == PACKAGE
+
+
 def written_elsewhere(value: Any) -> bool:
     """Whether a class that is not of this package, or a function, is among the parts of a tree.
 
@@ -87,7 +92,7 @@ def written_elsewhere(value: Any) -> bool:
         return any(map(written_elsewhere, value.values()))
     if isinstance(value, (*DATA, jax.ShapeDtypeStruct)):
         return False
-    if kind.__module__.partition(".")[0] != PACKAGE:
+    if not is_own(kind.__module__):
         return True
     fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
     return any(written_elsewhere(getattr(value, field.name)) for field in fields)

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import AnnotationError, jaxtyped
 
 from reachjax.numerics.archives import UnreadableError, digest, read_archive, write_archive
-from reachjax.numerics.pytrees import unchecked
+from reachjax.numerics.pytrees import PACKAGE, is_own, unchecked
 
 
 def require_structure(kind: type, fields: dict[str, Any]) -> None:
@@ -120,7 +120,6 @@ def _told(hint: Any) -> str:
 VERSION = 1
 """The version of the format: files of another one are refused."""
 
-PACKAGE = __name__.partition(".")[0]
 SEAL = "seal"
 """A field with a hash of all others, which differs where another version writes them otherwise."""
 
@@ -233,7 +232,7 @@ def _name(kind: type) -> str:
     Raises:
         UnstorableError: it is another one.
     """
-    if kind.__module__.partition(".")[0] != PACKAGE:
+    if not is_own(kind.__module__):
         raise UnstorableError(f"{kind.__qualname__} of {kind.__module__} cannot be stored")
     return f"{kind.__module__}:{kind.__qualname__}"
 
@@ -243,7 +242,7 @@ def _class(name: str) -> Any:
     if not isinstance(name, str):
         raise ValueError(f"it names a class by {name!r:.60}")
     module, _, path = name.partition(":")
-    if module.partition(".")[0] != PACKAGE:
+    if not is_own(module):
         raise ValueError(f"it names {name}, which is not of {PACKAGE}")
     try:
         found = importlib.import_module(_moved(module))
@@ -253,7 +252,7 @@ def _class(name: str) -> Any:
         raise ValueError(f"it names {name}, which this {PACKAGE} does not have") from None
     if not isinstance(found, type):
         raise ValueError(f"it names {name}, which is no class")
-    if found.__module__.partition(".")[0] != PACKAGE or found.__qualname__ != path:
+    if not is_own(found.__module__) or found.__qualname__ != path:
         raise ValueError(f"it names {name}, which is not of {PACKAGE}")
     return found
 

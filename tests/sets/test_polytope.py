@@ -196,8 +196,8 @@ def test_a_polytope_that_a_linear_program_calls_infeasible_is_not_said_to_be_emp
     A += [[0.1355315913783207, -0.31707284467892216, -0.08470070074143014]]
     b = [81.29697988440091, -248455.7037955008, -45033003.822574005, -2692.176863671695]
     b += [2787518.6712358524, 1276750.7739225973, -11739842.594842771, 3118.7281105908028]
-    ends = [[Fraction(b[row]) / Fraction(A[row][i]) for i in range(3) for row in (i, i + 3)]]
-    points = itertools.product(*(ends[0][2 * i : 2 * i + 2] for i in range(3)))
+    ends = [[Fraction(b[row]) / Fraction(A[row][i]) for row in (i, i + 3)] for i in range(3)]
+    points = itertools.product(*ends)
     exact = [[Fraction(a) for a in row] for row in A]
     assert any(
         all(

@@ -1,6 +1,5 @@
 """Tubes from files are those that were written, and other files are refused."""
 
-import dataclasses
 import json
 import subprocess
 import sys
@@ -15,7 +14,7 @@ import pytest
 import reachjax as rj
 from reachjax.numerics import archives, storage
 from reachjax.programs.affine import AffineForms
-from tests.closed_loops import closed_loop, random_loop
+from tests.closed_loops import closed_loop, own_plant, random_loop
 from tests.laws.changes import unclaimed
 
 BOX = rj.Template.box(2)
@@ -132,32 +131,8 @@ def test_a_bar_must_pass_on_all_steps(tube, path):
         rj.load(path, recheck=True, progress=lambda steps: list(steps)[1:])
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class OwnPlant(rj.AbstractPlant):
-    """A plant of a class that a user wrote, whose arrays are not those of the proofs."""
-
-    A: jax.Array
-    B: jax.Array
-
-    @property
-    def states(self):
-        return 2
-
-    @property
-    def inputs(self):
-        return 1
-
-    @property
-    def steps(self):
-        return None
-
-    def propagate(self, x, u, t=0, unit=None, w=None):
-        return self.A @ x + self.B @ u
-
-
 def test_a_loop_with_a_plant_of_its_own_is_asked_for_again(X0, path):
-    plant = OwnPlant(jnp.array([[0.5, 0.1], [0.2, 0.7]]), jnp.array([[1.0], [0.5]]))
+    plant = own_plant()(jnp.array([[0.5, 0.1], [0.2, 0.7]]), jnp.array([[1.0], [0.5]]))
     loop = rj.ClosedLoop(plant, curved().controller)
     tube = rj.reach(loop, X0, 2, BOX)
     tube.save(path)

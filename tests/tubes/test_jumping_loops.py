@@ -202,8 +202,7 @@ def test_a_bound_is_closed_by_states_of_the_set_alone():
     loop = rj.ClosedLoop(plant, rj.Network(f, 2, 2))
     proof = rj.reach(loop, X0, 1, rj.Template.box(2), samples=300).proof(1)
     solved = np.array([each is rj.SolverStatus.SOLVED for each in proof.statuses])
-    ranges = np.repeat(proof.bounds[:2] + proof.bounds[2:], 1)
-    half = np.concatenate([ranges, ranges]) / 2
+    half = np.tile(proof.bounds[:2] + proof.bounds[2:], 2) / 2
     assert (np.asarray(proof.gaps) <= 1e-4 * half + 1e-9)[solved].all()
     inside = X0.contains(np.asarray(proof.witness_states), 1e-9)
     assert np.asarray(inside).all()

@@ -1,14 +1,12 @@
 """Claims about tubes as proofs: they hold for their own loop, set and start only."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import reachjax as rj
-from tests.closed_loops import recursion
+from tests.closed_loops import own_plant, recursion
 from tests.networks import he_network
 from tests.numerics.test_checks import aligned
 
@@ -147,28 +145,8 @@ def test_64_bit_floats_may_be_on_in_a_scope_also_inside_jit():
 
 def edited_plant(gain):
     """A user's plant before and after an edit of a constant in its equation."""
-
-    @jax.tree_util.register_dataclass
-    @dataclasses.dataclass(frozen=True)
-    class Tank(rj.AbstractPlant):
-        A: jax.Array
-
-        @property
-        def states(self):
-            return 1
-
-        @property
-        def inputs(self):
-            return 1
-
-        @property
-        def steps(self):
-            return None
-
-        def propagate(self, x, u, t=0, unit=None, w=None):
-            return gain * (self.A @ x) + np.array([[1.0]]) @ u
-
-    return rj.ClosedLoop(Tank(jnp.ones((1, 1))), rj.MLP.from_layers([([[0.0]], [0.0])]))
+    plant = own_plant(gain)(jnp.ones((1, 1)), jnp.ones((1, 1)))
+    return rj.ClosedLoop(plant, rj.MLP.from_layers([([[0.0]], [0.0])]))
 
 
 class Gained(rj.AbstractActivation):
@@ -195,9 +173,8 @@ def test_what_is_proved_is_of_the_equations_that_a_user_wrote_then(edited, tmp_p
     assert proved.proved
     proved.save(tmp_path / "kept.verdict")
     tube.save(tmp_path / "kept.reach")
-    assert rj.load(
-        tmp_path / "kept.verdict", edited(0.5)
-    ).proved  # another class, the same equations
+    same = edited(0.5)  # another class, the same equations
+    assert rj.load(tmp_path / "kept.verdict", same).proved
     for name in ("kept.verdict", "kept.reach"):
         with pytest.raises(ValueError, match="another one arrived"):
             rj.load(tmp_path / name, after)

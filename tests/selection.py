@@ -23,7 +23,7 @@ ELSEWHERE = (
 )
 """Claims about experiments, notebooks and site, and comparisons with a library of `[dev]`."""
 
-OTHERS = 16
+OTHERS = 2
 """So many other cases of a claim are taken at most, all over the range of its cases."""
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +27,10 @@ from reachjax.verdicts.verdict import Counterexample
 
 SUSPECTS = 5
 """So many of the worst trajectories of each requirement are examined with their rounding."""
+
+AMONG = 32
+"""Of loops that jump so many are looked at: where numbers that are compared are equal, as at the
+corners of a set of choices, rounding decides, and others are examined before."""
 
 TOLERATED = 16
 """A simulated state may be beside the enclosure of its step by so many widths of that: rounding of
@@ -53,9 +58,9 @@ class Suspect(NamedTuple):
     states: np.ndarray
 
 
-def suspects(item: Requirement, rooms: np.ndarray, runs: Runs) -> list[Suspect]:
+def suspects(loop: ClosedLoop, item: Requirement, rooms: np.ndarray, runs: Runs) -> list[Suspect]:
     """The worst of some runs, of which these are the rooms `(c,)`."""
-    worst = np.argsort(rooms)[:SUSPECTS]
+    worst = np.argsort(rooms, kind="stable")[: AMONG if loop.jumps else SUSPECTS]
     return [Suspect(float(rooms[k]), item, *runs.some(k)) for k in worst if rooms[k] <= 0]
 
 
@@ -68,7 +73,7 @@ def counterexample(
         return None
     scenarios = Scenarios.of(loop, X0, len(ordered[0].states) - 1, start)
     on_host = in_numpy(loop)
-    for room, item, scenario, states in ordered:
+    for room, item, scenario, states in _those_that_are_known_first(on_host, ordered, start):
         if not scenarios.surely_contains(scenario):
             scenario = _moved_inwards(scenarios, scenario)
             if not scenarios.surely_contains(scenario):
@@ -116,6 +121,28 @@ def _moved_inwards(
         return scenario
     middle = scenarios.middle(states.mean(axis=0))
     return middle + (1 - INWARDS) * (scenario - middle)
+
+
+def _those_that_are_known_first(
+    loop: ClosedLoop, ordered: list[Suspect], start: int
+) -> Iterator[Suspect]:
+    """Suspects on whose trajectories no numbers that are compared are equal, then the others.
+
+    Of each of the two `SUSPECTS` of a requirement at most.
+    """
+    later, counts = list[Suspect](), Counter[tuple[bool, str, int]]()
+    for suspect in ordered:
+        _, item, scenario, states = suspect
+        if counts[False, item.name, item.time] == SUSPECTS:
+            continue
+        closest = closest_decision(loop, states[: item.time + 1], loop.split(scenario), start)
+        tied = closest is not None and not closest > 0
+        counts[tied, item.name, item.time] += 1
+        if not tied:
+            yield suspect
+        elif counts[True, item.name, item.time] <= SUSPECTS:
+            later.append(suspect)
+    yield from later
 
 
 def closest_decision(

@@ -126,7 +126,7 @@ class Findings:
                 self._simulated[item.name],
             )
             row[item.time] = np.fmin(row[item.time], rooms.min())
-            found += suspects(item, rooms, runs)
+            found += suspects(self._on_host, item, rooms, runs)
         self.example = self.example or counterexample(self._loop, self._X0, found, self._start)
 
     def verdict(self, ends: Mapping[Any, int] | None = None, **more: Any) -> Verdict:

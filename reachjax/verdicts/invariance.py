@@ -153,9 +153,9 @@ def _broken_later(
         if len(some.states):
             begun = some.scenarios[:, : loop.states + item.time * size]
             cut = Runs(begun, some.states)
-            found = suspects(item, rooms_of(on_host, item, cut, start), cut)
+            found = suspects(on_host, item, rooms_of(on_host, item, cut, start), cut)
             example = counterexample(loop, X0, found, start)
-            tried += len(found)
+            tried += min(len(found), SUSPECTS)
             if example is not None or tried > SUSPECTS:
                 return example
     return None

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.loops.scenarios import Runs
 from reachjax.methods.cells import Cells
+from reachjax.verdicts.counterexamples import SUSPECTS, counterexample, suspects
+from reachjax.verdicts.specification import requirements
 
 STEPS = 3
 OPTIONS = np.array([[0.0, -0.25], [0.125, 0.0], [0.0, 0.5]])
@@ -101,3 +104,24 @@ def test_numbers_times_decisions_are_bounded_exactly():
     points = np.array([*corners, (-1.0, 0.0), (0.0, 0.0)])
     tube = rj.reach(loop, box, 1, rj.Template(rows), gap=1e-6)
     np.testing.assert_allclose(tube.sets[1].b, (points @ rows.T).max(axis=0), atol=1e-7)
+
+
+def test_a_choice_that_is_clear_is_examined_before_many_that_are_tied():
+    plant = rj.NonlinearPlant(
+        lambda x, u, w: x + u + rj.one_of([[1.0], [-1.0]], w), 1, 1, disturbances=2
+    )
+    law, box = rj.MLP.from_layers([([[0.0]], [0.0])]), rj.Box([0.0], [0.125])
+    loop = rj.ClosedLoop(plant, law, disturbance=rj.Box(np.zeros(2), np.ones(2)))
+    tied, clear = np.array([0.125, 1.0, 1.0]), np.array([0.0625, 1.0, 0.0])
+    scenarios = np.stack([*[tied] * (2 * SUSPECTS), clear])
+    states = np.stack([[[x], [x + 1.0]] for x in scenarios[:, 0]])  # of a tie the first wins
+    (item,) = [
+        each for each in requirements(1, 1, None, safe=rj.Box([-2.0], [0.5])) if each.time == 1
+    ]
+    runs = Runs(scenarios, states)
+    found = suspects(loop, item, 0.5 - states[:, 1, 0], runs)
+    example = counterexample(loop, box, found, 0)
+    assert example is not None
+    assert example.decision == 1.0
+    np.testing.assert_array_equal(example.disturbances, [[1.0, 0.0]])
+    assert counterexample(loop, box, found[:SUSPECTS], 0) is None

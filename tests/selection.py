@@ -23,7 +23,7 @@ ELSEWHERE = (
 )
 """Claims about experiments, notebooks and site, and comparisons with a library of `[dev]`."""
 
-OTHERS = 2
+OTHERS = 1
 """So many other cases of a claim are taken at most, all over the range of its cases."""
 
 
@@ -37,7 +37,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--other-cases",
         action="store_true",
-        help=f"{OTHERS} cases of each claim about the library that are not taken by default",
+        help=f"{OTHERS} more of each claim about the library, of what is not taken by default",
     )
     parser.addoption(
         "--experiments",

@@ -29,7 +29,7 @@ SUSPECTS = 5
 """So many of the worst trajectories of each requirement are examined with their rounding."""
 
 AMONG = 32
-"""Of loops that jump so many are looked at: where numbers that are compared are equal, as at the
+"""So many are looked at where loops jump: where numbers that are compared are equal, as at the
 corners of a set of choices, rounding decides, and others are examined before."""
 
 TOLERATED = 16
@@ -59,7 +59,7 @@ class Suspect(NamedTuple):
 
 
 def suspects(loop: ClosedLoop, item: Requirement, rooms: np.ndarray, runs: Runs) -> list[Suspect]:
-    """The worst of some runs, of which these are the rooms `(c,)`."""
+    """The worst of some runs, of which these are the rooms `(c,)`: more where the loop jumps."""
     worst = np.argsort(rooms, kind="stable")[: AMONG if loop.jumps else SUSPECTS]
     return [Suspect(float(rooms[k]), item, *runs.some(k)) for k in worst if rooms[k] <= 0]
 

@@ -185,10 +185,19 @@ def _filled(number: Any, shape: tuple[int, ...], kind: Any) -> Any:
 def settled(parts: Any) -> Any:
     """One rounding of numbers for all that is made of them, whatever a compiler fuses.
 
-    They define what a column stands for, which must be the same wherever it is.
+    They define what a column stands for, which must be the same wherever it is. On a CPU XLA drops
+    barriers before it fuses, and computes what is behind them again for each of its uses: for each
+    entry of a row, where the row is concatenated. A call that it must not inline is kept.
     """
-    on_host = namespace(*jax.tree.leaves(parts)) is np
-    return parts if on_host else jax.lax.optimization_barrier(parts)
+    if namespace(*jax.tree.leaves(parts)) is np:
+        return parts
+    if jax.default_backend() != "cpu":
+        return jax.lax.optimization_barrier(parts)
+    with set_xla_metadata(inlineable="false"):
+        return _called(parts)
+
+
+_called = jax.jit(jax.lax.optimization_barrier)
 
 
 def constant(numbers: Any) -> Any:

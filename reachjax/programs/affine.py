@@ -17,12 +17,12 @@ that it stands for. Behind many layers they grow like the product of their `|W|`
 steps beyond all bounds; so those of a state become columns of their own before the next step.
 
 Where rounding is not counted (`rounding.rounding`) forms have no radii of their own, and say what
-would hold in exact arithmetic, which is no bound. Columns that are summed up at the end of a part
-of a step are then kept apart, layer by layer: those of the newest one are a diagonal.
+would hold in exact arithmetic, which is no bound.
 
 All of it is written over numpy and `jax.numpy` alike (`rounding.namespace`). In numpy, columns are
 appended as they are needed. In compiled code every unit and state has its place, so shapes are
-fixed.
+fixed; columns that are summed up at the end of a part of a step are kept apart there, layer by
+layer: those of the newest one are a diagonal.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ from reachjax.numerics.rounding import (
     larger,
     namespace,
     select,
+    settled,
     underflow,
 )
 from reachjax.programs.initial import Ends, InitialColumns, met
@@ -83,7 +84,7 @@ class AffineForms(AbstractNumber):
         rows: `(k, 2 + n)`, centre of the form, middle of the interval, coefficients of the columns.
         radii: `(k, 2)`, by how much the form may be off, and of the interval. Derivatives take the
             first for a constant. It is missing, `(k, 1)`, where rounding is not counted.
-        inner: columns besides, within a part of a step in compiled code that counts no rounding.
+        inner: columns besides, within a part of a step in compiled code.
     """
 
     rows: Float[Array | np.ndarray, "k n+2"]
@@ -127,14 +128,25 @@ class AffineForms(AbstractNumber):
 
     def rest(self, first: int) -> Any:
         """What all columns from some on are worth to each number, radii left aside."""
-        columns = self.columns[:, first:]
-        found = abs(columns).sum(axis=1) * (1 + gamma(self.rows.shape[1]))
-        return found + self.within_part if self.inner else found
+        found = abs(self.columns[:, first:]).sum(axis=1)
+        return (found + self.within_part) * (1 + gamma(self.width))
 
     @property
     def within_part(self) -> Any:
-        """What the columns within a part are worth to each number."""
-        return sum(abs(each).reshape(len(each), -1).sum(axis=1) for each in self.inner.values())
+        """What the columns within a part are worth to each number, but for rounding."""
+        each = (abs(part).reshape(len(part), -1).sum(axis=1) for part in self.inner.values())
+        return sum(each, start=NOTHING)
+
+    @property
+    def width(self) -> int:
+        """How many coefficients a number has, its constants among them."""
+        own = (1 if part.ndim == 1 else part.shape[1] for part in self.inner.values())
+        return self.rows.shape[1] + sum(own)
+
+    @property
+    def sizes(self) -> Any:
+        """Sums of absolute values of all coefficients, constants among them, but for rounding."""
+        return abs(self.rows).sum(axis=1) + self.within_part
 
     def _layers(self, change: Callable[[Any], Any], whole: bool = False) -> Layers:
         """The columns within a part, changed; all of them as matrices if these are asked for."""
@@ -152,7 +164,7 @@ class AffineForms(AbstractNumber):
     @property
     def _there(self) -> Any:
         """Which numbers are not zero."""
-        return abs(self.rows).sum(axis=1) + self.radii.sum(axis=1) > 0
+        return self.sizes + self.radii.sum(axis=1) > 0
 
     def within(self, interval: Ball) -> AffineForms:
         """The same forms with other intervals."""
@@ -164,26 +176,27 @@ class AffineForms(AbstractNumber):
     def __rmatmul__(self, matrix) -> AffineForms:
         """`matrix @ self` for an exact matrix."""
         matrix, count = namespace(self.rows).asarray(matrix), matrix.shape[1]
-        error = errors(lambda: gamma(count) * abs(self.rows).sum(axis=1))
-        lost = errors(lambda: underflow(matrix, self._there, self.rows.shape[1] + 2))
+        error = errors(lambda: gamma(count) * self.sizes)
+        lost = errors(lambda: underflow(matrix, self._there, self.width + 2))
         radii = abs(matrix) @ (self.radii + error[:, None]) + lost[:, None]
-        radii = radii * (1 + gamma(count + self.rows.shape[1]))
+        radii = _once(radii * (1 + gamma(count + self.width)))
         inner = self._layers(lambda part: matrix * part if part.ndim == 1 else matrix @ part)
         return AffineForms(matrix @ self.rows, radii, inner)
 
     def __add__(self, other) -> AffineForms:
         xp = namespace(self.rows)
         if isinstance(other, AffineForms):
-            rows = _sum(self.rows, other.rows)
-            radii, changed = self.radii + other.radii, rows
             inner = _added(self.inner, other.inner)
+            found = AffineForms(_sum(self.rows, other.rows), self.radii + other.radii, inner)
+            changed = found.sizes
         else:  # exact constants, one for each or one for all
-            changed = self.rows[:, :2] + xp.asarray(other)[..., None]
-            rows = xp.concatenate([changed, self.rows[:, 2:]], axis=1)
-            radii, inner = self.radii, self.inner
-        error = errors(lambda: gamma(1) * abs(changed).sum(axis=1))
-        radii = (radii + error[:, None]) * (1 + gamma(rows.shape[1] + 4))
-        return AffineForms(rows, radii, inner)
+            constants = self.rows[:, :2] + xp.asarray(other)[..., None]
+            rows = xp.concatenate([constants, self.rows[:, 2:]], axis=1)
+            found = AffineForms(rows, self.radii, self.inner)
+            changed = abs(constants).sum(axis=1)
+        error = errors(lambda: gamma(1) * changed)
+        radii = _once((found.radii + error[:, None]) * (1 + gamma(found.width + 4)))
+        return AffineForms(found.rows, radii, found.inner)
 
     def __neg__(self) -> AffineForms:
         return AffineForms(-self.rows, self.radii, self._layers(lambda part: -part))
@@ -192,11 +205,10 @@ class AffineForms(AbstractNumber):
         """Each number times an exact one, or all times one."""
         xp = namespace(self.rows)
         factor = xp.broadcast_to(xp.asarray(factor, float), (len(self.rows),))
-        error = errors(lambda: gamma(1) * abs(self.rows).sum(axis=1))
-        count = self.rows.shape[1] + 2
+        error, count = errors(lambda: gamma(1) * self.sizes), self.width + 2
         lost = errors(lambda: 2 * TINY * count * ((factor != 0) & self._there))
         radii = abs(factor)[:, None] * (self.radii + error[:, None]) + lost[:, None]
-        radii = radii * (1 + gamma(self.rows.shape[1] + 4))
+        radii = _once(radii * (1 + gamma(self.width + 4)))
         return AffineForms(factor[:, None] * self.rows, radii, self.scaled_layers(factor))
 
     def __getitem__(self, index) -> AffineForms:
@@ -216,7 +228,7 @@ class AffineForms(AbstractNumber):
 
     def ends_by_form(self, start: InitialColumns, cut: bool = False) -> Ends:
         """Lower and upper bounds `(k,)` by forms alone."""
-        own, n = start.count, self.rows.shape[1]
+        own, n = start.count, self.width
         center = self.rows[:, 0]
         lower, upper = start.bounds(self.rows[:, 2 : 2 + own], cut)
         error = errors(lambda: gamma(8) * (abs(center) + larger(-lower, upper)))
@@ -264,6 +276,11 @@ class AffineForms(AbstractNumber):
         rows[where, n + np.arange(count)] = by[where]
         places = np.where(needed, n - 3 + np.cumsum(needed), -1)
         return AffineForms(rows, self.radii), places
+
+
+def _once(radii: Any) -> Any:
+    """Radii that compilers do not compute again for each of their uses, which are many."""
+    return settled(radii) if is_counted() else radii
 
 
 def radii_of(off: Any, interval: Any) -> Any:

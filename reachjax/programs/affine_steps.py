@@ -140,7 +140,7 @@ def step_columns(loop: ClosedLoop, few: bool = False) -> tuple[int, int]:
     """How many columns a step adds, and how many it needs in between.
 
     Those of the states' radii are among them where rounding is counted, and of what a flow leaves
-    out. None is needed in between where rounding is not counted.
+    out.
 
     Args:
         loop: the closed loop.
@@ -152,7 +152,7 @@ def step_columns(loop: ClosedLoop, few: bool = False) -> tuple[int, int]:
     for layers, outputs in parts:
         if merges(layers, outputs, few):
             kept, between = kept - _count(layers) + outputs, max(between, _count(layers))
-    return kept, between if is_counted() else 0
+    return kept, between
 
 
 def step_forms(
@@ -164,7 +164,7 @@ def step_forms(
     slopes: Float[Array | np.ndarray, " units"] | None = None,
     known: Box | None = None,
     ranges: Ranges | None = None,
-    scratch: int = 0,
+    scratch: int | None = None,
     before: int = 0,
     spans: list[Between] | None = None,
     few: bool = False,
@@ -181,7 +181,8 @@ def step_forms(
             for any.
         known: a box that surely holds the successor, where one is known.
         ranges: what else bounds the inputs of a layer, or the successor, if anything does.
-        scratch: where the columns begin that a step needs in between, if there is a place.
+        scratch: where the columns begin that a step needs in between, if these have places among
+            all others; None to keep them apart.
         before: how many steps there were since the initial set.
         spans: gets what is in between the samples, of the flow of a differential equation.
         few: whether what units of any kind leave out is summed up.
@@ -202,8 +203,7 @@ def step_forms(
         ends = _cut(unit, y, start)
         if ranges is not None:
             ends = ranges(unit, y, ends, found)
-        if not is_counted():  # or compilers compute them again for each of their uses
-            ends = settled(ends)
+        ends = settled(ends)
         if unit.curved and unit.inputs > 1:
             z, forms = _bilinear(unit, y, ends, free, start)
         elif unit.curved:
@@ -215,8 +215,7 @@ def step_forms(
         else:
             here = slice(done, done + len(y))
             z, forms = _unit(unit, y, ends, free, None if slopes is None else slopes[here])
-        if not is_counted():
-            z = settled(z)
+        z = settled(z)
         if place is None and unit.curved:
             _require_bounds(forms, int(t))
         done = done + len(z)
@@ -235,7 +234,7 @@ def step_forms(
             return run(*given)
         first, kept, own = len(found), free, width
         if place is not None:
-            free = scratch if is_counted() else Inner(0)
+            free = Inner(0) if scratch is None else scratch
         z, gap, places = _merged(run(*given), own, kept, scratch)
         merged.append(PartColumns(z, gap, places, range(first, len(found))))
         width = z.columns.shape[1]
@@ -303,16 +302,17 @@ def _require_bounds(forms: UnitForms, t: int) -> None:
 
 
 def _merged(
-    forms: AffineForms, width: int, place: Place, scratch: int
+    forms: AffineForms, width: int, place: Place, scratch: int | None
 ) -> tuple[AffineForms, Any, Any]:
     """The forms with all columns from some on as one for each number, how much, and where."""
     if forms.inner:
-        gap = forms.within_part
+        gap = settled(forms.within_part * (1 + gamma(forms.width)))
         forms, places = AffineForms(forms.rows, forms.radii).with_own(gap, place)
         return forms, gap, places
-    xp, first = namespace(forms.rows), 2 + (width if place is None else scratch)
+    own = width if place is None or scratch is None else scratch
+    xp, first = namespace(forms.rows), 2 + own
     last = forms.rows[:, first:]
-    gap = abs(last).sum(axis=1) * (1 + gamma(last.shape[1]))
+    gap = settled(abs(last).sum(axis=1) * (1 + gamma(last.shape[1])))
     if place is None:
         rows = forms.rows[:, :first]
     else:
@@ -338,8 +338,7 @@ def _smooth(
     better = model.gap + lost <= line.gap
     model = Quadratic(*(select(better, *pair) for pair in zip(model, line, strict=True)))
     lost = select(better, lost, 0.0)
-    if not is_counted():
-        model, lost, own, rest, values = settled((model, lost, own, rest, values))
+    model, lost, own, rest, values = settled((model, lost, own, rest, values))
     off = center - model.center
     middle = model.offset + (model.slope + model.curvature * off) * off
     slope = model.slope + 2 * model.curvature * off
@@ -354,8 +353,8 @@ def _smooth(
         size = abs(model.offset) + (abs(model.slope) + 2 * abs(curvature * off)) * abs(off)
         size = size + abs(slope) * (own + rest) + abs(curvature) * own**2 + abs(slope * center)
         some = abs(center) + own + rest + abs(off) + abs(model.offset)
-        flushed = TINY * rows.shape[1] * (1 + abs(slope) + abs(curvature)) * (1 + some)
-        return gamma(rows.shape[1] + 32) * size + select(some > 0, 32 * flushed, 0.0)
+        flushed = TINY * y.width * (1 + abs(slope) + abs(curvature)) * (1 + some)
+        return gamma(y.width + 32) * size + select(some > 0, 32 * flushed, 0.0)
 
     radius = constant(abs(slope) * y.off * (1 + gamma(4)) + errors(size))
     gap = settled((model.gap + lost) * (1 + gamma(16)))
@@ -380,7 +379,7 @@ def _bilinear(
     """
     xp, (lower, upper), w = namespace(y.rows), ends, start.spread.shape[1]
     count, values = unit.terms, Ball.between(*unit.interval(lower, upper))
-    center, rows, size = y.rows[:, 0], y.rows[:, 2:], y.rows.shape[1]
+    center, rows, size = y.rows[:, 0], y.rows[:, 2:], y.width
     planes, offset, gap = unit.planes(lower, upper)
     own, rest, half = start.norms(rows[:, :w]), y.rest(w) + y.off, len(center) // 2
     (S, S_other), (R, R_other) = map(unit.halves, (own, rest))
@@ -437,13 +436,13 @@ def _unit(
 
     def size() -> Any:  # products with 0 and 1 are exact
         size = abs(constant(rows)).sum(axis=1) + abs(constant(offset))
+        size = size + constant(abs(slope)) * y.within_part
         rounded = (slope != 0) & (abs(slope) != 1) | (offset != 0)
-        some = abs(y.rows).sum(axis=1) + y.off > 0
-        flushed = select(some, 2 * TINY * (rows.shape[1] + 2), 0.0)
+        flushed = select(y.sizes + y.off > 0, 2 * TINY * (y.width + 2), 0.0)
         return select(rounded, gamma(4) * size + flushed, 0.0)
 
     radius = abs(slope) * y.off + errors(size)
-    radius = constant(radius + left) * (1 + gamma(rows.shape[1]))
+    radius = constant(radius + left) * (1 + gamma(y.width))
     columns = xp.concatenate([constants, rows[:, 2:]], axis=1)
     z = AffineForms(columns, radii_of(radius, values.rad), y.scaled_layers(slope))
     z, places = z.with_own(gap, place)

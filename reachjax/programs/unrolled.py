@@ -189,7 +189,7 @@ def _together(each: Sequence[ByForms]) -> ByForms:
 FOUND = jax.checkpoint_policies.save_only_these_names(EXTREMES)
 """What is kept for derivatives, as it has none itself."""
 
-COLUMNS, MEMORY = 96, 12
+COLUMNS, MEMORY = 32, 3
 """Where many cells are bounded so many columns are kept, or those of so many steps, where these are
 more: old ones are merged."""
 
@@ -242,7 +242,7 @@ def _at_once(
     """Bounds for all steps, as one scan."""
     start = InitialColumns.of(X0, box, loop.curved)
     few = columns is not None and not is_counted()
-    (more, scratch), steps = step_columns(loop, few), len(directions)
+    (more, _), steps = step_columns(loop, few), len(directions)
     kept = (steps - 1) * more if columns is None else max(columns, 4 * loop.states)
     merges, first = kept < (steps - 1) * more, start.count
     end = first + (kept + more if merges else steps * more)
@@ -254,11 +254,11 @@ def _at_once(
         place = first + (kept if merges else k * more)
         spans = [] if between else None
         given = loop, state, t + k, start
-        state, units, _ = step_forms(*given, place=place, scratch=end, spans=spans, few=few)
+        state, units, _ = step_forms(*given, place=place, spans=spans, few=few)
         found = _bounds(rows, state, units, start, spans, between)
         return merged_columns(state, first, kept, end) if merges else state, found
 
-    state = AffineForms.beginning(start, end + scratch)
+    state = AffineForms.beginning(start, end)
     return jax.lax.scan(advance, state, (jnp.arange(steps), directions))[1]
 
 

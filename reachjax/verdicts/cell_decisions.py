@@ -38,6 +38,10 @@ PROGRAMS = 50
 SHOTS, FEWER = 64, 8
 """How many trajectories are simulated from a cell that is not proved; and from each of many."""
 
+AT_ONCE = 8
+"""Cells are shot from once they are this part of all: many trajectories take hardly longer than one
+does."""
+
 FEW_OF_A_FLOW = 4
 """So many cells of a flow are worth a compiled call for more, which is filled up."""
 
@@ -117,7 +121,7 @@ class _Decisions(AbstractSearch):
         self._first = self._task._replace(nodes=0) if task.loop.curved else self._task
         self._open, self._last = deque(cells.leaves), deque[Node]()
         self._left_over = deque[tuple[Node, Margins | None]]()
-        self._shot = 0
+        self._unshot, self._shot = list[Node](), 0
         self._lost: tuple[Unbounded, list[float]] | None = None
         self._bounded = False
 
@@ -192,7 +196,9 @@ class _Decisions(AbstractSearch):
             return
         axis = outcome.axis if outcome.axis >= 0 else self._cells.longest(node)
         self._tried.setdefault(depth, deque()).append(axis)
-        self._shoot(node)
+        self._unshot.append(node)
+        if AT_ONCE * len(self._unshot) >= self._cells.count:
+            self._shoot()
         if self.ended:
             return
         if first and self._may_halve(node, axis):
@@ -224,15 +230,18 @@ class _Decisions(AbstractSearch):
         tried.append(tried[-1])
         return tried[-1]
 
-    def _shoot(self, node: Node) -> None:
-        """Simulate a few trajectories from a cell: corners and points."""
+    def _shoot(self) -> None:
+        """Simulate a few trajectories from each cell that waits for it: corners and points."""
         self._shot += 1
-        rng = np.random.default_rng(self._shot)
-        lower, upper = node.ends
+        rng, found = np.random.default_rng(self._shot), list[np.ndarray]()
         shots = SHOTS if self._cells.count < SHOTS else FEWER
-        ends = rng.uniform(size=(shots, len(lower)))
-        ends[: shots // 2] = ends[: shots // 2] > 0.5
-        states = np.clip(lower + ends * (upper - lower), lower, upper)
+        for node in self._unshot:
+            lower, upper = node.ends
+            ends = rng.uniform(size=(shots, len(lower)))
+            ends[: shots // 2] = ends[: shots // 2] > 0.5
+            found.append(np.clip(lower + ends * (upper - lower), lower, upper))
+        self._unshot.clear()
+        states = np.concatenate(found)
         states = states[np.asarray(self._X0.contains(states))]
         if len(states):
             task, drawn = self._task, self._scenarios.drawn(states, self._shot)
@@ -249,6 +258,8 @@ class _Decisions(AbstractSearch):
             UnboundedError: there is no cell over which all units have bounds.
             UnsoundError: a trajectory breaks what is proved.
         """
+        if self._unshot and not (interrupted or self.ended or self._budget.late):
+            self._shoot()
         task, example = self._task, self.findings.example
         if self._lost and not (self._bounded or example or interrupted):
             unbounded, widths = self._lost

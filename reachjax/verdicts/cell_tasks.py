@@ -20,6 +20,7 @@ from reachjax.loops.units import UnboundedError
 from reachjax.methods.cells import WAYS
 from reachjax.methods.ladder import WORK, Ladder
 from reachjax.methods.steps import boxed
+from reachjax.methods.witnesses import Simulations
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.flags import lenient
 from reachjax.programs.affine import AffineForms
@@ -32,6 +33,10 @@ from reachjax.verdicts.grounds import Leaves
 from reachjax.verdicts.sieve import Margins, Outcome, Sieve, Unbounded, no_margins
 from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.targets import target_of, values_of
+
+FAR = 30.0
+"""Bounds of smooth loops that are so many times as wide as all that is simulated, or as that is
+large, grow on: nothing comes of them but ever dearer steps."""
 
 HALVED = 0.4
 """What smooth functions leave out on account of a coordinate falls to less than this part of it
@@ -47,6 +52,8 @@ class CellTask(NamedTuple):
         start: the time of the initial set.
         required: the requirements.
         nodes: how many linear programs a bound may take.
+        beyond: `(2, n_x)`, ends of a box around all that is simulated, so large that a cell whose
+            bounds leave it is given up; None where nothing is.
     """
 
     loop: ClosedLoop
@@ -54,6 +61,7 @@ class CellTask(NamedTuple):
     start: int
     required: tuple[Requirement, ...]
     nodes: int
+    beyond: Float[np.ndarray, "2 n_x"] | None = None
 
     @property
     def by_programs(self) -> bool:
@@ -132,6 +140,9 @@ def _climbed(
                     axes = _axes(ladder, _first_open(task.required, margins), early)
                 (axis, then), lost = axes, Unbounded.of(error)
                 return Outcome(False, margins, axis=axis, then=then, unbounded=lost)
+            if not failing and is_beyond(ladder, task.beyond):
+                axis, then = _axes(ladder, _first_open(task.required, margins), early)
+                return Outcome(False, margins, axis=axis, then=then)
         if budget.overdue:
             return Outcome(False, margins)
         for number, item in enumerate(task.required):
@@ -148,6 +159,27 @@ def _climbed(
             break
     axis, then = axes
     return Outcome(proved, margins, axis=axis, leaves=tuple(leaves), then=then)
+
+
+def far_from(simulations: Simulations | None) -> Float[np.ndarray, "2 n_x"] | None:
+    """A box around all simulated states, `FAR` times as wide; None where there are none."""
+    if simulations is None:
+        return None
+    states = simulations.runs.states.reshape(-1, simulations.runs.states.shape[-1])
+    states = states[np.isfinite(states).all(axis=1)]
+    if not len(states):
+        return None
+    ends = np.array([states.min(axis=0), states.max(axis=0)])
+    size = np.maximum(np.ptp(ends, axis=0), abs(ends).max(axis=0))
+    return ends + FAR * np.array([[-1.0], [1.0]]) * size
+
+
+def is_beyond(ladder: Ladder, beyond: Float[np.ndarray, "2 n_x"] | None) -> bool:
+    """Whether bounds of the states where a ladder has come to leave a box."""
+    if beyond is None:
+        return False
+    lower, upper = ladder.horizon.ends[-1]
+    return bool(np.any(lower < beyond[0]) or np.any(upper > beyond[1]))
 
 
 def _first_open(required: Sequence[Requirement], margins: Margins) -> Requirement:

@@ -13,6 +13,7 @@ of closed sets, decided as goals are.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol
@@ -33,8 +34,9 @@ from reachjax.verdicts.verdict import Recurrence, Verdict
 LONG = 100
 """Shorter horizons are done step by step: what comes back does so after tens of steps."""
 
-EARLIEST = 25
-"""From this step on, and after twice as many each time, a set that holds later states is tried."""
+EARLIEST, LATEST, LATER = 25, 0.6, math.sqrt(2)
+"""From this step on until this part of the horizon, and after so many times as many each time, a
+set that holds later states is tried."""
 
 WIDER, PUSHED = (1.5,), (1.5, 6.0)
 """By how much it is larger than what is simulated: bounds of its states are. Of a loop with
@@ -165,11 +167,11 @@ def _candidates(
     """Sets that hold what is simulated from a step on."""
     states = states[np.isfinite(states).all(axis=(1, 2))]
     step = EARLIEST
-    while len(states) and step <= horizon // 2:
+    while len(states) and step <= LATEST * horizon:
         for wider in PUSHED if loop.is_disturbed else WIDER:
             # of a polytope forms know the box around it alone
             yield from reversed([*sets_around(loop, states, step, wider)])
-        step *= 2
+        step = round(LATER * step)
 
 
 def _for_ever(

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
@@ -52,7 +53,7 @@ from reachjax.proofs.branches import BranchCertificate, Rung
 from reachjax.proofs.proposal import SolverStatus
 from reachjax.sets import AbstractSet
 from reachjax.verdicts.cell_decisions import decided_by_cells
-from reachjax.verdicts.cell_tasks import CellTask
+from reachjax.verdicts.cell_tasks import CellTask, far_from, is_beyond
 from reachjax.verdicts.closing import closed
 from reachjax.verdicts.findings import Findings
 from reachjax.verdicts.grounds import Asked, ClimbRecord, Grounds
@@ -249,7 +250,8 @@ class _Asked(NamedTuple):
         if cells is not None:
             parts = CellTree.over(X0, cells)
             counts = () if isinstance(cells, int | np.integer) else tuple(map(int, cells))
-            task = CellTask(loop, horizon, start, tuple(required), relaxation.nodes)
+            given = tuple(required), relaxation.nodes, far_from(simulations)
+            task = CellTask(loop, horizon, start, *given)
             given = task, X0, parts, simulations, budget, executor, progress
             return decided_by_cells(*given, counts=counts)
         decision = _Decision(loop, X0, horizon, start, required, simulations, budget)
@@ -292,7 +294,9 @@ def _by_remedies(
             ladder = Ladder(*given, between=between)
             # a flow costs much where bounds are wide, and cells begin anew
             ends = cells_follow and loop.plant.continuous
-            decision.climb(ladder, tighten=nodes > FIRST_PROGRAMS, to_first_open=ends)
+            beyond = far_from(decision.simulations) if cells_follow else None
+            tighten = nodes > FIRST_PROGRAMS
+            decision.climb(ladder, tighten=tighten, to_first_open=ends, beyond=beyond)
 
     by_cells, most = None, 1
     if loop.curved:
@@ -306,7 +310,8 @@ def _by_remedies(
             programs_may_follow = False
         if decision.ended:
             return decision.verdict()
-        task = CellTask(loop, horizon, start, tuple(required), nodes=0)
+        beyond = far_from(decision.simulations)
+        task = CellTask(loop, horizon, start, tuple(required), nodes=0, beyond=beyond)
         part = FOR_CELLS_OF_FLOWS if loop.plant.continuous else FOR_CELLS
         share = budget.share(part if programs_may_follow else 1.0)
         parts = CellTree.whole(X0, most)
@@ -398,13 +403,21 @@ class _Decision:
                 compared = item.compared_with(self._X0)
                 self._findings.prove(item, float(compared.margins.min()), item.proved(compared))
 
-    def climb(self, ladder: Ladder, tighten: bool, to_first_open: bool = False) -> None:
+    def climb(
+        self,
+        ladder: Ladder,
+        tighten: bool,
+        to_first_open: bool = False,
+        beyond: Float[np.ndarray, "2 n_x"] | None = None,
+    ) -> None:
         """Climb until all is decided, or nothing more can be.
 
         Args:
             ladder: at the initial set.
             tighten: whether the ranges of units are bounded by linear programs.
             to_first_open: whether nothing later matters where a requirement is not proved.
+            beyond: ends of a box where nothing is worth going on once bounds leave it; None for
+                everywhere.
         """
         last = max(time for _, time in self._findings.open)
         self._climbs.append(ClimbRecord())
@@ -413,7 +426,7 @@ class _Decision:
             ladder.advance(tighten)
             self._climbs[-1].advanced(ladder.horizon.tightened)
             self._decisions += open_decisions(ladder.horizon.steps[-1], self._start + k - 1)
-            if self._budget.overdue:
+            if self._budget.overdue or is_beyond(ladder, beyond):
                 return
             for key, item in list(self._findings.open.items()):
                 if item.time == k and not self.ended:

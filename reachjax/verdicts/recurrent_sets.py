@@ -20,7 +20,7 @@ from reachjax.verdicts.specification import Requirement
 TRAJECTORIES = 300
 """How many trajectories are simulated from a set that may return into itself."""
 
-PERIODS = 60
+PERIODS = 150
 """A set must return into itself after no more steps than this."""
 
 WIDER = 1.2

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from reachjax.numerics.rounding import UNIT, Ball
+from reachjax.numerics.rounding import UNIT, Ball, settled
 
 fractions = np.vectorize(Fraction, otypes=[object])
 
@@ -164,3 +164,17 @@ def test_negation_and_indexing_keep_radii():
     part = (-ball)[1:]
     np.testing.assert_array_equal(part.mid, [2.0, -3.0])
     np.testing.assert_array_equal(part.rad, [0.2, 0.3])
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="other compilers keep barriers")
+def test_what_is_settled_is_rounded_once_for_all_its_uses():
+    x = jnp.arange(1.0, 4.0) / 3
+
+    def used_twice(x):
+        once = settled(x * x + 1.0)
+        return jnp.concatenate([once[:, None] * x, once[:, None]], axis=1)
+
+    compiled = jax.jit(used_twice).lower(x).compile()
+    assert compiled.as_text().count(" call(") == 1
+    np.testing.assert_array_equal(compiled(x)[:, -1], x * x + 1.0)
+    np.testing.assert_allclose(jax.grad(lambda x: used_twice(x)[:, -1].sum())(x), 2 * x)

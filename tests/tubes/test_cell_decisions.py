@@ -11,6 +11,11 @@ import pytest
 
 import reachjax as rj
 from reachjax.loops.units import UnboundedError
+from reachjax.methods.ladder import Ladder
+from reachjax.methods.propagation import simulations_from
+from reachjax.numerics.budget import Budget
+from reachjax.verdicts.cell_tasks import CellTask, far_from, outcome_of
+from reachjax.verdicts.specification import requirements
 from tests.networks import he_network
 
 HORIZON = 4
@@ -248,3 +253,26 @@ def test_an_executor_runs_the_cells_of_a_set_that_forms_do_not_prove(smooth):
     assert len(sent) > 1
     with pytest.raises(TypeError, match="executor must be an object with a method submit"):
         rj.decide(smooth, X0, 1, safe=X0, executor=2)
+
+
+def test_a_cell_whose_bounds_are_far_from_all_that_is_simulated_is_given_up(smooth, monkeypatch):
+    steps, horizon, advance = [], 200, Ladder.advance
+
+    def counted(*given, **named):
+        steps.append(1)
+        advance(*given, **named)
+
+    monkeypatch.setattr(Ladder, "advance", counted)
+    wanted = tuple(requirements(2, horizon, goal={horizon: rj.Box([-0.1, -0.1], [0.1, 0.1])}))
+    loop, part = jax.device_get((smooth, rj.Box([-2.0, -2.0], [2.0, 2.0])))
+    simulations = simulations_from(loop, part, horizon, 0, 100, 0)
+    beyond = far_from(simulations)
+    states = simulations.runs.states
+    assert np.all((beyond[0] < states) & (states < beyond[1]))
+    task = CellTask(loop, horizon, 0, wanted, 0, beyond)
+    outcome = outcome_of(task, part, Budget(np.inf))
+    assert not outcome.proved
+    assert outcome.axis >= 0
+    assert len(steps) < horizon
+    small = jax.device_get(rj.Box([-1e-4, -1e-4], [1e-4, 1e-4]))
+    assert outcome_of(task, small, Budget(np.inf)).proved

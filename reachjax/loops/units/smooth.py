@@ -345,10 +345,10 @@ class SmoothUnit(AbstractUnit):
 
         if not is_counted():
             return Quadratic(middle, offset, slope, curvature, select(wide, between, math.inf))
-        gap = (between + 2 * off()) * (1 + gamma(4))
+        gap = settled((between + 2 * off()) * (1 + gamma(4)))
         better = wide & (gap < linear.gap)
         curved = Quadratic(middle, offset, slope, curvature, gap)
-        chosen = [select(better, *pair) for pair in zip(curved, linear, strict=True)]
+        chosen = settled([select(better, *pair) for pair in zip(curved, linear, strict=True)])
         known = reduce(lambda a, b: a & b, (abs(each) < math.inf for each in chosen))
         *chosen, gap = (xp.where(known, each, 0.0) for each in chosen)
         return Quadratic(*settled((*chosen, xp.where(known, gap, math.inf))))

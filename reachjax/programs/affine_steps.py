@@ -140,7 +140,7 @@ def step_columns(loop: ClosedLoop, few: bool = False) -> tuple[int, int]:
     """How many columns a step adds, and how many it needs in between.
 
     Those of the states' radii are among them where rounding is counted, and of what a flow leaves
-    out.
+    out. None is needed in between where rounding is not counted.
 
     Args:
         loop: the closed loop.
@@ -152,7 +152,7 @@ def step_columns(loop: ClosedLoop, few: bool = False) -> tuple[int, int]:
     for layers, outputs in parts:
         if merges(layers, outputs, few):
             kept, between = kept - _count(layers) + outputs, max(between, _count(layers))
-    return kept, between
+    return kept, between if is_counted() else 0
 
 
 def step_forms(

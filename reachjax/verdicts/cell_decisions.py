@@ -76,6 +76,7 @@ def decided_by_cells(
         search.findings.simulate(simulations.runs)
     try:
         search.run(executor, progress)
+        search.shoot_the_last()
         return search.verdict()
     except KeyboardInterrupt:
         message = (
@@ -230,6 +231,11 @@ class _Decisions(AbstractSearch):
         tried.append(tried[-1])
         return tried[-1]
 
+    def shoot_the_last(self) -> None:
+        """Simulate from the cells that still wait for it, if there is time."""
+        if self._unshot and not (self.ended or self._budget.late):
+            self._shoot()
+
     def _shoot(self) -> None:
         """Simulate a few trajectories from each cell that waits for it: corners and points."""
         self._shot += 1
@@ -258,8 +264,6 @@ class _Decisions(AbstractSearch):
             UnboundedError: there is no cell over which all units have bounds.
             UnsoundError: a trajectory breaks what is proved.
         """
-        if self._unshot and not (interrupted or self.ended or self._budget.late):
-            self._shoot()
         task, example = self._task, self.findings.example
         if self._lost and not (self._bounded or example or interrupted):
             unbounded, widths = self._lost

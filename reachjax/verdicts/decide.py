@@ -284,6 +284,7 @@ def _by_remedies(
     """
     decision.at_first()
     begun, around = map(in_numpy, (X0, boxed(X0, "X0")))
+    beyond = far_from(decision.simulations) if loop.curved else None
 
     def climb(nodes: int, cells_follow: bool = False) -> None:
         if not decision.ended:
@@ -294,9 +295,9 @@ def _by_remedies(
             ladder = Ladder(*given, between=between)
             # a flow costs much where bounds are wide, and cells begin anew
             ends = cells_follow and loop.plant.continuous
-            beyond = far_from(decision.simulations) if cells_follow else None
+            far = beyond if cells_follow else None
             tighten = nodes > FIRST_PROGRAMS
-            decision.climb(ladder, tighten=tighten, to_first_open=ends, beyond=beyond)
+            decision.climb(ladder, tighten=tighten, to_first_open=ends, beyond=far)
 
     by_cells, most = None, 1
     if loop.curved:
@@ -310,7 +311,6 @@ def _by_remedies(
             programs_may_follow = False
         if decision.ended:
             return decision.verdict()
-        beyond = far_from(decision.simulations)
         task = CellTask(loop, horizon, start, tuple(required), nodes=0, beyond=beyond)
         part = FOR_CELLS_OF_FLOWS if loop.plant.continuous else FOR_CELLS
         share = budget.share(part if programs_may_follow else 1.0)

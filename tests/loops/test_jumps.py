@@ -134,11 +134,22 @@ REFUSED = {
     "counts as truth values": lambda x: T[
         jnp.argmax(jnp.cumsum(bits(x).astype(int)).astype(bool))
     ] * x,
+    "products of truth values": lambda x: (bits(x) @ jnp.array([True, True])) * x,
+    "truth values by a matrix of them": lambda x: (
+        jnp.array([[True, False], [True, True]]) @ bits(x)
+    ) * x,
+    "sums of products of truth values": lambda x: jnp.einsum("i,i->", bits(x), x > 0.1) * x,
+    "bits of any number": lambda x: lax.reduce_or(jnp.where(bits(x), jnp.array([1, 2]), 0), (0,))
+    * x,
+    "bits of all numbers": lambda x: lax.reduce_and(jnp.where(bits(x), 2, 1), (0,)) * x,
     "cases by a parameter": Partial(lambda t, x: jnp.where(t[jnp.argmax(W @ x)] > 0, x, -x), T),
     "a condition of a parameter": Partial(
         lambda t, x: jnp.select([x[0] > 0, t[0] > 0], [1.0, 2.0], 3.0) * x, T
     ),
 }  # fmt: skip
+
+
+REASONS = r"cannot be certified: .*(range of|counting|parameter|truth values JAX|bit by bit)"
 
 
 @pytest.mark.parametrize("name", JUMPS)
@@ -163,7 +174,7 @@ def test_values_on_the_surfaces_are_within_the_bounds_of_a_point(name):
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_would_be_read_otherwise_than_it_is_computed_is_refused(name):
-    with pytest.raises(TypeError, match=r"cannot be certified: .*(range of|counting|parameter)"):
+    with pytest.raises(TypeError, match=REASONS):
         network(REFUSED[name])
 
 

@@ -80,13 +80,15 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
     """The value, or a list of them, of one equation, of which one operand at least is a value.
 
     Raises:
-        UnsupportedError: there is no rule for it, or whole numbers may leave their range.
+        UnsupportedError: there is no rule for it, whole numbers may leave their range, or truth
+            values would be computed with as numbers.
     """
     found = _recorded(recorder, equation, operands)
-    if jnp.issubdtype(equation.kind, jnp.integer):
-        for each in found if isinstance(found, list) else [found]:
-            if isinstance(each, Value):
-                jumps.require_whole(recorder, equation, each)
+    for each in found if isinstance(found, list) else [found]:
+        if isinstance(each, Value) and jnp.issubdtype(equation.kind, jnp.bool_):
+            raise UnsupportedError(jumps.NOT_COUNTED)
+        if isinstance(each, Value) and jnp.issubdtype(equation.kind, jnp.integer):
+            jumps.require_whole(recorder, equation, each)
     return found
 
 

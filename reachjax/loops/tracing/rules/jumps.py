@@ -91,6 +91,14 @@ WHOLE = (
     "jnp.clip(y, 0.0, 9.0).astype(int)"
 )
 
+NOT_COUNTED = (
+    "of truth values JAX makes whether any product holds, and no sum: compute with numbers, as "
+    "m.astype(float) @ n, or use jnp.any"
+)
+
+BITS = "it is taken bit by bit of whole numbers: use jnp.all or jnp.any of comparisons"
+"""Of `reduce_and` and `reduce_or`, which are `jnp.all` and `jnp.any` of truth values alone."""
+
 
 def of_decisions(
     recorder: Recorder, equation: Equation, operands: Sequence[Operand], again: Again
@@ -231,7 +239,13 @@ def _looked_up(
 
 
 def _all(recorder: Recorder, equation: Equation, pick: Pick) -> Operand:
-    """Whether all truth values along axes hold, or any."""
+    """Whether all truth values along axes hold, or any.
+
+    Raises:
+        UnsupportedError: they are whole numbers.
+    """
+    if not np.issubdtype(equation.kind, np.bool_):
+        raise UnsupportedError(BITS)
     bits, axes = bits_of(recorder, pick), tuple(equation.params["axes"])
     if not isinstance(bits, Value):
         return equation.evaluate(bits > 0.5)

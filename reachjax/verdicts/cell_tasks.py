@@ -38,6 +38,10 @@ FAR = 30.0
 """Bounds of smooth loops that are so many times as wide as all that is simulated, or as that is
 large, grow on: nothing comes of them but ever dearer steps."""
 
+FLAT = 1e-9
+"""Coordinates that are so small a part of the largest, such as advisories that no trajectory has,
+say nothing of how far bounds may be."""
+
 HALVED = 0.4
 """What smooth functions leave out on account of a coordinate falls to less than this part of it
 where it is halved: to a quarter of what is of degree two, to an eighth of degree three."""
@@ -162,7 +166,10 @@ def _climbed(
 
 
 def far_from(simulations: Simulations | None) -> Float[np.ndarray, "2 n_x"] | None:
-    """A box around all simulated states, `FAR` times as wide; None where there are none."""
+    """A box around all simulated states, `FAR` times as wide; None where there are none.
+
+    It has no ends where states are flat.
+    """
     if simulations is None:
         return None
     states = simulations.runs.states.reshape(-1, simulations.runs.states.shape[-1])
@@ -171,6 +178,7 @@ def far_from(simulations: Simulations | None) -> Float[np.ndarray, "2 n_x"] | No
         return None
     ends = np.array([states.min(axis=0), states.max(axis=0)])
     size = np.maximum(np.ptp(ends, axis=0), abs(ends).max(axis=0))
+    size = np.where(size > FLAT * size.max(), size, np.inf)
     return ends + FAR * np.array([[-1.0], [1.0]]) * size
 
 

@@ -97,7 +97,7 @@ NOT_COUNTED = (
 )
 
 BITS = "it is taken bit by bit of whole numbers: use jnp.all or jnp.any of comparisons"
-"""Of `reduce_and` and `reduce_or`, which are `jnp.all` and `jnp.any` of truth values alone."""
+"""Why `reduce_and` and `reduce_or` are refused: of truth values alone they are all and any."""
 
 
 def of_decisions(

@@ -85,10 +85,8 @@ def recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand]
     """
     found = _recorded(recorder, equation, operands)
     for each in found if isinstance(found, list) else [found]:
-        if isinstance(each, Value) and jnp.issubdtype(equation.kind, jnp.bool_):
-            raise UnsupportedError(jumps.NOT_COUNTED)
-        if isinstance(each, Value) and jnp.issubdtype(equation.kind, jnp.integer):
-            jumps.require_whole(recorder, equation, each)
+        if isinstance(each, Value):
+            jumps.require_of_kind(recorder, equation, each)
     return found
 
 

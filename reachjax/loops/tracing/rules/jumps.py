@@ -445,12 +445,18 @@ def whole_numbers(recorder: Recorder, equation: Equation, value: Value) -> Opera
     return _staircase(recorder, value, whole[0], edges, reached, equation.kind)
 
 
-def require_whole(recorder: Recorder, equation: Equation, value: Value) -> None:
-    """Raise an error unless whole numbers surely are of their kind: JAX wraps those that are not.
+def require_of_kind(recorder: Recorder, equation: Equation, value: Value) -> None:
+    """Raise an error unless JAX computes with numbers of this kind as with any others.
 
-    They are computed with as if there were no end to them.
+    Whole numbers, which it wraps at the ends of their kind, are computed with as if there were no
+    end to them; sums of truth values are to it whether any of them holds.
+
+    Raises:
+        UnsupportedError: whole numbers may leave their range, or it is a truth value.
     """
-    if not value.size:
+    if np.issubdtype(equation.kind, np.bool_):
+        raise UnsupportedError(NOT_COUNTED)
+    if not (value.size and np.issubdtype(equation.kind, np.integer)):
         return
     limits, kind = recorder.limits(value, ConstantLimits), np.iinfo(equation.kind)
     least, most = limits.least.min(), limits.most.max()

@@ -1,4 +1,4 @@
-"""Linear programs over polytopes, on the host by HiGHS (scipy).
+"""Linear programs over polytopes, on the host by HiGHS (scipy), or by all bases if they are few.
 
 An optimal value that comes out of a linear-programming code is only as good as its tolerance, so
 what is used in a certificate is rebuilt from the dual solution: for any `y >= 0`,
@@ -9,6 +9,7 @@ So is how far two polytopes are apart: by weak duality, or by one facet alone.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from scipy.optimize import linprog
 
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.sets.balance import Balanced, balanced, exponents, lengths, upwards
+from reachjax.sets.bases import maximisers_by_bases
 from reachjax.sets.unusable import ThinSetError, UnusableSetError
 
 UNEVEN = 10
@@ -65,8 +67,11 @@ def maximisers(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`maximiser` for `k` directions: multipliers `(k, m)` and points `(k, n)`.
 
-    One linear program with a copy of the polytope for each takes a fraction of the time of many.
+    Few facets are tried by all their bases at once. Else one linear program with a copy of the
+    polytope for each direction takes a fraction of the time of many.
     """
+    if (found := maximisers_by_bases(A, b, directions)) is not None:
+        return found
     k, (m, n) = len(directions), A.shape
     blocks = sp.kron(sp.eye_array(k), A, format="csr")
     result = linprog(
@@ -147,7 +152,23 @@ def boxed(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, Maxima]:
 
     The first guess of the sizes is mended by the box that it leads to. If it leads to none, all
     coordinates are taken to be of one size.
+
+    Returns:
+        What is kept for the next call on the same polytope: arrays that cannot be written to.
     """
+    return _boxed(*(np.asarray(part, float).tobytes() for part in (A, b)), A.shape)
+
+
+@lru_cache(maxsize=64)
+def _boxed(normals: bytes, offsets: bytes, shape: tuple[int, int]) -> tuple[Balanced, Maxima]:
+    """`boxed` of the bytes of `A` and `b`: a set is asked for its box again and again."""
+    region, box = _boxed_anew(np.frombuffer(normals).reshape(shape), np.frombuffer(offsets))
+    for array in (*region, *box):
+        array.flags.writeable = False
+    return region, box
+
+
+def _boxed_anew(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, Maxima]:
     region = Balanced.of(A, b)
     try:
         box = _box(region)

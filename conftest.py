@@ -16,6 +16,8 @@ from pathlib import Path
 import jax
 import pytest
 
+from tests.memory import forget
+
 pytest_plugins = ["tests.campaign.session", "tests.selection"]
 """Their options have to be known before any test is read."""
 
@@ -76,4 +78,4 @@ def _memory_is_bounded(request):
     yield
     every = map(request.config.getoption, ("every_case", "other_cases", "experiments"))
     if taken() > (MOST if any(every) else LARGEST):
-        jax.clear_caches()
+        forget()

@@ -30,7 +30,9 @@ FUNCTIONS = ("sin", "cos", "tanh", "exp", "log", "sqrt")
 
 
 def _entrywise(function: Callable) -> Callable:
-    return np.vectorize(function, otypes=[object])
+    """A function of a number as one of arrays too; of a number it gives a number, no array."""
+    of_arrays = np.vectorize(function, otypes=[object])
+    return lambda y: of_arrays(y) if isinstance(y, np.ndarray) else function(y)
 
 
 EXACT = SimpleNamespace(
@@ -211,10 +213,10 @@ def flowed(rate: Callable[[Any], Any], x: Any, h: float) -> Any:
     for row in range(COLUMNS):
         count = 2 * (row + 1)
         part = (0 * x[0] + h) / count
-        last, here = x, x + part * rate(x)
+        last, here = x, x + rate(x) * part  # a number of mpmath's after the array: it multiplies
         for _ in range(count - 1):
-            last, here = here, last + 2 * part * rate(here)
-        column = (last + here + part * rate(here)) / 2
+            last, here = here, last + rate(here) * (2 * part)
+        column = (last + here + rate(here) * part) / 2
         for k in range(row):
             own, other = count**2, (count - 2 * (k + 1)) ** 2
             rows[k], column = column, (own * column - other * rows[k]) / (own - other)
@@ -237,6 +239,7 @@ class KindCase:
         inputs: what they are projected onto: the ends of a box, or normals and offsets.
         region: the kind of initial set.
         options: of `reach`.
+        known: trajectories in sixty digits that were asked for, which are asked for again.
     """
 
     kind: Kind
@@ -249,6 +252,7 @@ class KindCase:
     inputs: tuple[np.ndarray, np.ndarray]
     region: str
     options: dict[str, Any] = field(default_factory=dict)
+    known: dict[Any, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
     nonempty = True
 
@@ -317,7 +321,7 @@ class KindCase:
         What is negative by less than rounding of these counts as zero.
         """
         with mpmath.workdps(DIGITS):
-            found, state = [], self.states(x, w, v, digits, EXACT)[t]
+            found, state = [], self._in_digits(x, w, v)[t]
             if region.A is not None:
                 found += list(digits(region.b) - digits(region.A) @ state)
             if region.center is not None:
@@ -326,6 +330,13 @@ class KindCase:
                 found.append(1 - (away.T * mpmath.lu_solve(shape, away))[0])
             least = mpmath.mpf(10) ** (25 - DIGITS)
             return [max(each, 0) if abs(each) < least else each for each in found]
+
+    def _in_digits(self, *drawn: Any) -> np.ndarray:
+        """The trajectory of one scenario in so many digits, computed once."""
+        key = tuple(None if part is None else np.asarray(part, float).tobytes() for part in drawn)
+        if key not in self.known:
+            self.known[key] = self.states(*drawn, digits, EXACT)
+        return self.known[key]
 
 
 def _fractions(values: np.ndarray) -> np.ndarray:

@@ -10,7 +10,9 @@ import jax
 import numpy as np
 
 import reachjax as rj
-from reachjax.programs.unrolled import unrolled_from_boxes
+from reachjax.loops.units import UnboundedError
+from reachjax.programs.unrolled import unrolled, unrolled_from_boxes
+from reachjax.tubes.rechecks import Recheck
 from tests.campaign.containment import DRAWS
 from tests.campaign.kinds import KindCase
 from tests.campaign.oracle import WIDE, Region, exact
@@ -25,6 +27,8 @@ DOUBT = 1e-6
 """Of a state's size: what is nearer to a facet may be outside of it."""
 BESIDE = (-1e-9, -1e-12, 0.0, 1e-12, 1e-9, 1e-3, 0.3)
 """Parts of what is attained, by which thresholds stand beside it."""
+LONG = 8
+"""Proofs of more steps are repeated by the recheck of their tube, which takes each step once."""
 
 Scenario = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]
 
@@ -56,7 +60,11 @@ def checked(trial: Trial) -> None:
     trial.outcome.counts["states"] += runs.shape[0] * runs.shape[1]
     for t, region in enumerate(sets[1:], start=1):
         _contained(trial, region, scenarios, runs[:, t], t, f"tube = {call}", "a state outside")
-        _repeated(trial, proofs[t - 1], region, scenarios, runs[:, t], t)
+        _witnessed(trial, proofs[t - 1], t)
+        if case.kind.horizon <= LONG or t == case.kind.horizon:
+            _repeated(trial, proofs[t - 1], region, scenarios, runs[:, t], t)
+    if case.kind.horizon > LONG:
+        _repeated_at_once(trial, names, sets, scenarios, runs)
     if case.kind.columns and isinstance(case.X0, rj.Box):
         _merged(trial, names, scenarios, runs)
     for _ in range(2):
@@ -113,7 +121,7 @@ def _scenarios(case: KindCase, tube: rj.ReachTube, proofs: list) -> list[Scenari
                 x, w, v = loop.split(row)
                 parts = (None if part is None else _lengthened(part, steps) for part in (w, v))
                 found.append((np.asarray(x), *parts))
-    allowed = [case.X0, loop.disturbance, loop.noise]
+    allowed = _allowed(case)
     return [one for one in found if all(map(_holds, allowed, one))]
 
 
@@ -137,14 +145,24 @@ def _extremes(W: Any, count: int, steps: int, seed: int) -> np.ndarray:
     return np.stack(found, axis=1)
 
 
-def _holds(W: Any, points: Any) -> bool:
-    """Whether points surely are in a set, by fractions; those of all times if there are several."""
-    if W is None:
+def _allowed(case: KindCase) -> list[list[Region] | None]:
+    """The sets of initial states, disturbances and noises at each time, one where all are alike."""
+
+    def regions(W: Any) -> list[Region] | None:
+        if W is None:
+            return None
+        return [plain(W)] if W.steps is None else [plain(W.at(t)) for t in range(W.steps)]
+
+    return [regions(W) for W in (case.X0, case.loop.disturbance, case.loop.noise)]
+
+
+def _holds(regions: list[Region] | None, points: Any) -> bool:
+    """Whether points surely are in sets, by fractions; those of all times if there are several."""
+    if regions is None:
         return True
-    if points.ndim == 1:
-        return plain(W).holds(exact(points))
-    sets = [W if W.steps is None else W.at(t) for t in range(len(points))]
-    return all(plain(each).holds(exact(point)) for each, point in zip(sets, points, strict=True))
+    points = exact(np.atleast_2d(points))
+    sets = regions * len(points) if len(regions) == 1 else regions[: len(points)]
+    return all(each.holds(point) for each, point in zip(sets, points, strict=True))
 
 
 def _contained(
@@ -174,6 +192,17 @@ def _listed(part: Any) -> Any:
     return None if part is None else np.asarray(part).tolist()
 
 
+PROOF = ("tube = rj.reach(...)", "proof = tube.proof({})")
+
+
+def _witnessed(trial: Trial, proof: Any, t: int) -> None:
+    """No witness exceeds its bound."""
+    bounds, witnesses = np.asarray(proof.bounds), np.asarray(proof.witnesses)
+    if np.any(witnesses > bounds + ROUNDING * np.maximum(1.0, abs(bounds))):
+        said = f"at t = {t} the gaps are {(bounds - witnesses).tolist()}"
+        trial.fails("a witness exceeds its bound", said, *_lines(t))
+
+
 def _repeated(
     trial: Trial,
     proof: Any,
@@ -183,29 +212,90 @@ def _repeated(
     t: int,
 ) -> None:
     """A recheck repeats the bounds, and slopes that nothing was optimised for hold too."""
-    lines = ("tube = rj.reach(...)", f"proof = tube.proof({t})")
     bounds = np.asarray(proof.bounds)
     size = np.maximum(1.0, abs(bounds))
-    again = trial.attempt("recheck", "proof.recheck()", {"proof": proof}, *lines)
+    again = trial.attempt("recheck", "proof.recheck()", {"proof": proof}, *_lines(t))
     if again is not None and not np.all(np.asarray(again) <= bounds + ROUNDING * size):
         said = f"recheck gives {np.asarray(again).tolist()} for the bounds {bounds.tolist()}"
-        trial.fails("recheck does not repeat the proof", said, *lines)
-    witnesses = np.asarray(proof.witnesses)
-    if np.any(witnesses > bounds + ROUNDING * size):
-        said = f"at t = {t} the gaps are {(bounds - witnesses).tolist()}"
-        trial.fails("a witness exceeds its bound", said, *lines)
+        trial.fails("recheck does not repeat the proof", said, *_lines(t))
     if not isinstance(proof, rj.LinearCertificate) or region.A is None:
         return
-    rng = np.random.default_rng([trial.case.number, t])
+    names = {
+        "proof": proof,
+        "slopes": _spoilt(proof, np.random.default_rng([trial.case.number, t])),
+    }
+    found = trial.attempt("recheck", "proof.recheck(slopes)", names, *_lines(t))
+    if found is not None:
+        _of_garbage(trial, found, region, scenarios, states, t)
+
+
+def _repeated_at_once(
+    trial: Trial,
+    names: dict[str, Any],
+    sets: list[Region],
+    scenarios: list[Scenario],
+    runs: np.ndarray,
+) -> None:
+    """What `_repeated` says of the last step, of those before it, of which each is taken once."""
+    tube, steps = names["tube"], trial.case.kind.horizon
+    trial.attempt("recheck", "again(tube)", {"again": _again, "tube": tube}, _lines(steps)[0])
+    proof = tube.proof(steps)
+    if not isinstance(proof, rj.LinearCertificate):
+        return
+    slopes = _spoilt(proof, np.random.default_rng([trial.case.number, 0]))
+    rows = np.broadcast_to(proof.directions, (steps, *proof.directions.shape))
+    given = proof.loop, proof.X0, proof.X0.bounding_box(), rows, proof.start, slopes
+    found = _offsets(*given)
+    for t, offsets in enumerate(found[: steps - 1], start=1):
+        _of_garbage(trial, offsets, sets[t], scenarios, runs[:, t], t)
+
+
+def _again(tube: rj.ReachTube) -> None:
+    """Prove every step anew.
+
+    Raises:
+        DisagreementError: a bound is not repeated.
+    """
+    recheck = Recheck(tube)
+    while recheck.left:
+        recheck.advance()
+
+
+def _offsets(*given: Any) -> list[np.ndarray]:
+    """Bounds by forms of each step, up to one in which a unit has none."""
+    found = []
+    try:
+        for step in unrolled(*given):
+            found.append(np.asarray(step.offsets))
+    except UnboundedError:
+        pass
+    return found
+
+
+def _spoilt(proof: rj.LinearCertificate, rng: np.random.Generator) -> np.ndarray:
+    """Slopes that nothing was optimised for."""
     slopes = np.asarray(proof.slopes)
-    slopes = slopes + rng.choice([1e-6, 0.1, 10.0]) * rng.normal(size=slopes.shape)
-    names = {"proof": proof, "slopes": slopes}
-    found = trial.attempt("recheck", "proof.recheck(slopes)", names, *lines)
-    if found is None or not np.isfinite(found).all():
+    return slopes + rng.choice([1e-6, 0.1, 10.0]) * rng.normal(size=slopes.shape)
+
+
+def _of_garbage(
+    trial: Trial,
+    found: Any,
+    region: Region,
+    scenarios: list[Scenario],
+    states: np.ndarray,
+    t: int,
+) -> None:
+    """What such slopes prove holds."""
+    if not np.isfinite(found).all():
         return
     trial.outcome.counts["rechecks of garbage"] += 1
     proved = Region(region.A, np.asarray(found)[: len(region.A)])
-    _contained(trial, proved, scenarios, states, t, lines[0], "garbage proves too much")
+    _contained(trial, proved, scenarios, states, t, _lines(t)[0], "garbage proves too much")
+
+
+def _lines(t: int) -> list[str]:
+    return [line.format(t) for line in PROOF]
 
 
 def _decided(
@@ -245,8 +335,7 @@ def _decided(
         if status == "REFUTED":
             one = verdict.counterexample
             parts = (np.asarray(one.states[0]), one.disturbances, one.noises)
-            allowed = (case.X0, case.loop.disturbance, case.loop.noise)
-            if not all(map(_holds, allowed, parts)):
+            if not all(map(_holds, _allowed(case), parts)):
                 trial.fails("false counterexample: not of its sets", expression, lines)
             elif case.room(*parts, half, t)[0] >= 0:
                 trial.fails("false counterexample: it breaks nothing", expression, lines)

@@ -10,13 +10,13 @@ A test is a block of cases whose shapes agree; what failed is printed as Python 
 import itertools
 import json
 
-import jax
 import pytest
 
 from tests.campaign import cases, claims, kinds, of_kinds
 from tests.campaign.architectures import BLOCK, EVERY, architecture
 from tests.campaign.outcomes import Outcome
 from tests.campaign.session import PROPERTY, Journal, numbers
+from tests.memory import forget
 
 MOST_PRINTED = 3
 """So many failing cases of a block are printed; the report has the others."""
@@ -63,7 +63,7 @@ def test_nothing_that_is_said_is_false(block, journal, finished, compiled, reque
     kind = architecture(block[0])
     shapes, anew = kind.loop, isinstance(kind, kinds.Kind) and kind.facets > 0
     if anew or compiled != [shapes]:  # normals are compiled in: programs would pile up
-        jax.clear_caches()
+        forget()
         compiled[:] = [shapes]
     outcomes = []
     for number in block:

@@ -14,7 +14,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
@@ -22,6 +21,7 @@ from tqdm import tqdm
 import conftest  # noqa: F401  (64-bit floats, quick compilation)
 from tests.golden.cases import KEPT, every
 from tests.golden.records import SECONDS, Record, differences, read, recorded, written
+from tests.memory import forget
 
 
 def run(pattern: str, kept: bool) -> dict[str, Record]:
@@ -30,7 +30,7 @@ def run(pattern: str, kept: bool) -> dict[str, Record]:
     found, asked = {}, some if kept else every()
     for case in tqdm([case for case in asked if pattern in case.name], unit="case"):
         found[case.name] = recorded(case)
-        jax.clear_caches()  # what is compiled is compiled in each case's own seconds
+        forget()  # what is compiled is compiled in each case's own seconds
     return found
 
 

@@ -2,12 +2,12 @@
 
 import itertools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.memory import forget
 
 SMALL = 1000
 """Operations of what may be compiled whatever is left of a limit: a step of a loop in plain
@@ -49,7 +49,7 @@ def operations(monkeypatch):
         return compiled(backend, module, *given, **options)
 
     monkeypatch.setattr(compiler, "compile_or_get_cached", counted)
-    jax.clear_caches()
+    forget()
     return counts
 
 

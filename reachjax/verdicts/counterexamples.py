@@ -19,6 +19,7 @@ from reachjax.loops.units import UnboundedError
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
+from reachjax.programs.unrolled import boxes_from_point
 from reachjax.sets import AbstractSet, Box, Ellipsoid
 from reachjax.sets.balance import balanced
 from reachjax.sets.unusable import ThinSetError
@@ -195,13 +196,30 @@ def broken_at(
 
 
 def enclosures(loop: ClosedLoop, scenario: Scenario, steps: int, start: int) -> list[Box]:
-    """Boxes around the states of the exact trajectory of a scenario, rounding accounted for."""
+    """Boxes around the states of the exact trajectory of a scenario, rounding accounted for.
+
+    By forms over all steps; where these have no bounds, from box to box.
+
+    Raises:
+        UnboundedError: neither has, as a unit leaves its domain or a solution escapes.
+    """
     loop, (x0, w, v) = in_numpy(loop), scenario
+    try:
+        found = [Box(x0, x0), *boxes_from_point(loop, scenario, steps, start)]
+        if all(map(_is_finite, found)):
+            return found
+    except UnboundedError:
+        pass
     found = [Box(x0, x0)]
     for t in range(steps):
         drawn = (None if part is None else part[t] for part in (w, v))
         found.append(successor_box(loop, found[-1], start + t, *drawn))
     return found
+
+
+def _is_finite(box: Box) -> bool:
+    """Whether a box has ends that are numbers."""
+    return bool(np.isfinite(box.lower).all() and np.isfinite(box.upper).all())
 
 
 def deviates(

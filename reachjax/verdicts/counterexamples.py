@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
@@ -222,33 +221,74 @@ def _is_finite(box: Box) -> bool:
     return bool(np.isfinite(box.lower).all() and np.isfinite(box.upper).all())
 
 
-def deviates(
-    loop: ClosedLoop, scenario: Scenario, states: Float[np.ndarray, "t n_x"], start: int
-) -> bool:
-    """Whether a simulated trajectory leaves the enclosure of a step by more than rounding.
+class Departure(NamedTuple):
+    """A step that is run otherwise than it is enclosed, by more than rounding.
 
-    Each step is enclosed from the state that was simulated, so that nothing adds up. Then what was
-    simulated is another loop than what is bounded. What is integrated is beside the flow by more
-    than rounding: by about as much as it is beside what twice as many steps say.
+    Attributes:
+        step: how many there are before.
+        coordinate: of the state after it.
+        run: its value, as the loop is run.
+        enclosed: the closest value that the enclosure of this step has.
     """
-    loop, (_, w, v) = in_numpy(loop), scenario
+
+    step: int
+    coordinate: int
+    run: float
+    enclosed: float
+
+
+def departures(
+    loop: ClosedLoop,
+    scenario: Scenario,
+    following: Float[np.ndarray, "h n_x"],
+    start: int,
+) -> Iterator[Departure]:
+    """The steps whose results are beside the enclosures of their recording by more than rounding.
+
+    Each is enclosed from its own state, so that nothing adds up. Where numbers that are compared
+    are equal but for rounding, each winner is right. What is integrated is beside the flow by more
+    than rounding: by about as much as it is beside what twice as many steps say. Steps from which
+    nothing is known to follow, or after which there are no numbers, say nothing.
+
+    Args:
+        loop: the closed loop.
+        scenario: the states `(h, n_x)` from which steps are made, disturbances and noise.
+        following: the state after each.
+        start: the time of the first one.
+    """
+    loop, (states, w, v) = in_numpy(loop), scenario
     plant: Any = loop.plant
     finer = in_numpy(loop.replace(plant=plant.finer)) if plant.continuous else None
-    for t, (x, following) in enumerate(itertools.pairwise(states)):
+    for t, (x, run) in enumerate(zip(states, following, strict=True)):
         drawn = [None if part is None else part[t] for part in (w, v)]
-        reached = successor_box(loop, Box(x, x), start + t, *drawn)
+        try:
+            reached = successor_box(loop, Box(x, x), start + t, *drawn, doubt=TOLERATED)
+        except UnboundedError:
+            continue
         lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
         with np.errstate(over="ignore", invalid="ignore"):
-            beyond = np.maximum(lower - following, following - upper)
-            slack = TOLERATED * (upper - lower + np.spacing(abs(following)))
+            beyond = np.maximum(lower - run, run - upper)
+            slack = TOLERATED * (upper - lower + np.spacing(abs(run)) + TINY)
             if finer is not None:
                 one, other = (
                     each.step(x, start + t, w=drawn[0], v=drawn[1]) for each in (loop, finer)
                 )
                 slack = slack + TOLERATED * np.nan_to_num(abs(other - one), nan=np.inf)
-        if np.any(beyond > slack):
-            return True
-    return False
+            beside = np.flatnonzero((beyond > slack) & np.isfinite(run))
+        if len(beside):
+            i = int(beside[0])
+            yield Departure(t, i, float(run[i]), float(np.clip(run, lower, upper)[i]))
+
+
+def deviates(
+    loop: ClosedLoop, scenario: Scenario, states: Float[np.ndarray, "t n_x"], start: int
+) -> bool:
+    """Whether a simulated trajectory leaves the enclosure of a step by more than rounding.
+
+    Then what was simulated is another loop than what is bounded.
+    """
+    _, *drawn = scenario
+    return any(departures(loop, Scenario(states[:-1], *drawn), states[1:], start))
 
 
 def most_room(item: Requirement, reached: Box) -> float:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.batches import PARTS
@@ -36,6 +36,8 @@ TOLERATED = 16
 """A simulated state may be beside the enclosure of its step by so many widths of that: rounding of
 compiled code is within it, but for what libraries of functions leave out."""
 
+THIN = 1e-9
+"""An enclosure is thin if no coordinate is wider than this, or than this part of its size."""
 
 INWARDS, AROUND = 1e-9, 64
 """By this part of its way to the mean of so many samples a scenario is moved that rounding may have
@@ -242,6 +244,7 @@ def departures(
     scenario: Scenario,
     following: Float[np.ndarray, "h n_x"],
     start: int,
+    known: Sequence[Box] | None = None,
 ) -> Iterator[Departure]:
     """The steps whose results are beside the enclosures of their recording by more than rounding.
 
@@ -255,29 +258,51 @@ def departures(
         scenario: the states `(h, n_x)` from which steps are made, disturbances and noise.
         following: the state after each.
         start: the time of the first one.
+        known: for each step a box that holds what follows the state; what is in it needs no other
+            enclosure, which takes longer. None for none.
     """
     loop, (states, w, v) = in_numpy(loop), scenario
     plant: Any = loop.plant
     finer = in_numpy(loop.replace(plant=plant.finer)) if plant.continuous else None
     for t, (x, run) in enumerate(zip(states, following, strict=True)):
         drawn = [None if part is None else part[t] for part in (w, v)]
+        beside = np.zeros(0)
+        if finer is not None:
+            with np.errstate(all="ignore"):
+                one, other = (
+                    each.step(x, start + t, w=drawn[0], v=drawn[1]) for each in (loop, finer)
+                )
+                beside = TOLERATED * np.nan_to_num(abs(other - one), nan=np.inf)
+        if known is not None and _is_thin(known[t]) and not _excess(known[t], run, beside).any():
+            continue
         try:
             reached = successor_box(loop, Box(x, x), start + t, *drawn, doubt=TOLERATED)
         except UnboundedError:
             continue
-        lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
-        with np.errstate(over="ignore", invalid="ignore"):
-            beyond = np.maximum(lower - run, run - upper)
-            slack = TOLERATED * (upper - lower + np.spacing(abs(run)) + TINY)
-            if finer is not None:
-                one, other = (
-                    each.step(x, start + t, w=drawn[0], v=drawn[1]) for each in (loop, finer)
-                )
-                slack = slack + TOLERATED * np.nan_to_num(abs(other - one), nan=np.inf)
-            beside = np.flatnonzero((beyond > slack) & np.isfinite(run))
+        found = np.flatnonzero(_excess(reached, run, beside))
+        if len(found):
+            i = int(found[0])
+            closest = np.clip(run, np.asarray(reached.lower), np.asarray(reached.upper))
+            yield Departure(t, i, float(run[i]), float(closest[i]))
+
+
+def _is_thin(box: Box) -> bool:
+    """Whether what is in a box is known but for rounding."""
+    lower, upper = np.asarray(box.lower), np.asarray(box.upper)
+    with np.errstate(all="ignore"):
+        return bool(np.all(upper - lower <= THIN * (1 + abs(lower))))
+
+
+def _excess(
+    box: Box, run: Float[np.ndarray, " n_x"], beside: Float[np.ndarray, " k"]
+) -> Bool[np.ndarray, " n_x"]:
+    """Which numbers are out of a box by more than rounding, and than integration leaves out."""
+    lower, upper = np.asarray(box.lower), np.asarray(box.upper)
+    with np.errstate(all="ignore"):
+        slack = TOLERATED * (upper - lower + np.spacing(abs(run)) + TINY)
         if len(beside):
-            i = int(beside[0])
-            yield Departure(t, i, float(run[i]), float(np.clip(run, lower, upper)[i]))
+            slack = slack + beside
+        return (np.maximum(lower - run, run - upper) > slack) & np.isfinite(run)
 
 
 def deviates(

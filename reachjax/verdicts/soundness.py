@@ -17,8 +17,9 @@ from jaxtyping import Float
 from reachjax.loops import ClosedLoop
 from reachjax.loops.closed_loop import Scenario
 from reachjax.loops.scenarios import Runs, Scenarios
+from reachjax.numerics.pytrees import unchecked
 from reachjax.numerics.rounding import TINY
-from reachjax.sets import AbstractSet
+from reachjax.sets import AbstractSet, Box
 from reachjax.verdicts.compiled import TRIALS, compiled_runs, compiled_steps, is_telling
 from reachjax.verdicts.counterexamples import (
     Departure,
@@ -160,7 +161,9 @@ def require_broken(loop: ClosedLoop, example: Counterexample, start: int) -> Non
     states[abs(states) < TINY] = 0.0  # as XLA has it
     drawn = [None if p is None else p[:count] for p in (example.disturbances, example.noises)]
     following = compiled_steps(loop, states, *drawn, start=start)
-    for found in departures(loop, Scenario(states, *drawn), following, start):
+    ends = zip(example.lower[1:], example.upper[1:], strict=True)
+    boxes = [unchecked(Box, lower=lower, upper=upper) for lower, upper in ends]
+    for found in departures(loop, Scenario(states, *drawn), following, start, boxes):
         k = found.step
         here = (None if part is None else part[k] for part in drawn)
         if is_telling(loop, states[k], start + k, *here):

@@ -63,8 +63,13 @@ class DelayedPlant(AbstractPlant):
 
     @property
     def steps(self) -> int | None:
-        """No number of steps: plants that vary in time are not delayed."""
-        return None
+        """The number of times its plant is given for; `None` of one that does not vary in time."""
+        return self.plant.steps
+
+    @property
+    def clock(self) -> bool:
+        """Whether its plant is a function of the time, whatever that is."""
+        return self.plant.clock
 
     @property
     def period(self) -> Any:

@@ -136,12 +136,16 @@ class AffinePlant(AbstractPlant):
         [1.5, 0.0]
     """
 
-    A: Float[Array, "*time n n"] = converted(converter=_one_array("(n_x, n_x)", "(time, n_x, n_x)"))
-    B: Float[Array, "*time n m"] = converted(converter=_one_array("(n_x, n_u)", "(time, n_x, n_u)"))
-    c: Float[Array, "*time n"] = converted(
+    A: Float[Array, "*times_of_A n n"] = converted(
+        converter=_one_array("(n_x, n_x)", "(time, n_x, n_x)")
+    )
+    B: Float[Array, "*times_of_B n m"] = converted(
+        converter=_one_array("(n_x, n_u)", "(time, n_x, n_u)")
+    )
+    c: Float[Array, "*times_of_c n"] = converted(
         converter=_one_array("(n_x,)", "(time, n_x)"), default=None
     )
-    E: Float[Array, "*time n w"] | None = converted(
+    E: Float[Array, "*times_of_E n w"] | None = converted(
         converter=_one_array("(n_x, n_w)", "(time, n_x, n_w)"), default=None
     )
 

@@ -109,6 +109,12 @@ class AffineForms(AbstractNumber):
         forms = cls(rows, radii_of(exact, xp.full(n, xp.inf)))
         return forms.within(Ball.between(*forms.ends(start, cut=True)))
 
+    @classmethod
+    def exact(cls, values: Float[np.ndarray, " k"]) -> AffineForms:
+        """Known numbers, which no column moves, in numpy."""
+        values = np.asarray(values, float)
+        return cls(np.stack([values, values], axis=1), np.zeros((len(values), 2)))
+
     @property
     def off(self) -> Any:
         """By how much each form may be off `(k,)`; nothing where rounding is not counted."""

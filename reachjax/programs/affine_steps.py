@@ -168,6 +168,8 @@ def step_forms(
     before: int = 0,
     spans: list[Between] | None = None,
     few: bool = False,
+    w: AffineForms | None = None,
+    v: AffineForms | None = None,
 ) -> StepForms:
     """One step of the loop, whose own forward pass is run over affine forms.
 
@@ -186,6 +188,8 @@ def step_forms(
         before: how many steps there were since the initial set.
         spans: gets what is in between the samples, of the flow of a differential equation.
         few: whether what units of any kind leave out is summed up.
+        w: the disturbances, where they are known; then the start has no box.
+        v: the noise, where it is known; the same.
     """
     found: list[UnitForms] = []
     done, width, free = 0, state.columns.shape[1], place
@@ -242,10 +246,10 @@ def step_forms(
         return z
 
     merged: list[PartColumns] = []
-    measured, (plant, net) = loop.measured(state, t, apply), (loop.plant, loop.controller)
+    measured, (plant, net) = loop.measured(state, t, apply, v), (loop.plant, loop.controller)
     u = part(loop.controller_layers, plant.inputs, net.propagate, measured, apply)
-    u, w = loop.projected(u, t, apply), loop.pushed(state, t, apply)
-    successor = part(loop.plant_layers, plant.states, plant.propagate, state, u, t, apply, *w)
+    u, pushed = loop.projected(u, t, apply), loop.pushed(state, t, apply, w)
+    successor = part(loop.plant_layers, plant.states, plant.propagate, state, u, t, apply, *pushed)
     if place is None:
         successor = successor.padded(width)
     if successor.off is not NOTHING:

@@ -6,6 +6,7 @@ unit that these bounds call affine is affine.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit, Line, Lines
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.pytrees import pytree, unchecked
-from reachjax.numerics.rounding import Ball, gamma
+from reachjax.numerics.rounding import TINY, Ball, gamma
 from reachjax.sets import Box
 
 MARGINAL = 1e-9
@@ -105,9 +106,12 @@ def _image(unit: AbstractUnit, y: Ball) -> tuple[Ball, Ball]:
     return y, Ball(z.mid, z.rad + rounding) if unit.nonexpansive else z
 
 
-def _value(unit: AbstractUnit, *given: Ball) -> Ball:
-    """What a unit makes of inputs, in numpy."""
-    return _image(unit, Ball.joined(given))[1]
+def _value(doubt: float, unit: AbstractUnit, *given: Ball) -> Ball:
+    """What a unit makes of inputs, in numpy; of one that jumps they are in doubt."""
+    y = Ball.joined(given)
+    if doubt and unit.jumps:
+        y = Ball(y.mid, y.rad + doubt * (y.rad + gamma(1) * abs(y.mid)) + TINY)
+    return _image(unit, y)[1]
 
 
 def _settled(unit: AbstractUnit, y: Ball, z: Ball, lines: Lines) -> tuple[Lines, Array, Array]:
@@ -139,7 +143,9 @@ def _chosen(mask: Array, one: Line, other: Line) -> Line:
     return Line(*(jnp.where(mask, *pair) for pair in zip(one, other, strict=True)))
 
 
-def successor_box(loop: ClosedLoop, box: Box, t: int, w: Any = None, v: Any = None) -> Box:
+def successor_box(
+    loop: ClosedLoop, box: Box, t: int, w: Any = None, v: Any = None, *, doubt: float = 0.0
+) -> Box:
     """A box that surely holds the successors of a box of states, rounding included.
 
     In numpy, where nothing is compiled: it is asked for one trajectory at a time.
@@ -150,6 +156,8 @@ def successor_box(loop: ClosedLoop, box: Box, t: int, w: Any = None, v: Any = No
         t: the time.
         w: the disturbances, where they are known.
         v: the noise, where it is known.
+        doubt: by how many times what rounding may be worth numbers are wider that are compared
+            where the loop jumps: compiled code may take another winner of what is nearly a tie.
 
     Returns:
         A box of numpy arrays, infinite or no numbers where numbers overflow.
@@ -158,7 +166,7 @@ def successor_box(loop: ClosedLoop, box: Box, t: int, w: Any = None, v: Any = No
     drawn = (None if part is None else Ball.exact(np.asarray(part)) for part in (w, v))
     with np.errstate(all="ignore"):
         state = Ball.between(lower, upper)
-        successor = loop.step(state, t, _value, *drawn)
+        successor = loop.step(state, t, partial(_value, doubt), *drawn)
         return unchecked(Box, lower=successor.lower, upper=successor.upper)
 
 

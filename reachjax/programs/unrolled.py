@@ -16,9 +16,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.closed_loop import Scenario
 from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units.smooth import EXTREMES
 from reachjax.numerics.host import in_numpy
+from reachjax.numerics.pytrees import unchecked
 from reachjax.numerics.rounding import is_counted, rounding
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
@@ -95,6 +97,44 @@ def unrolled(
     given = loop, X0, box, directions, t, slopes, known, between, most, wanted
     for found in along_ways(*given):
         yield _together(found)
+
+
+def boxes_from_point(loop: ClosedLoop, scenario: Scenario, steps: int, t: int = 0) -> Iterator[Box]:
+    """Boxes that surely hold the states of one trajectory after 1, ..., N steps, in numpy.
+
+    What rounding and units leave open at a step is carried on by columns of its own, so it grows as
+    the trajectory's own perturbations do: boxes of boxes grow by the size of the Jacobian's entries
+    at each step, whatever the loop contracts.
+
+    Args:
+        loop: of concrete numbers.
+        scenario: of the trajectory.
+        steps: how many.
+        t: the time of its initial state.
+
+    Raises:
+        UnboundedError: a unit has no bounds, or the flow of a differential equation escapes.
+
+    Example:
+        >>> from reachjax import MLP, AffinePlant
+        >>> net = MLP.from_layers([([[1.0], [-1.0]], [0.0, 0.0]), ([[-0.4, 0.4]], [0.0])])
+        >>> loop = ClosedLoop(AffinePlant([[1.0]], [[1.0]]), net)
+        >>> found = boxes_from_point(loop, Scenario(np.ones(1), None, None), 2)
+        >>> [box.upper.round(6).tolist() for box in found]
+        [[0.6], [0.36]]
+    """
+    loop, (x0, *drawn) = in_numpy(loop), scenario
+    point = unchecked(Box, lower=np.asarray(x0), upper=np.asarray(x0))
+    start = InitialColumns.of(point, point, loop.curved)
+    if loop.is_disturbed:  # what else bounds units is of all that may be drawn
+        start = start.replace(box=None)
+    state = AffineForms.beginning(start)
+    for k in range(steps):
+        w, v = (None if part is None else AffineForms.exact(part[k]) for part in drawn)
+        with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
+            state = step_forms(loop, state, t + k, start, before=k, few=True, w=w, v=v).successor
+            lower, upper = state.ends(start)
+        yield unchecked(Box, lower=lower, upper=upper)
 
 
 def along_ways(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.batches import PARTS
@@ -19,6 +18,7 @@ from reachjax.loops.units import UnboundedError
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import TINY, gamma
 from reachjax.programs.bounds import successor_box
+from reachjax.programs.unrolled import boxes_from_point
 from reachjax.sets import AbstractSet, Box, Ellipsoid
 from reachjax.sets.balance import balanced
 from reachjax.sets.unusable import ThinSetError
@@ -36,6 +36,8 @@ TOLERATED = 16
 """A simulated state may be beside the enclosure of its step by so many widths of that: rounding of
 compiled code is within it, but for what libraries of functions leave out."""
 
+THIN = 1e-9
+"""An enclosure is thin if no coordinate is wider than this, or than this part of its size."""
 
 INWARDS, AROUND = 1e-9, 64
 """By this part of its way to the mean of so many samples a scenario is moved that rounding may have
@@ -195,8 +197,20 @@ def broken_at(
 
 
 def enclosures(loop: ClosedLoop, scenario: Scenario, steps: int, start: int) -> list[Box]:
-    """Boxes around the states of the exact trajectory of a scenario, rounding accounted for."""
+    """Boxes around the states of the exact trajectory of a scenario, rounding accounted for.
+
+    By forms over all steps; where these have no bounds, from box to box.
+
+    Raises:
+        UnboundedError: neither has, as a unit leaves its domain or a solution escapes.
+    """
     loop, (x0, w, v) = in_numpy(loop), scenario
+    try:
+        found = [Box(x0, x0), *boxes_from_point(loop, scenario, steps, start)]
+        if all(map(_is_finite, found)):
+            return found
+    except UnboundedError:
+        pass
     found = [Box(x0, x0)]
     for t in range(steps):
         drawn = (None if part is None else part[t] for part in (w, v))
@@ -204,33 +218,102 @@ def enclosures(loop: ClosedLoop, scenario: Scenario, steps: int, start: int) -> 
     return found
 
 
+def _is_finite(box: Box) -> bool:
+    """Whether a box has ends that are numbers."""
+    return bool(np.isfinite(box.lower).all() and np.isfinite(box.upper).all())
+
+
+class Departure(NamedTuple):
+    """A step that is run otherwise than it is enclosed, by more than rounding.
+
+    Attributes:
+        step: how many there are before.
+        coordinate: of the state after it.
+        run: its value, as the loop is run.
+        enclosed: the closest value that the enclosure of this step has.
+    """
+
+    step: int
+    coordinate: int
+    run: float
+    enclosed: float
+
+
+def departures(
+    loop: ClosedLoop,
+    scenario: Scenario,
+    following: Float[np.ndarray, "h n_x"],
+    start: int,
+    known: Sequence[Box] | None = None,
+) -> Iterator[Departure]:
+    """The steps whose results are beside the enclosures of their recording by more than rounding.
+
+    Each is enclosed from its own state, so that nothing adds up. Where numbers that are compared
+    are equal but for rounding, each winner is right. What is integrated is beside the flow by more
+    than rounding: by about as much as it is beside what twice as many steps say. Steps from which
+    nothing is known to follow, or after which there are no numbers, say nothing.
+
+    Args:
+        loop: the closed loop.
+        scenario: the states `(h, n_x)` from which steps are made, disturbances and noise.
+        following: the state after each.
+        start: the time of the first one.
+        known: for each step a box that holds what follows the state; what is in it needs no other
+            enclosure, which takes longer. None for none.
+    """
+    loop, (states, w, v) = in_numpy(loop), scenario
+    plant: Any = loop.plant
+    finer = in_numpy(loop.replace(plant=plant.finer)) if plant.continuous else None
+    for t, (x, run) in enumerate(zip(states, following, strict=True)):
+        drawn = [None if part is None else part[t] for part in (w, v)]
+        beside = np.zeros(0)
+        if finer is not None:
+            with np.errstate(all="ignore"):
+                one, other = (
+                    each.step(x, start + t, w=drawn[0], v=drawn[1]) for each in (loop, finer)
+                )
+                beside = TOLERATED * np.nan_to_num(abs(other - one), nan=np.inf)
+        if known is not None and _is_thin(known[t]) and not _excess(known[t], run, beside).any():
+            continue
+        try:
+            reached = successor_box(loop, Box(x, x), start + t, *drawn, doubt=TOLERATED)
+        except UnboundedError:
+            continue
+        found = np.flatnonzero(_excess(reached, run, beside))
+        if len(found):
+            i = int(found[0])
+            closest = np.clip(run, np.asarray(reached.lower), np.asarray(reached.upper))
+            yield Departure(t, i, float(run[i]), float(closest[i]))
+
+
+def _is_thin(box: Box) -> bool:
+    """Whether what is in a box is known but for rounding."""
+    lower, upper = np.asarray(box.lower), np.asarray(box.upper)
+    with np.errstate(all="ignore"):
+        return bool(np.all(upper - lower <= THIN * (1 + abs(lower))))
+
+
+def _excess(
+    box: Box, run: Float[np.ndarray, " n_x"], beside: Float[np.ndarray, " k"]
+) -> Bool[np.ndarray, " n_x"]:
+    """Which numbers are out of a box by more than rounding, and than integration leaves out."""
+    lower, upper = np.asarray(box.lower), np.asarray(box.upper)
+    with np.errstate(all="ignore"):
+        slack = TOLERATED * (upper - lower + np.spacing(abs(run)) + TINY)
+        if len(beside):
+            slack = slack + beside
+        return (np.maximum(lower - run, run - upper) > slack) & np.isfinite(run)
+
+
 def deviates(
     loop: ClosedLoop, scenario: Scenario, states: Float[np.ndarray, "t n_x"], start: int
 ) -> bool:
     """Whether a simulated trajectory leaves the enclosure of a step by more than rounding.
 
-    Each step is enclosed from the state that was simulated, so that nothing adds up. Then what was
-    simulated is another loop than what is bounded. What is integrated is beside the flow by more
-    than rounding: by about as much as it is beside what twice as many steps say.
+    Then what was simulated is another loop than what is bounded.
     """
-    loop, (_, w, v) = in_numpy(loop), scenario
-    plant: Any = loop.plant
-    finer = in_numpy(loop.replace(plant=plant.finer)) if plant.continuous else None
-    for t, (x, following) in enumerate(itertools.pairwise(states)):
-        drawn = [None if part is None else part[t] for part in (w, v)]
-        reached = successor_box(loop, Box(x, x), start + t, *drawn)
-        lower, upper = np.asarray(reached.lower), np.asarray(reached.upper)
-        with np.errstate(over="ignore", invalid="ignore"):
-            beyond = np.maximum(lower - following, following - upper)
-            slack = TOLERATED * (upper - lower + np.spacing(abs(following)))
-            if finer is not None:
-                one, other = (
-                    each.step(x, start + t, w=drawn[0], v=drawn[1]) for each in (loop, finer)
-                )
-                slack = slack + TOLERATED * np.nan_to_num(abs(other - one), nan=np.inf)
-        if np.any(beyond > slack):
-            return True
-    return False
+    _, *drawn = scenario
+    return any(departures(loop, Scenario(states[:-1], *drawn), states[1:], start))
 
 
 def most_room(item: Requirement, reached: Box) -> float:

@@ -55,9 +55,10 @@ from reachjax.sets import AbstractSet
 from reachjax.verdicts.cell_decisions import decided_by_cells
 from reachjax.verdicts.cell_tasks import CellTask, far_from, is_beyond
 from reachjax.verdicts.closing import closed
+from reachjax.verdicts.compiled import compiled_runs
 from reachjax.verdicts.findings import Findings
 from reachjax.verdicts.grounds import Asked, ClimbRecord, Grounds
-from reachjax.verdicts.soundness import compiled_runs, require_unbroken, worst_of
+from reachjax.verdicts.soundness import require_unbroken, worst_of
 from reachjax.verdicts.specification import (
     AvoidSets,
     Region,

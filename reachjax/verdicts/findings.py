@@ -20,7 +20,7 @@ from reachjax.numerics.host import in_numpy
 from reachjax.numerics.rounding import TINY
 from reachjax.sets import AbstractSet
 from reachjax.verdicts.counterexamples import counterexample, suspects
-from reachjax.verdicts.soundness import Claim
+from reachjax.verdicts.soundness import Claim, require_broken
 from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.verdict import Counterexample, Verdict, VerdictStatus
 
@@ -115,6 +115,9 @@ class Findings:
         Args:
             runs: from the initial set.
             items: of which requirements; None of all.
+
+        Raises:
+            UnsoundError: JAX runs a counterexample otherwise than it is enclosed.
         """
         runs = runs.some(np.isfinite(runs.states).all(axis=(1, 2)))
         if not len(runs.states):
@@ -127,7 +130,11 @@ class Findings:
             )
             row[item.time] = np.fmin(row[item.time], rooms.min())
             found += suspects(self._on_host, item, rooms, runs)
-        self.example = self.example or counterexample(self._loop, self._X0, found, self._start)
+        if self.example is None:
+            example = counterexample(self._loop, self._X0, found, self._start)
+            if example is not None:
+                require_broken(self._loop, example, self._start)
+            self.example = example
 
     def verdict(self, ends: Mapping[Any, int] | None = None, **more: Any) -> Verdict:
         """The verdict from everything proved and simulated so far.

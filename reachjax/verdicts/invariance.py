@@ -25,6 +25,7 @@ from reachjax.programs.relaxations import BranchAndCut
 from reachjax.sets import AbstractSet, PolyhedralSet
 from reachjax.sets.ball_polytopes import inner_polytope
 from reachjax.tubes.reach import ReachTube
+from reachjax.verdicts.compiled import compiled_runs
 from reachjax.verdicts.counterexamples import SUSPECTS, counterexample, suspects
 from reachjax.verdicts.decide import decide
 from reachjax.verdicts.findings import rooms_of
@@ -35,7 +36,7 @@ from reachjax.verdicts.recurrent_sets import (
     periods,
     within,
 )
-from reachjax.verdicts.soundness import Claim, compiled_runs, require_unbroken, worst_of
+from reachjax.verdicts.soundness import Claim, require_broken, require_unbroken, worst_of
 from reachjax.verdicts.specification import AvoidSets, Region, Requirement, period_of, requirements
 from reachjax.verdicts.verdict import Counterexample, Recurrence, Verdict, VerdictStatus
 
@@ -103,6 +104,7 @@ def for_ever(
     wanted, runs = Wanted(safe, tuple(avoid or ())), _long_runs(loop, X0, start, seed, budget)
     example = _broken_later(loop, X0, wanted, runs, start, budget)
     if example is not None:
+        require_broken(loop, example, start)
         refuted = VerdictStatus.REFUTED
         return dataclasses.replace(verdict, status=refuted, counterexample=example)
     if verdict.status is VerdictStatus.UNKNOWN:

@@ -2,30 +2,34 @@
 
 Bounds, and trajectories on the host, come from one reading of the loop's functions. Were that
 reading wrong, both would be, and agree. So some trajectories of the loop as it is compiled are held
-against what is proved. One that breaks it by more than rounding is no verdict but an error.
+against what is proved. One that breaks it by more than rounding is no verdict but an error. What is
+refuted rests on an enclosed trajectory, each step of which is held against the compiled one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.closed_loop import Scenario
 from reachjax.loops.scenarios import Runs, Scenarios
-from reachjax.loops.tracing.functions import Compiled
-from reachjax.numerics.compilations import ONCE
-from reachjax.sets import AbstractSet
-from reachjax.verdicts.counterexamples import deviates, enclosures, most_room
+from reachjax.numerics.pytrees import unchecked
+from reachjax.numerics.rounding import TINY
+from reachjax.sets import AbstractSet, Box
+from reachjax.verdicts.compiled import TRIALS, compiled_runs, compiled_steps, is_telling
+from reachjax.verdicts.counterexamples import (
+    Departure,
+    departures,
+    deviates,
+    enclosures,
+    most_room,
+)
 from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.verdict import Counterexample, DecidedCell, VerdictStatus
-
-TRIALS = 64
-"""So many trajectories are run by JAX where bounds and simulations are of the host."""
 
 EXAMINED = 3
 """So many of the worst trajectories of each requirement are examined with their rounding."""
@@ -35,7 +39,7 @@ SHOWN = 1e-9
 
 
 class UnsoundError(Exception):
-    """Something is proved that a trajectory of the loop breaks by more than rounding.
+    """Something is proved or refuted of another loop than JAX runs, by more than rounding.
 
     This is a defect of reachjax, and of no argument that it was given; none of what it says of this
     loop can be relied on. Please report it, with the loop and the trajectory.
@@ -43,9 +47,11 @@ class UnsoundError(Exception):
     Attributes:
         requirement: which part of the specification: `goal`, `safe` or `avoid[i]`.
         time: when, in steps after the initial set.
-        certified: the margin that was proved.
+        certified: the margin that was proved; NaN of what was refuted.
         simulated: the margin of the trajectory.
         states: `(time + 1, n_x)`, the trajectory.
+        departs: of what was refuted, the step that JAX runs otherwise than it is enclosed: `step`,
+            `coordinate`, and its values `run` and `enclosed`; None of what was proved.
     """
 
     def __init__(
@@ -55,19 +61,32 @@ class UnsoundError(Exception):
         certified: float,
         simulated: float,
         states: Float[np.ndarray, "t n_x"],
+        departs: Departure | None = None,
     ):
+        if departs is None:
+            said = (
+                f"{requirement} at t = {time} is certified with margin {certified:+.4g}, but the "
+                f"trajectory {np.asarray(states).tolist()} has margin {simulated:+.4g}, and "
+                "rounding is less than that"
+            )
+        else:
+            said = (
+                f"{requirement} at t = {time} is broken by the trajectory "
+                f"{np.asarray(states).tolist()} with margin {simulated:+.4g}, but JAX runs the "
+                f"loop otherwise: coordinate {departs.coordinate} of the state after step "
+                f"{departs.step} is {departs.run!r} there, and in the enclosure of the step at "
+                f"closest {departs.enclosed!r}, which rounding does not explain"
+            )
         super().__init__(
-            f"{requirement} at t = {time} is certified with margin {certified:+.4g}, but the "
-            f"trajectory {np.asarray(states).tolist()} has margin {simulated:+.4g}, and rounding "
-            "is less than that: this is a defect of reachjax, and nothing that it says of this "
-            "loop can be relied on. Please report it, with the loop and this trajectory"
+            f"{said}: this is a defect of reachjax, and nothing that it says of this loop can be "
+            "relied on. Please report it, with the loop and this trajectory"
         )
         self.requirement, self.time, self.states = requirement, time, np.asarray(states)
-        self.certified, self.simulated = certified, simulated
+        self.certified, self.simulated, self.departs = certified, simulated, departs
 
     def __reduce__(self) -> tuple[Any, ...]:
         given = self.requirement, self.time, self.certified, self.simulated, self.states
-        return type(self), given
+        return type(self), (*given, self.departs)
 
 
 class Claim(NamedTuple):
@@ -117,6 +136,41 @@ def require_unbroken(
                 raise UnsoundError(*given)
 
 
+def require_broken(loop: ClosedLoop, example: Counterexample, start: int) -> None:
+    """Raise an error if JAX runs a step of a counterexample otherwise than it is enclosed.
+
+    Each step is run from the middle of its own enclosure, so that loops that amplify rounding, or
+    go another way at a tie, are held to single steps alone. A step in numbers of few bits, or too
+    large or too small for XLA, is held to nothing.
+
+    Args:
+        loop: the closed loop, of numbers.
+        example: with an enclosure.
+        start: the time of its initial state.
+
+    Raises:
+        UnsoundError: JAX does: what is refuted may be true.
+    """
+    if example.lower is None or example.upper is None:
+        return
+    count, states = example.time, np.array(example.states[: example.time])
+    middles = example.lower[:count] + (example.upper - example.lower)[:count] / 2
+    known = np.asarray(np.isfinite(middles).all(axis=1))
+    known[:1] = False  # where it begins is exact
+    states[known] = middles[known]
+    states[abs(states) < TINY] = 0.0  # as XLA has it
+    drawn = [None if p is None else p[:count] for p in (example.disturbances, example.noises)]
+    following = compiled_steps(loop, states, *drawn, start=start)
+    ends = zip(example.lower[1:], example.upper[1:], strict=True)
+    boxes = [unchecked(Box, lower=lower, upper=upper) for lower, upper in ends]
+    for found in departures(loop, Scenario(states, *drawn), following, start, boxes):
+        k = found.step
+        here = (None if part is None else part[k] for part in drawn)
+        if is_telling(loop, states[k], start + k, *here):
+            given = example.requirement, count, np.nan, -example.violation
+            raise UnsoundError(*given, example.states[: count + 1], found)
+
+
 def _contradicts(
     loop: ClosedLoop,
     scenarios: Scenarios,
@@ -146,34 +200,6 @@ def worst_of(runs: Runs, items: Sequence[Requirement]) -> Float[np.ndarray, "c s
     worst = np.argsort(rooms)[: TRIALS // 2]
     others = np.arange(len(rooms))[:: -(-len(rooms) // (TRIALS // 2))]
     return runs.scenarios[np.union1d(worst, others)]
-
-
-def compiled_runs(
-    loop: ClosedLoop, scenarios: Scenarios, rows: Float[np.ndarray, "c s"], start: int
-) -> Runs:
-    """Trajectories of some scenarios as JAX runs the loop, step by step: one step is compiled."""
-    rows = np.asarray(rows)[:TRIALS]
-    if not len(rows):
-        return Runs(rows, np.zeros((0, scenarios.steps + 1, loop.states)))
-    states, *drawn = scenarios.split(np.resize(rows, (TRIALS, rows.shape[1])))
-    loop, found = jax.device_put(loop), [states]
-    for k in range(scenarios.steps):
-        at = [None if part is None else part[:, k] for part in drawn]
-        found.append(_stepped(loop, found[-1], start + k, *at))
-    return Runs(rows, np.stack(jax.device_get(found), axis=1)[: len(rows)])
-
-
-@partial(Compiled, compiler_options=ONCE)
-def _stepped(
-    loop: ClosedLoop,
-    states: Float[Array, "c n_x"],
-    t: int,
-    disturbances: Float[Array, "c n_w"] | None,
-    noises: Float[Array, "c n_x"] | None,
-) -> Float[Array, "c n_x"]:
-    """The successors of many states."""
-    given = states, disturbances, noises
-    return jax.vmap(lambda x, w, v: loop.step(x, t, w=w, v=v))(*given)
 
 
 def require_unbroken_cells(

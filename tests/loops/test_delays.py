@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.loops.delays import DelayedPlant
 
 RATE, H = 0.5, 0.25
 NET = rj.MLP.from_layers([([[-0.4, -0.2]], [0.1])])
@@ -82,3 +83,51 @@ def test_errors_of_delays_name_what_is_wrong():
         rj.delayed(loops()[0], 0)
     with pytest.raises(TypeError, match="region must be a Box"):
         rj.with_inputs(rj.Ellipsoid([0.0], [[1.0]]), 1)
+
+
+def in_time():
+    """Plants that vary in time, whose last state is an input on its way."""
+    A = jnp.stack([jnp.array([[a, 0.0], [0.0, 1.0]]) for a in (0.5, 0.6, 0.7, 0.8)])
+    return {
+        "function": rj.NonlinearPlant.timed(
+            lambda x, u, t: jnp.array([x[0] / 2 + 1e-3 * t + u[0], x[1]]), 2, 1
+        ),
+        "equation": rj.SampledPlant(
+            lambda x, u, t: jnp.array([1e-2 * t - x[0] + u[0], 0.0]), 2, 1, 0.5, clock=True
+        ),
+        "matrices": rj.AffinePlant(A, [[1.0], [0.0]]),
+    }
+
+
+def late_in_time(kind):
+    net = rj.MLP.from_layers([([[0.0, 0.0]], [0.0])])
+    return rj.ClosedLoop(DelayedPlant(in_time()[kind], 1), net)
+
+
+@pytest.mark.parametrize("kind", in_time())
+def test_what_is_late_varies_in_time_as_its_plant_does(kind, tmp_path):
+    loop, plant, X = late_in_time(kind), in_time()[kind], rj.Box([-1.0, 0.0], [1.0, 0.0])
+    assert loop.varies
+    assert (loop.steps, loop.plant.clock) == (plant.steps, plant.clock)
+    tube, safe = rj.reach(loop, X, 2, rj.Template.box(2)), rj.Box([-5.0, -5.0], [5.0, 5.0])
+    tube.save(tmp_path / "a.tube")
+    for each in (tube, rj.load(tmp_path / "a.tube", loop, recheck=True)):
+        with pytest.raises(ValueError, match="do not vary in time"):
+            rj.verify(each, safe=safe, forever=True)
+
+
+def test_matrices_of_several_times_have_no_later_ones_though_inputs_are_late(tmp_path):
+    loop, X = late_in_time("matrices"), rj.Box([-1.0, 0.0], [1.0, 0.0])
+    with pytest.raises(ValueError, match="time"):
+        rj.reach(loop, X, 5, rj.Template.box(2))
+    rj.reach(loop, X, 4, rj.Template.box(2)).save(tmp_path / "a.tube")
+    assert rj.load(tmp_path / "a.tube").loop.steps == 4
+
+
+def test_a_late_plant_that_drifts_is_not_closed_by_a_set_that_it_comes_back_to():
+    loop = late_in_time("function")
+    drifts = rj.decide(
+        loop, rj.Box([-1.0, 0.0], [1.0, 0.0]), 120, safe=rj.Box([-2.0] * 2, [2.0] * 2)
+    )
+    assert drifts.proved
+    assert drifts.recurrence is None

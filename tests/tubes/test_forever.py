@@ -166,8 +166,8 @@ def test_what_cannot_be_asked_for_is_named():
 
 
 @pytest.mark.costly
-def test_a_set_to_return_into_of_which_nothing_is_safe_is_none():
-    """Trajectories end beside what is safe, later than anything proved: that is unknown."""
+def test_a_set_to_return_into_of_which_nothing_is_safe_is_none(monkeypatch):
+    """Trajectories end beside what is safe, later than anything proved: they refute it."""
     modes = np.array([[1.0, 1.0], [1.0, 0.3]])
     A = modes @ np.diag([0.995, -0.9]) @ np.linalg.inv(modes)
     end = 10 * modes[:, 0]
@@ -176,7 +176,11 @@ def test_a_set_to_return_into_of_which_nothing_is_safe_is_none():
     X0, safe = rj.Box([-0.01, -0.01], [0.01, 0.01]), rj.Polytope([[1.0, 0.0]], [6.0])
     tube = rj.reach(loop, X0, 125, rj.Template.box(2), rj.LinearBounds())
     verdict = rj.verify(tube, safe=safe, samples=20, forever=True)
-    assert verdict.status is rj.VerdictStatus.UNKNOWN
+    assert verdict.refuted
+    assert verdict.counterexample.time > 125
+    assert np.max(verdict.counterexample.upper - verdict.counterexample.lower) < 1e-9
+    monkeypatch.setattr("reachjax.verdicts.invariance.counterexample", lambda *_: None)
+    assert rj.verify(tube, safe=safe, samples=20, forever=True).status is rj.VerdictStatus.UNKNOWN
 
 
 @pytest.mark.parametrize("kind", ["box", "polytope"])

@@ -1,13 +1,17 @@
 """A verdict that a trajectory of the compiled loop breaks is an error, whoever says it."""
 
+import pickle
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import reachjax as rj
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.affine import AffineForms
+from reachjax.verdicts.compiled import is_telling
 
 X0 = rj.Box([0.5], [1.0])
 INSIDE = rj.Box([-0.2], [1.2])
@@ -91,3 +95,135 @@ def test_what_is_touched_but_for_rounding_is_no_error(name, beside):
     touched = rj.Box([0.0], [1.0 + beside])  # where trajectories are, and bounds all but are
     found = str(CALLS[name](sound_loop(1.0), safe=touched))
     assert "REFUTED" not in found
+
+
+AWAY = rj.Box([1.0], [3.0])
+"""Where the loop that is run is after two steps, and the one that bounds are of is not."""
+
+
+REFUTING = {
+    "decide": lambda loop: rj.decide(loop, X0, 2, goal=AWAY),
+    "decide by cells": lambda loop: rj.decide(loop, X0, 2, goal=AWAY, cells=4),
+    "verify for ever": lambda loop: rj.verify(
+        rj.reach(loop, X0, 2, rj.Template.box(1)),
+        avoid=[rj.Box([-0.1], [0.1])],
+        samples=20,
+        forever=True,
+    ),
+}
+
+
+@pytest.mark.parametrize("call", REFUTING.values(), ids=REFUTING)
+def test_what_is_refuted_of_a_loop_that_is_misread_is_no_verdict_but_an_error(call):
+    with pytest.raises(rj.UnsoundError) as raised:
+        call(misread_loop())
+    error = raised.value
+    assert error.departs.step == 0
+    assert error.departs.coordinate == 0
+    x = error.states[0, 0]
+    assert error.departs.run == pytest.approx(1.5 * x)
+    assert error.departs.enclosed == pytest.approx(0.75 * x)
+    assert np.isnan(error.certified)
+    assert error.simulated < 0
+    for shown in ("JAX runs the loop otherwise", f"{error.departs.run!r}", "report"):
+        assert shown in str(error)
+    assert "certified" not in str(error)
+    again = pickle.loads(pickle.dumps(error))
+    assert again.departs == error.departs
+    assert str(again) == str(error)
+
+
+def runs_as(change: Any) -> rj.ClosedLoop:
+    """`x+ = x / 2` as it is read; as JAX runs it, a function of the state and of that."""
+
+    @pytree
+    class Plant(rj.AffinePlant):
+        def propagate(self, x: Any, u: Any, t: Any = 0, unit: Any = None, w: Any = None) -> Any:
+            following = rj.AffinePlant.propagate(self, x, u, t, unit, w)
+            return change(x, following) if isinstance(following, jax.Array) else following
+
+    net = rj.MLP.from_layers([([[0.0]], [0.0])])
+    return rj.ClosedLoop(Plant([[0.5]], [[1.0]], [0.0]), net)
+
+
+def in_turns(x, following):
+    """What a loop adds up: some numbers of it are hidden in its turns."""
+
+    def turn(carry, _):
+        return carry * 1e-60, None
+
+    tiny, _ = jax.lax.scan(turn, x, None, length=6)
+    return following - x + tiny * 1e300 * 1e60
+
+
+LAWFUL = {
+    "few bits": lambda x, following: following.astype(jnp.float32).astype(float),
+    "taken for zero": lambda x, following: following - x**2 + (1e-170 * x) ** 2 * 1e300 * 1e40,
+    "too large": lambda x, following: following - x**-2 + 1 / (1e170 * x) ** 2 * 1e300 * 1e40,
+    "in turns": in_turns,
+    "no numbers": lambda x, following: following + jnp.sqrt(-x),
+}
+"""What compiled code makes of a function otherwise than exact arithmetic."""
+
+
+@pytest.mark.parametrize("change", LAWFUL.values(), ids=LAWFUL)
+def test_numbers_that_are_too_large_or_small_or_short_say_nothing_against_what_is_refuted(change):
+    loop, x = runs_as(change), jnp.array([0.7])
+    assert not abs(loop.step(x, 0) - x / 2)[0] < 1e-9  # a departure, were it not for its numbers
+    assert rj.decide(loop, rj.Box([0.51], [0.93]), 2, goal=AWAY).refuted
+
+
+MISREAD = {
+    "a function": lambda x, following: following + jnp.sin(x),
+    "by little": lambda x, following: following * (1 + 1e-12),
+    "behind a mask": lambda x, following: jnp.max(
+        jnp.where(jnp.array([True, False]), following + 1e-3, -jnp.inf), keepdims=True
+    ),
+    "in turns": lambda x, following: jax.lax.fori_loop(0, 3, lambda k, y: y + 0.1, following),
+    "of a call": lambda x, following: jax.jit(jnp.tanh)(following),
+    "of a branch": lambda x, following: jax.lax.cond(x[0] > 0, jnp.cos, lambda y: y, following),
+}
+
+
+@pytest.mark.parametrize("change", MISREAD.values(), ids=MISREAD)
+def test_other_numbers_say_that_a_refuted_loop_is_misread(change):
+    with pytest.raises(rj.UnsoundError, match="JAX runs the loop otherwise"):
+        rj.decide(runs_as(change), X0, 2, goal=AWAY)
+
+
+def test_steps_tell_something_by_their_own_numbers():
+    x = np.array([0.7])
+    for change in LAWFUL.values():
+        assert not is_telling(runs_as(change), x, 0)
+    for change in MISREAD.values():
+        assert is_telling(runs_as(change), x, 0)
+
+
+def free_loop(f):
+    net = rj.MLP.from_layers([([[0.0]], [0.0])])
+    return rj.ClosedLoop(rj.NonlinearPlant(f, 1, 1), net)
+
+
+def test_a_chaotic_loop_is_held_to_single_steps_when_it_is_refuted():
+    """Twenty steps take the last bit of a compiled trajectory to the fifth digit."""
+    loop = free_loop(lambda x, u: 3.9 * x * (1 - x) + u)
+    start = rj.Box([0.3], [0.3001])
+    assert rj.decide(loop, start, 20, goal=rj.Box([2.0], [3.0])).refuted
+
+
+TIES = {
+    "a step": lambda x, u: jnp.where(x + 0.1 - 0.2 > 0.3, x + 2.0, x - 2.0) + u,
+    "a sign": lambda x, u: x + jnp.sign(x - 0.4) + u,
+    "a choice": lambda x, u: (
+        jnp.array([1.0, 5.0])[jnp.argmax(jnp.concatenate([x + 0.1, x / 3 + 0.1 + 2 * x / 3]))][None]
+        + u
+    ),
+}
+
+
+@pytest.mark.parametrize("f", TIES.values(), ids=TIES)
+def test_at_a_tie_each_winner_is_right_also_where_something_is_refuted(f):
+    """What is required is broken after either, and at the next step again."""
+    loop = free_loop(f)
+    start = rj.Box([0.4], [0.4])
+    assert rj.decide(loop, start, 1, goal=rj.Box([20.0], [30.0])).refuted

@@ -182,7 +182,7 @@ def flowed(
         if between:
             last = h * Series.value(tape, [found, *given])
             inner = here + (1 / 3) * terms[0], found - (1 / 3) * last
-            fourth = _largest(terms[3].ball) if sketches else piece.fourth
+            fourth: Any = _largest(terms[3].ball) if sketches else piece.fourth
             wide = [point.widened(fourth / 16) for point in (here, *inner, found)]
             *wide, state = split(_composed(joined([*wide, found]), state), 5)
             controls.append(Control(tuple(wide), part))

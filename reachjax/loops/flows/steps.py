@@ -177,10 +177,14 @@ def flowed(
         proved = proved & holds
         sketches = between and piece.fourth is None
         terms = solved(tape, here, given, h, max(piece.order, 4 if sketches else 1))
-        found = _sum([here, *terms[: piece.order]])
+        polynomial = terms[: piece.order]
+        found = _sum([here, *polynomial])
         found = (found + piece.remainder.mid).widened(piece.remainder.rad * (1 + gamma(4)))
         if between:
-            last = h * Series.value(tape, [found, *given])
+            if sketches:  # the polynomial's own rate takes no unit
+                last = _sum([float(k) * term for k, term in enumerate(polynomial, start=1)])
+            else:
+                last = h * Series.value(tape, [found, *given])
             inner = here + (1 / 3) * terms[0], found - (1 / 3) * last
             fourth: Any = _largest(terms[3].ball) if sketches else piece.fourth
             wide = [point.widened(fourth / 16) for point in (here, *inner, found)]

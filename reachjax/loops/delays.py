@@ -94,6 +94,10 @@ class DelayedPlant(AbstractPlant):
         """The plant of a part of each period."""
         return self.replace(plant=self._sampled.shortened(part))
 
+    def prepared(self) -> DelayedPlant:
+        """The plant with what all its steps have in common computed."""
+        return self.replace(plant=self.plant.prepared())
+
     def beginning(self, x: Any, u: Any) -> tuple[Any, Any]:
         """What a period begins with: inputs that have moved up, and the one that acts."""
         n, N, m = self.own, self.states, self.inputs

@@ -71,6 +71,10 @@ class AbstractPlant(Replaceable, abc.ABC):
     def steps(self) -> int | None:
         """The number of times a time-varying plant is given for; `None` when time-invariant."""
 
+    def prepared(self) -> AbstractPlant:
+        """The plant with what all steps have in common computed: itself, if that is nothing."""
+        return self
+
     @abc.abstractmethod
     def propagate(
         self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None

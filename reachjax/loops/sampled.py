@@ -154,7 +154,21 @@ class SampledAffinePlant(AbstractSampledPlant):
 
     @property
     def flow(self) -> LinearFlow:
-        """Its flow over one period."""
+        """Its flow over one period; kept of numpy, and of a plant that is prepared."""
+        kept = self.__dict__.get("_flow")
+        if kept is None:
+            kept = self._new_flow()
+            if all(isinstance(each, np.ndarray) for each in jax.tree.leaves(self)):
+                object.__setattr__(self, "_flow", kept)
+        return kept
+
+    def prepared(self) -> SampledAffinePlant:
+        """A copy that has the exponentials of its flow."""
+        found = self.replace()
+        object.__setattr__(found, "_flow", self.flow.prepared())
+        return found
+
+    def _new_flow(self) -> LinearFlow:
         parts = [self.A, self.B, *([] if self.E is None else [self.E]), self.c[:, None]]
         matrix = namespace(self.A).concatenate(parts, axis=1)
         return LinearFlow(matrix, Settings(self.period, None, self.fewest, self.held))

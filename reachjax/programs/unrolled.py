@@ -280,6 +280,7 @@ def _at_once(
     columns: int | None,
 ) -> ByForms:
     """Bounds for all steps, as one scan."""
+    loop = loop.replace(plant=loop.plant.prepared())
     start = InitialColumns.of(X0, box, loop.curved)
     few = columns is not None and not is_counted()
     (more, _), steps = step_columns(loop, few), len(directions)

@@ -55,7 +55,9 @@ def volume_penalty(
 
     Differentiable in the loop and the initial set, also inside `jax.jit`, `vmap` (over initial sets
     or networks) and `scan`. A penalty needs no proof: where `LinearBounds()` is compiled or
-    differentiated, the sets of a loop in discrete time are the certified ones but for rounding.
+    differentiated, the sets are the certified ones but for rounding, and of a differential equation
+    for what Taylor polynomials leave out: as many steps a period as its plant's `steps` says are
+    done, of its `order`, or of order four.
 
     Args:
         loop: the closed loop.
@@ -98,7 +100,7 @@ def volume_penalty(
             raise ValueError(f"measure must give one number for a set, but {arrived} arrived")
         return sum(sizes, start=jnp.zeros(())) / horizon
 
-    return _penalised(size, loop, X0, horizon, template, cells, options)
+    return _penalised(size, loop, X0, horizon, template, cells, options, False)
 
 
 @once_positional("goal", "avoid", "safe")
@@ -164,7 +166,8 @@ def specification_penalty(
     def missed(tube: ReachTube | Sketch) -> Float[Array, ""]:
         return missing(required, tube, margin)
 
-    return _penalised(missed, loop, X0, horizon, template, cells, options)
+    between = any(item.throughout for item in required)
+    return _penalised(missed, loop, X0, horizon, template, cells, options, between)
 
 
 def _penalised(
@@ -175,19 +178,23 @@ def _penalised(
     template: AbstractTemplate | None,
     cells: Sequence[int] | None,
     options: dict[str, Any],
+    between: bool,
 ) -> Float[Array, ""]:
-    """The penalty of a tube, or its mean over those from the cells of an initial set."""
+    """The penalty of a tube, or its mean over those from the cells of an initial set.
+
+    Between samples it asks for sets or not, as is said.
+    """
     template = template_of(loop, template)
     require_kinds(loop=loop, X0=X0, template=template)
     options = _completed(loop, X0, template, options)
-    by_forms = isinstance(options["relaxation"], LinearBounds) and not loop.plant.continuous
+    by_forms = isinstance(options["relaxation"], LinearBounds)
 
     def of(X0: AbstractSet) -> Float[Array, ""]:
         problem = Problem(loop, X0, template, horizon, options.get("start", 0))
         if not by_forms or is_concrete(problem.parts):
             return penalty(reach(loop, X0, horizon, template, **options))
         check_problem(problem, Options(**{k: v for k, v in options.items() if k != "start"}))
-        return penalty(sketched(problem))
+        return penalty(sketched(problem, between))
 
     if cells is None:
         return of(X0)

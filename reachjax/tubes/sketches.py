@@ -1,7 +1,9 @@
 """Sets that nothing proves: what affine forms say if rounding is not counted.
 
 A penalty needs no proof. Its sets are those of `LinearBounds` but for rounding, take a fraction of
-its operations, and are no tube: nothing is decided from them.
+its operations, and are no tube: nothing is decided from them. Of a differential equation Taylor
+polynomials, and cubics in between samples, count as its solutions: what they leave out is not
+enclosed (`loops.flows`).
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.methods.problem import Problem
@@ -19,33 +22,31 @@ from reachjax.sets import AbstractSet, Polytope
 
 @dataclasses.dataclass(frozen=True)
 class Sketch:
-    """Sets of a loop's states at each time, up to rounding.
+    """Sets of a loop's states at each time, up to rounding; of a flow, up to remainders too.
 
     Attributes:
         loop: the closed loop.
         sets: `sets[t]` for `t = 0 .. horizon`; `sets[0]` is the initial set.
+        spans: sets of the states from each sample to the next one; none in discrete time, nor where
+            they were not asked for.
     """
 
     loop: ClosedLoop
     sets: tuple[AbstractSet, ...]
+    spans: tuple[Polytope, ...] = ()
 
     @property
     def horizon(self) -> int:
         """The number of steps."""
         return len(self.sets) - 1
 
-    @property
-    def spans(self) -> tuple[Polytope, ...]:
-        """No sets between samples.
 
-        Raises:
-            TypeError: they were asked for.
-        """
-        raise TypeError("a sketch has no sets between samples: take the tube of reach(...)")
-
-
-def sketched(problem: Problem) -> Sketch:
+def sketched(problem: Problem, between: bool = False) -> Sketch:
     """The sets of a problem, whose arguments have been checked.
+
+    Args:
+        problem: the problem.
+        between: whether sets in between the samples of a differential equation are asked for.
 
     Raises:
         TypeError: the template has no facets.
@@ -56,7 +57,11 @@ def sketched(problem: Problem) -> Sketch:
     )
     box, facets = problem.box, problem.facets
     given = problem.loop, problem.X0.closed_form(box), box, problem.directions
-    offsets = unrolled_at_once(*given, problem.start, counted=False).offsets
-    offsets = jnp.where(jnp.isfinite(offsets), offsets, jnp.nan)
-    regions = (facets.at(k).polytope(each) for k, each in enumerate(offsets, start=1))
-    return Sketch(problem.loop, (problem.X0, *regions))
+    found = unrolled_at_once(*given, problem.start, between=int(between), counted=False)
+
+    def regions(offsets: Float[Array, "N f"]) -> tuple[Polytope, ...]:
+        offsets = jnp.where(jnp.isfinite(offsets), offsets, jnp.nan)
+        return tuple(facets.at(k).polytope(each) for k, each in enumerate(offsets, start=1))
+
+    spans = () if found.between is None else regions(jnp.max(found.between, axis=1))
+    return Sketch(problem.loop, (problem.X0, *regions(found.offsets)), spans)

@@ -55,6 +55,10 @@ class AbstractFlow(abc.ABC):
             UnboundedError: solutions escape, leave a domain, or are too fast, in numpy.
         """
 
+    def prepared(self) -> AbstractFlow:
+        """The flow with what all periods have in common computed: itself, if that is nothing."""
+        return self
+
     def enclosed(self, given: tuple[Ball, ...]) -> Ball:
         """What intervals lead to.
 

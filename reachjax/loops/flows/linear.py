@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from reachjax.loops.flows.steps import Control, Flowed, Settings, drift
 from reachjax.loops.flows.taylor_models import TaylorModels, joined
 from reachjax.loops.units import AtUnit
 from reachjax.numerics.numbers import size
-from reachjax.numerics.rounding import TINY, Ball, constant, gamma, larger, namespace
+from reachjax.numerics.rounding import TINY, Ball, constant, gamma, is_counted, larger, namespace
 
 DEGREE = 16
 """The degree of the polynomial, of matrices whose norm is at most a half."""
@@ -43,11 +44,18 @@ def exponential(M: Float[Array | np.ndarray, "k k"]) -> Ball:
     if xp is np:
         count = int(np.clip(np.ceil(np.log2(max(2 * norm, 1.0))), 0, 60)) if norm < 1e15 else 60
     part, norm = M * 2.0**-count, norm * 2.0**-count
-    found, sizes, eye = xp.eye(size), xp.eye(size), xp.eye(size)
+    found, eye = xp.eye(size), xp.eye(size)
+    if not is_counted():
+        for k in range(DEGREE, 0, -1):
+            found = eye + part @ found / k
+        for _ in range(count):
+            found = found @ found
+        return Ball.exact(found)
+    sizes = xp.eye(size)
     for k in range(DEGREE, 0, -1):
         found, sizes = eye + part @ found / k, eye + abs(part) @ sizes / k
     rest = xp.where(norm <= 0.5, 2 * 0.5 ** (DEGREE + 1) / math.factorial(DEGREE + 1), xp.inf)
-    left = xp.full((size, size), rest)  # of this shape also where rounding is not counted
+    left = xp.full((size, size), rest)
     radii = constant(gamma(DEGREE * (size + 8)) * sizes + left + size * TINY)
     for _ in range(count):
         weights = abs(found)
@@ -89,20 +97,47 @@ class LinearFlow(AbstractFlow):
         xp, (n, k) = namespace(self.matrix), self.matrix.shape
         return xp.concatenate([self.matrix, xp.zeros((k - n, k))])
 
+    @cached_property
+    def _whole(self) -> Ball:
+        """What a period makes of the state and what is held."""
+        return self._after(1.0)
+
+    @cached_property
+    def _parts(self) -> tuple[Ball, ...]:
+        """What steps in between samples make of these, up to the end of each but the last."""
+        pieces = self._pieces(self.settings.period * self._generator())
+        return tuple(self._after((k + 1) / pieces) for k in range(pieces - 1))
+
+    @cached_property
+    def _growth(self) -> Ball:
+        """What the state and what is held grow to within a step: `|z(s)| <= exp(h |M|) |z|`."""
+        pieces = len(self._parts) + 1
+        return exponential(abs(self.settings.period / pieces * self._generator()))
+
+    def _after(self, part: float) -> Ball:
+        return exponential(self.settings.period * part * self._generator())[: len(self.matrix)]
+
+    def prepared(self) -> LinearFlow:
+        """The flow with its exponentials computed."""
+        _ = self._whole, self._growth  # they are kept
+        return self
+
     def followed(self, given: list[TaylorModels], box: Ball, between: bool = False) -> Flowed:
         """What Taylor models lead to, in one step; in between samples in short ones."""
-        z, h, (M, n) = joined(given), self.settings.period, (self._generator(), len(given[0]))
+        z, h = joined(given), self.settings.period
 
-        def after(part: float) -> TaylorModels:
-            T = exponential(h * part * M)[:n]
+        def after(T: Ball) -> TaylorModels:
+            found = T.mid[:, :-1] @ z + T.mid[:, -1]
+            if not is_counted():
+                return found
             size = larger(*map(abs, z.ends()))
-            wide = (T.rad[:, :-1] @ size + T.rad[:, -1]) * (1 + gamma(len(M)))
-            return (T.mid[:, :-1] @ z + T.mid[:, -1]).widened(wide)
+            wide = (T.rad[:, :-1] @ size + T.rad[:, -1]) * (1 + gamma(self.matrix.shape[1]))
+            return found.widened(wide)
 
-        controls = list[Control]()
+        state, controls = after(self._whole), list[Control]()
         if between:
-            pieces = self._pieces(h * M)
-            states = [given[0], *(after((k + 1) / pieces) for k in range(pieces))]
+            states = [given[0], *map(after, self._parts), state]
+            pieces = len(states) - 1
             for here, there in itertools.pairwise(states):
                 controls.append(self._control(here, there, given[1:], h / pieces, 1 / pieces))
         end, within = self._drift(given)
@@ -110,7 +145,7 @@ class LinearFlow(AbstractFlow):
             each._replace(points=tuple(point.widened(within) for point in each.points))
             for each in controls
         )
-        return Flowed(after(1.0).widened(end), wide)
+        return Flowed(state.widened(end), wide)
 
     def _pieces(self, M: Any) -> int:
         """How many steps there are in between."""
@@ -130,7 +165,7 @@ class LinearFlow(AbstractFlow):
         ends = joined([here, *others]).ends()
         xp = namespace(rows)
         z = xp.concatenate([larger(*map(abs, ends)), xp.ones(1)])
-        growth = exponential(size)  # |z(s)| <= exp(h |M|) |z|
+        growth = self._growth
         z = (growth.mid + growth.rad) @ z * error
         for _ in range(4):
             z = size @ z * error

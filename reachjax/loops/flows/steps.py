@@ -49,7 +49,8 @@ from reachjax.numerics.rounding import (
 )
 
 ORDER, SKETCHED = 6, 4
-"""The order of compiled steps, where none is given; and where nothing is proved."""
+"""The order of compiled steps, where none is given; and where nothing is proved, where higher ones
+that are asked for are no more than the first."""
 
 HIGHEST = 20
 """The highest order that is chosen on the host: beyond, a step is better halved."""
@@ -120,7 +121,7 @@ class _Piece(NamedTuple):
     Attributes:
         B: what they stay in.
         remainder: of the polynomials.
-        fourth: bounds of `|h^4 x_4|`.
+        fourth: bounds of `|h^4 x_4|`; None for what it is where the step begins.
         order: of the polynomials.
         excess: the remainder over what it shall be.
     """
@@ -174,13 +175,19 @@ def flowed(
             todo, count = [*todo, part / 2, part / 2], count + 1
             continue
         proved = proved & holds
-        terms = solved(tape, here, given, h, max(piece.order, 1))
-        found = _sum([here, *terms[: piece.order]])
+        sketches = between and piece.fourth is None
+        terms = solved(tape, here, given, h, max(piece.order, 4 if sketches else 1))
+        polynomial = terms[: piece.order]
+        found = _sum([here, *polynomial])
         found = (found + piece.remainder.mid).widened(piece.remainder.rad * (1 + gamma(4)))
         if between:
-            last = h * Series.value(tape, [found, *given])
+            if sketches:  # the polynomial's own rate takes no unit
+                last = _sum([float(k) * term for k, term in enumerate(polynomial, start=1)])
+            else:
+                last = h * Series.value(tape, [found, *given])
             inner = here + (1 / 3) * terms[0], found - (1 / 3) * last
-            wide = [point.widened(piece.fourth / 16) for point in (here, *inner, found)]
+            fourth: Any = _largest(terms[3].ball) if sketches else piece.fourth
+            wide = [point.widened(fourth / 16) for point in (here, *inner, found)]
             *wide, state = split(_composed(joined([*wide, found]), state), 5)
             controls.append(Control(tuple(wide), part))
         else:
@@ -199,9 +206,8 @@ def flowed(
 
 
 def _sketched(X: Ball, order: int | None) -> _Piece:
-    """A step of which nothing is proved: as if polynomials left nothing out, nor cubics."""
-    nothing = zeros(X)
-    return _Piece(X, nothing, nothing.rad, order or SKETCHED, 0.0)
+    """A step of which nothing is proved, as if polynomials left nothing out."""
+    return _Piece(X, zeros(X), None, min(order or SKETCHED, ORDER), 0.0)
 
 
 def _sum(numbers: list[TaylorModels]) -> TaylorModels:
@@ -354,7 +360,12 @@ def _over(found: Any, allowed: Any) -> float:
 
 def _size(ball: Ball) -> Any:
     """Bounds of absolute values, which derivatives take for constants."""
-    return constant(larger(abs(ball.lower), abs(ball.upper)))
+    return constant(_largest(ball))
+
+
+def _largest(ball: Ball) -> Any:
+    """Bounds of absolute values."""
+    return larger(abs(ball.lower), abs(ball.upper))
 
 
 def _escaped(X: Ball, B: Ball) -> UnboundedError:

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,7 +72,15 @@ def read_file(path: Path) -> KerasFile:
             return _archive(content)
         with h5py.File(io.BytesIO(content), "r") as file:
             return _legacy(file)
-    except (OSError, RuntimeError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (
+        OSError,
+        RuntimeError,
+        KeyError,
+        TypeError,
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+    ) as error:
         # h5py's and zipfile's, for what is damaged or cut off
         text = " ".join(str(error).split())[:300]
         raise ValueError(f"it is no file of Keras, or damaged: {text}") from error
@@ -203,7 +213,7 @@ def _numbered(
                     f"the layer {name!r} ({each['class_name']}) holds weights of {other!r}, which "
                     "are not known"
                 )
-        variables = _group(held, "vars") if "vars" in held else {}
+        variables: Any = _group(held, "vars") if "vars" in held else {}
         told = variables.attrs.get("name", name) if "vars" in held else name
         if told != name:
             raise ValueError(f"the weights of {told!r} stand where those of {name!r} should")
@@ -315,7 +325,7 @@ def _array(group: Any, name: str, layer: str, room: int) -> np.ndarray:
             f"the weights {name!r} of the layer {layer!r} are of {found.dtype}: only numbers of 32 "
             "and 64 bits are known. Save the model in float32"
         )
-    if found.size > room:
+    if math.prod(found.shape) > room:
         raise ValueError(f"the weights of all layers together have more than {ROOM} entries")
     array = np.asarray(found[()], float)
     if not np.isfinite(array).all():

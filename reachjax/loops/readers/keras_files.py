@@ -3,6 +3,8 @@
 Sources: the formats of Keras, of `.keras` (a zip of `config.json`, `metadata.json` and
 `model.weights.h5`) and of the legacy `.h5` (HDF5 with an attribute `model_config`). No code of a
 file is run, no link out of it is followed, and no size is believed before it is checked.
+HDF5's own library reads the bytes: of some damaged ones it makes a loop without end, as others do
+who read them by it.
 """
 
 from __future__ import annotations

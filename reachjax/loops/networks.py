@@ -213,17 +213,19 @@ class Network(AbstractNetwork):
     def from_file(cls, path: str | os.PathLike[str]) -> Network:
         """A network from a file, by its ending.
 
-        ONNX (`.onnx`, see `from_onnx`); MATLAB (`.mat`, version 7 or older) with variables `W`, `b`
-        and `act_fcns`, in a struct or not; NNet (`.nnet`), whose inputs are clipped and scaled; and
-        plain text as Sherlock has it, of ReLUs throughout, or as POLAR has it, with names of
-        activations.
+        ONNX (`.onnx`, see `from_onnx`); Keras (`.keras`, or the legacy `.h5` of a whole model),
+        whose layers are read at inference, without Keras; MATLAB (`.mat`, version 7 or older) with
+        variables `W`, `b` and `act_fcns`, in a struct or not; NNet (`.nnet`), whose inputs are
+        clipped and scaled; and plain text as Sherlock has it, of ReLUs throughout, or as POLAR has
+        it, with names of activations.
 
         Args:
             path: of the file.
 
         Raises:
             FileNotFoundError: there is no such file.
-            ImportError: the package `onnx` is missing.
+            ImportError: the package `onnx`, or for Keras `h5py`, is missing.
+            TypeError: a layer's function has no bounds.
             ValueError: it cannot be read; the error says where.
 
         Example:
@@ -235,10 +237,14 @@ class Network(AbstractNetwork):
             [3.0]
         """
         from reachjax.loops.readers.chains import ENDINGS, read_chain
+        from reachjax.loops.readers.keras_files import ENDINGS as KERAS
+        from reachjax.loops.readers.keras_graphs import read_graph as read_keras
 
         path = existing_file("path", path)
         if path.suffix == ".onnx":
             return cls.from_onnx(path)
+        if path.suffix in KERAS:
+            return cls._from_graph(path, *read_keras(path))
         try:
             chain = read_chain(path)
         except ValueError as error:
@@ -246,7 +252,7 @@ class Network(AbstractNetwork):
                 raise
             raise ValueError(
                 f"{error}. It was read as plain text, since its ending is none of "
-                f"{', '.join(ENDINGS)}"
+                f"{', '.join((*ENDINGS, *KERAS))}"
             ) from error
         return cls(chain, *chain.sizes)
 
@@ -278,16 +284,22 @@ class Network(AbstractNetwork):
             TypeError: an operator's function has no bounds, or a name is no text.
             ValueError: it is no ONNX file, or is not understood; the error names the node.
         """
-        from reachjax.loops.readers.onnx_graphs import culprit, read_graph
+        from reachjax.loops.readers.onnx_graphs import read_graph
 
         path = existing_file("path", path)
         for name, value in (("inputs", inputs), ("output", output)):
             texts = [value] if value is None or name == "output" else value
             if not all(each is None or isinstance(each, str) for each in texts):
                 raise TypeError(f"{name} must be names of the file, but {value!r} arrived")
-        graph, *sizes = read_graph(path, inputs, output)
+        return cls._from_graph(path, *read_graph(path, inputs, output))
+
+    @classmethod
+    def _from_graph(cls, path: os.PathLike[str], graph: Any, inputs: int, outputs: int) -> Network:
+        """The network of a graph; an error names the node from which it cannot be certified."""
+        from reachjax.loops.readers.onnx_graphs import culprit
+
         try:
-            return cls(graph, *sizes)
+            return cls(graph, inputs, outputs)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{path}, {culprit(graph)}: {error}") from error
 

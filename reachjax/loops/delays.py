@@ -63,8 +63,13 @@ class DelayedPlant(AbstractPlant):
 
     @property
     def steps(self) -> int | None:
-        """No number of steps: plants that vary in time are not delayed."""
-        return None
+        """Those of the plant: `delayed` takes none that varies in time, but a file may have one."""
+        return self.plant.steps
+
+    @property
+    def clock(self) -> bool:
+        """Whether the plant is a function of the time: `delayed` takes none that is."""
+        return self.plant.clock
 
     @property
     def period(self) -> Any:

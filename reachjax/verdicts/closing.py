@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -68,12 +68,10 @@ class _Later(NamedTuple):
     """What is proved of the states from a set.
 
     Attributes:
-        period: after how many steps all states are in it again; 0 if that is not known.
         halfway: the two questions.
         verdict: the proof of the second one.
     """
 
-    period: int
     halfway: Halfway
     verdict: Verdict
 
@@ -125,7 +123,7 @@ def closed(
             share = budget.share(FOR_RETURN)
             found = _for_ever(asked, candidate, later, share)
             if found is None and begins_again:
-                found = _later(Halfway(asked, step, region, 0), 0, later, share)
+                found = _later(Halfway(asked, step, region, 0), later, share)
             if found is None:
                 continue
             attempts += 1
@@ -143,8 +141,8 @@ def closed(
             for item in required:
                 findings.prove(item, *proof.margins[item.name, item.time])
             parts = (each.grounds or Grounds() for each in (begun, found.verdict))
-            more = {"asked": asked._replace(loop=jax.device_put(loop))}
-            more["grounds"] = Closing(step, region, found.period, *parts)
+            more: dict[str, Any] = {"asked": asked._replace(loop=jax.device_put(loop))}
+            more["grounds"] = Closing(step, region, found.halfway.period, *parts)
             more |= {"cells": begun.cells, "certificates": begun.certificates}
             more["recurrence"] = proof.recurrence
             ends = Counter(begun.ends) + Counter(found.verdict.ends)
@@ -172,16 +170,16 @@ def _for_ever(asked: Asked, candidate: Candidate, later: Decides, budget: Budget
             halfway = Halfway(asked, candidate.step, candidate.region, period)
         except ValueError:  # too much of it varies in time
             continue
-        found = _later(halfway, period, later, budget)
+        found = _later(halfway, later, budget)
         if found is not None:
             return found
     return None
 
 
-def _later(halfway: Halfway, period: int, later: Decides, budget: Budget) -> _Later | None:
+def _later(halfway: Halfway, later: Decides, budget: Budget) -> _Later | None:
     """The proof of what is required from a set on; None of none."""
     verdict = _decided(halfway.after, later, budget)
-    return _Later(period, halfway, verdict) if verdict.proved else None
+    return _Later(halfway, verdict) if verdict.proved else None
 
 
 def _decided(asked: Asked, decides: Decides, budget: Budget) -> Verdict:

@@ -54,6 +54,7 @@ class Halfway:
         period: after how many steps they shall be in it again; 0 where they need not be.
 
     Attributes:
+        period: as given.
         before: what is required until that step, and that all states are in the set then.
         after: what is required from the set on: at each step of the period, at the last of which
             all states are in the set again, or until the horizon.
@@ -72,7 +73,7 @@ class Halfway:
             raise ValueError("the set halfway must be one of the loop's states")
         if not 1 <= step < asked.horizon or period < 0:
             raise ValueError(f"step {step} and period {period} are not of {asked.horizon} steps")
-        self._step, self._region, self._period = step, region, period
+        self._step, self._region, self.period = step, region, period
         until = [item for item in asked.required if item.time <= step]
         rest = [item for item in asked.required if item.time > step]
         self._names, kinds = _kinds(rest)
@@ -99,7 +100,7 @@ class Halfway:
 
     def joined(self, before: Proof, after: Proof) -> Proof:
         """What the proofs of both questions prove of the one that they answer."""
-        step, period = self._step, self._period
+        step, period = self._step, self.period
         arrivals = [before.margins[ARRIVES, step]]
         if period:
             arrivals.append(after.margins[ARRIVES, period])
@@ -121,8 +122,8 @@ class Halfway:
     def _recurrence(self, after: Proof, margin: float) -> Recurrence | None:
         """What a statement for all time rests on; None where the horizon was gone to its end."""
         step, inner = self._step, after.recurrence
-        if self._period:
-            return Recurrence(step, self._period, self._region, margin, True)
+        if self.period:
+            return Recurrence(step, self.period, self._region, margin, True)
         if inner is None:
             return None
         return dataclasses.replace(inner, step=step + inner.step, margin=min(margin, inner.margin))

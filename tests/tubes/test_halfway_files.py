@@ -330,6 +330,12 @@ def test_no_two_requirements_of_a_part_have_one_name_and_time(discrete):
         Halfway(asked._replace(required=(*asked.required, also)), step, SMALL, 5)
 
 
+@pytest.mark.parametrize(("step", "period"), [(0, 5), (HORIZON, 5), (50, -1)])
+def test_steps_and_periods_are_within_the_horizon(step, period, discrete):
+    with pytest.raises(ValueError, match=f"step {step} and period {period} are not of 120 steps"):
+        Halfway(discrete.asked, step, SMALL, period)
+
+
 def delayed():
     loop = rj.delayed(turning(0.9))
     R = rj.Box([-0.03, -0.03, -1e-3], [0.03, 0.03, 1e-3])

@@ -63,7 +63,7 @@ class DelayedPlant(AbstractPlant):
 
     @property
     def steps(self) -> int | None:
-        """Those of the plant: `delayed` takes none that varies in time, but a file may have one."""
+        """The number of steps of the plant: `delayed` takes none that has one, a file may."""
         return self.plant.steps
 
     @property

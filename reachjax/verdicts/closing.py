@@ -1,10 +1,7 @@
 """Long horizons that close, or begin again from a common set.
 
-Let all states of step `k` be in a set `S`. What is required later is then required of the states
-from `S` after `t - k` steps, whatever the initial set was: one proof for all cells of it. If every
-state of `S` is in it again after `m` steps, the states of step `t > k` are among those from `S`
-after `(t - k - 1) mod m + 1` steps; so what holds from `S` at all steps up to the `m`-th one, and
-in between, holds for ever. Both are of loops that do not vary in time.
+What is required after a step at which all states are in a set is required of the states from that
+set (`halfway`), whatever the initial set was: one proof for all cells of it.
 
 A set is looked for around where simulated trajectories are. That it is one, is proved: an inclusion
 of closed sets, decided as goals are.
@@ -12,24 +9,26 @@ of closed sets, decided as goals are.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.methods.witnesses import Simulations
 from reachjax.numerics.budget import Budget, Interrupted
-from reachjax.sets import AbstractSet, PolyhedralSet
+from reachjax.sets import AbstractSet
 from reachjax.sets.unusable import ThinSetError
 from reachjax.verdicts.findings import Findings
+from reachjax.verdicts.grounds import Asked, Closing, Grounds
+from reachjax.verdicts.halfway import Halfway, proof_of
 from reachjax.verdicts.recurrent_sets import Candidate, periods, sets_around
 from reachjax.verdicts.specification import Requirement
-from reachjax.verdicts.verdict import Recurrence, Verdict
+from reachjax.verdicts.verdict import Verdict
 
 LONG = 100
 """Shorter horizons are done step by step: what comes back does so after tens of steps."""
@@ -69,26 +68,12 @@ class _Later(NamedTuple):
     """What is proved of the states from a set.
 
     Attributes:
-        margins: certified ones of the requirements, by names and times since the set.
-        names: how the requirements of the loop are called there.
-        period: after how many steps all states are in it again; 0 if that is not known.
-        verdict: the proof.
+        halfway: the two questions.
+        verdict: the proof of the second one.
     """
 
-    margins: dict[str, Float[np.ndarray, " m+1"]]
-    names: dict[tuple[str, int, bool], str]
-    period: int
+    halfway: Halfway
     verdict: Verdict
-
-    def margin(self, item: Requirement, step: int) -> float:
-        """The margin of a requirement, of states that are in the set at a step."""
-        row = self.margins[self.names[_kind(item)]]
-        return float(np.nanmin(row) if self.period else row[item.time - step])
-
-
-def _kind(item: Requirement) -> tuple[str, int, bool]:
-    """What a requirement is, whenever it is meant."""
-    return item.name, id(item.region), item.inside
 
 
 def closed(
@@ -123,6 +108,7 @@ def closed(
     """
     if loop.varies or horizon < LONG:
         return None
+    asked = Asked(loop, X0, horizon, start, tuple(required))
     findings = Findings(loop, X0, horizon, start, required)
     findings.simulate(simulations.runs)
     if findings.ended:
@@ -130,32 +116,35 @@ def closed(
     budget, attempts = budget.share(FOR_CLOSING), 0
     for candidate in _candidates(loop, simulations.runs.states, horizon):
         step, region = candidate.step, candidate.region
-        rest = [item for item in required if item.time > step]
+        rest = any(item.time > step for item in required)
         if budget.late or attempts == ATTEMPTS or not rest:
             return None
         try:
             share = budget.share(FOR_RETURN)
-            found = _for_ever(loop, candidate, horizon, rest, later, share)
+            found = _for_ever(asked, candidate, later, share)
             if found is None and begins_again:
-                found = _begun_again(region, step, horizon, rest, later, share)
+                found = _later(Halfway(asked, step, region, 0), later, share)
             if found is None:
                 continue
             attempts += 1
-            arrives = Requirement(ARRIVES, step, region, True)
-            before = [*(item for item in required if item.time <= step), arrives]
-            begun = first(X0, step, before, budget)
+            begun = _decided(found.halfway.before, first, budget)
         except (ThinSetError, ValueError):  # a unit has no bounds from it, or it is no set
             continue
         except Interrupted as error:
             cells = getattr(error.found, "cells", ())
             raise Interrupted(str(error), findings.verdict(cells=cells)) from None
         if begun.proved:
+            proof = found.halfway.joined(
+                proof_of(found.halfway.before, begun.margins),
+                proof_of(found.halfway.after, found.verdict.margins, found.verdict.recurrence),
+            )
             for item in required:
-                early = item.time <= step
-                margin = begun.margins[item.name][item.time] if early else found.margin(item, step)
-                findings.prove(item, margin, True)
-            more = {"cells": begun.cells, "certificates": begun.certificates}
-            more["recurrence"] = _recurrence(candidate, found, begun)
+                findings.prove(item, *proof.margins[item.name, item.time])
+            parts = (each.grounds or Grounds() for each in (begun, found.verdict))
+            more: dict[str, Any] = {"asked": asked._replace(loop=jax.device_put(loop))}
+            more["grounds"] = Closing(step, region, found.halfway.period, *parts)
+            more |= {"cells": begun.cells, "certificates": begun.certificates}
+            more["recurrence"] = proof.recurrence
             ends = Counter(begun.ends) + Counter(found.verdict.ends)
             return findings.verdict(dict(ends), **more)
     return None
@@ -174,59 +163,25 @@ def _candidates(
         step = round(LATER * step)
 
 
-def _for_ever(
-    loop: ClosedLoop,
-    candidate: Candidate,
-    horizon: int,
-    rest: Sequence[Requirement],
-    later: Decides,
-    budget: Budget,
-) -> _Later | None:
+def _for_ever(asked: Asked, candidate: Candidate, later: Decides, budget: Budget) -> _Later | None:
     """The proof that a set is come back to, and what is required holds meanwhile; None of none."""
-    kinds: dict[tuple[str, int, bool], Requirement] = {}
-    for item in rest:
-        if _kind(item) not in kinds or item.throughout:
-            kinds[_kind(item)] = item
-    names = {kind: f"{kind[0]}, {number}" for number, kind in enumerate(kinds)}
-    for period in periods(loop, candidate):
-        if len(kinds) * period > max(len(rest), horizon - candidate.step):
-            continue  # too much of it varies in time
-        items = [
-            dataclasses.replace(item, name=names[kind], time=step)
-            for kind, item in kinds.items()
-            for step in range(1, period + 1)
-        ]
-        items.append(Requirement(ARRIVES, period, candidate.region, True))
-        verdict = later(candidate.region, period, items, budget)
-        if verdict.proved:
-            return _Later(verdict.margins, names, period, verdict)
+    for period in periods(asked.loop, candidate):
+        try:
+            halfway = Halfway(asked, candidate.step, candidate.region, period)
+        except ValueError:  # too much of it varies in time
+            continue
+        found = _later(halfway, later, budget)
+        if found is not None:
+            return found
     return None
 
 
-def _begun_again(
-    region: PolyhedralSet,
-    step: int,
-    horizon: int,
-    rest: Sequence[Requirement],
-    later: Decides,
-    budget: Budget,
-) -> _Later | None:
-    """The proof of what is required from a set on until the horizon; None of none."""
-    names = {_kind(item): f"{item.name}, {item.inside}" for item in rest}
-    items = [
-        dataclasses.replace(item, name=names[_kind(item)], time=item.time - step) for item in rest
-    ]
-    verdict = later(region, horizon - step, items, budget)
-    return _Later(verdict.margins, names, 0, verdict) if verdict.proved else None
+def _later(halfway: Halfway, later: Decides, budget: Budget) -> _Later | None:
+    """The proof of what is required from a set on; None of none."""
+    verdict = _decided(halfway.after, later, budget)
+    return _Later(halfway, verdict) if verdict.proved else None
 
 
-def _recurrence(candidate: Candidate, found: _Later, begun: Verdict) -> Recurrence | None:
-    """What a statement for all time rests on; None where the horizon was gone to its end."""
-    step, arrival = candidate.step, begun.margins[ARRIVES][-1]
-    if found.period:
-        margin = float(min(arrival, found.margins[ARRIVES][-1]))
-        return Recurrence(step, found.period, candidate.region, margin, True)
-    inner = found.verdict.recurrence
-    if inner is None:
-        return None
-    return dataclasses.replace(inner, step=step + inner.step, margin=min(arrival, inner.margin))
+def _decided(asked: Asked, decides: Decides, budget: Budget) -> Verdict:
+    """The verdict on a question."""
+    return decides(asked.X0, asked.horizon, list(asked.required), budget)

@@ -4,6 +4,9 @@ A proof is one of each leaf of a tree of cells. Over a leaf forms are unrolled, 
 times: as they are, or with ranges of units that linear programs tightened. Of these programs, and
 of those that bound requirements, the multipliers are kept. Nothing here has to be believed: any
 multipliers are sound, and any tree of cells covers the set (`rechecks`).
+
+Where states come into a set halfway, there are two proofs, and the set between them: what either
+has to prove follows from the set (`halfway`), and is not kept.
 """
 
 from __future__ import annotations
@@ -16,8 +19,11 @@ from jaxtyping import Float, Int
 
 from reachjax.loops import ClosedLoop
 from reachjax.proofs.branches import Branches
-from reachjax.sets import AbstractSet
+from reachjax.sets import AbstractSet, PolyhedralSet
 from reachjax.verdicts.specification import Requirement
+
+Key = tuple[str, int]
+"""The name and the time of a requirement."""
 
 LARGEST = 2**27
 """A matrix of more entries than a gigabyte holds is none of a step's."""
@@ -119,6 +125,25 @@ class Grounds(NamedTuple):
     counts: tuple[int, ...] = ()
     axes: tuple[tuple[int, ...], ...] = ((-1,),)
     climbs: tuple[tuple[Climb, ...], ...] = ((),)
+
+
+class Closing(NamedTuple):
+    """A set that states come into, and what proves either part of the horizon.
+
+    Attributes:
+        step: when all states are in the set.
+        region: the set.
+        period: after how many steps states from it are in it again, and what is required later is
+            proved at each of them; 0 where it is proved from the set on until the horizon.
+        before: what proves the requirements until that step, and that all states are in the set.
+        after: what proves the requirements of the states from the set.
+    """
+
+    step: int
+    region: PolyhedralSet
+    period: int
+    before: Grounds | Closing
+    after: Grounds | Closing
 
 
 class ClimbRecord:

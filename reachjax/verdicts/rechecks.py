@@ -4,6 +4,9 @@ Of a proof the tree of cells, ranges and multipliers are taken, none of which ha
 are made again from the initial set, forms from the loop, and multipliers of a sign that proves
 nothing are zero. Of a counterexample the initial state, the disturbances and the noise are taken:
 its trajectory is enclosed again. Nothing is searched.
+
+Of a set that states come into halfway, and may come back to, the set, the step and the period are
+taken: both questions are asked again as they follow from these.
 """
 
 from __future__ import annotations
@@ -31,14 +34,12 @@ from reachjax.tubes.repeats import DisagreementError
 from reachjax.verdicts.cell_decisions import sifted
 from reachjax.verdicts.cell_tasks import CellTask, outcome_of
 from reachjax.verdicts.findings import Findings
-from reachjax.verdicts.grounds import Asked, Climb, Grounds, Leaves
+from reachjax.verdicts.grounds import Asked, Climb, Closing, Grounds, Key, Leaves
+from reachjax.verdicts.halfway import Halfway, Proof
 from reachjax.verdicts.sieve import TOGETHER, Outcome
 from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.targets import values_of
 from reachjax.verdicts.verdict import Verdict, VerdictStatus
-
-Key = tuple[str, int]
-"""The name and the time of a requirement."""
 
 
 def rechecked(verdict: Verdict, progress: Bar | None = None) -> Verdict:
@@ -62,10 +63,11 @@ def rechecked(verdict: Verdict, progress: Bar | None = None) -> Verdict:
             _refute(verdict, asked, findings)
         elif verdict.status is VerdictStatus.PROVED:
             grounds = verdict.grounds or Grounds()
-            margins, left_out = _proved(asked, grounds, progress)
+            proof = _proved(asked, grounds, progress)
             for item in asked.required:
-                findings.prove(item, *margins[item.name, item.time])
-            more["grounds"] = grounds
+                findings.prove(item, *proof.margins[item.name, item.time])
+            left_out = proof.left_out
+            more |= {"grounds": grounds, "recurrence": proof.recurrence}
     except DisagreementError:
         raise
     except Exception as error:  # what is read may be of any shape and size
@@ -104,13 +106,22 @@ def _refute(verdict: Verdict, asked: Asked, findings: Findings) -> None:
     findings.simulate(runs, broken)
 
 
-def _proved(
-    asked: Asked, grounds: Grounds, progress: Bar | None
-) -> tuple[dict[Key, tuple[float, bool]], int]:
-    """The least margin of each requirement over all cells, and whether it holds over each.
+def _proved(asked: Asked, grounds: Grounds | Closing, progress: Bar | None) -> Proof:
+    """What grounds prove of a question, in two parts where there is a set halfway.
 
-    Returns:
-        These, and how many cells the progress bar left out.
+    Raises:
+        ValueError: they are of another question.
+    """
+    if isinstance(grounds, Grounds):
+        return _over_cells(asked, grounds, progress)
+    halfway = Halfway(asked, grounds.step, grounds.region, grounds.period)
+    before = _proved(halfway.before, grounds.before, progress)
+    after = _proved(halfway.after, grounds.after, progress)
+    return halfway.joined(before, after)
+
+
+def _over_cells(asked: Asked, grounds: Grounds, progress: Bar | None) -> Proof:
+    """The least margin of each requirement over all cells, and whether it holds over each.
 
     Raises:
         ValueError: the tree is none of the initial set's, or there are not as many climbs as cells.
@@ -131,7 +142,7 @@ def _proved(
         for key, (least, holds) in found.items():
             margin, right = margins.get(key, (-np.inf, False))
             found[key] = min(least, margin), holds and right
-    return found, left
+    return Proof(found, left)
 
 
 def _cells(X0: AbstractSet, grounds: Grounds) -> list[Node]:

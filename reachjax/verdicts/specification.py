@@ -10,6 +10,7 @@ Goals and sets to avoid may be those of some times only.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -37,6 +38,9 @@ AvoidSets = Sequence[Region] | Mapping[int | range, Sequence[Region]]
 Timed = Region | Mapping[int | range | float | tuple[float, float], Region]
 """A set, or sets by the times, or the spans of times, at which they are meant: by steps, or of a
 differential equation by numbers of type `float` in its units of time, or pairs of such."""
+
+NAMES_INSIDE, NAMES_OUTSIDE = r"goal|safe", r"avoid\[(0|[1-9]\d*)\]"
+"""The names that `requirements` gives; any other one may be that of a step of a proof."""
 
 SAME = 1e-9
 """Times are one if they differ by less than this part of a period: users write decimals."""
@@ -382,8 +386,8 @@ def asked_again(
     if times and times != set(range(horizon + 1)):
         raise ValueError("a safe set must be required at all times")
     for item in said:
-        kinds = {"goal": True, "safe": True}
-        if kinds.get(item.name, not item.name.startswith("avoid[")) is not item.inside:
+        meant = NAMES_INSIDE if item.inside else NAMES_OUTSIDE
+        if re.fullmatch(meant, item.name, re.ASCII) is None:
             raise ValueError(f"{item.name!r} is no part of a specification")
         if not 0 <= item.time <= horizon:
             raise ValueError(f"{item.name} is required at t = {item.time}, beyond the horizon")

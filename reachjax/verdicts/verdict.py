@@ -33,7 +33,7 @@ from reachjax.sets import AbstractSet, Box, PolyhedralSet
 from reachjax.sets.pictures import draw_boxes
 from reachjax.tubes.displays import display, picture, table
 from reachjax.tubes.saving import keep
-from reachjax.verdicts.grounds import Asked, Grounds
+from reachjax.verdicts.grounds import Asked, Closing, Grounds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -188,7 +188,7 @@ class KeptVerdict(NamedTuple):
     asked: Asked
     status: VerdictStatus
     counterexample: Counterexample | None
-    grounds: Grounds | None
+    grounds: Grounds | Closing | None
 
     @property
     def verdict(self) -> Verdict:
@@ -219,7 +219,8 @@ class Verdict:
         certificates: of a verdict without a tube, what each requirement that is proved rests on,
             by its name and its time.
         cells: of a decision by cells, what is known of each, see `plot_cells`.
-        recurrence: of a statement for all time, what it rests on, or what came nearest to that.
+        recurrence: of a statement for all time, what it rests on, or what came nearest to that; of
+            a verdict that was read from a file, once it is proved anew.
         asked: of a verdict without a tube, what it is about.
         grounds: of one that is proved without a tube, what proves it anew.
         decisions: of a loop that jumps, those that may go either way over the initial set, or over
@@ -235,7 +236,7 @@ class Verdict:
     cells: tuple[DecidedCell, ...] = ()
     recurrence: Recurrence | None = None
     asked: Asked | None = None
-    grounds: Grounds | None = None
+    grounds: Grounds | Closing | None = None
     decisions: tuple[OpenDecision, ...] = ()
 
     @property
@@ -270,8 +271,7 @@ class Verdict:
 
         Raises:
             OSError: it cannot be written.
-            ValueError: it rests on a tube, which is to be saved instead, or on a set that states
-                come back to.
+            ValueError: it rests on a tube, which is to be saved instead.
 
         Example:
             >>> import pathlib, tempfile
@@ -283,10 +283,7 @@ class Verdict:
             'PROVED'
         """
         if self.asked is None:
-            raise ValueError(
-                "a verdict that rests on a tube, or on a set that states come back to, is not kept "
-                "in a file: save the tube"
-            )
+            raise ValueError("a verdict that rests on a tube is not kept in a file: save the tube")
         kept = KeptVerdict(self.asked, self.status, self.counterexample, self.grounds)
         keep(writable("path", path), kept, self.asked.loop)
 

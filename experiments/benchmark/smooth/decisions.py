@@ -12,7 +12,7 @@ from experiments.benchmark.rivals.processes import workers
 from experiments.benchmark.smooth import loops
 from experiments.benchmark.smooth.rows import Figures, Row
 from experiments.competition.instances import Instance
-from experiments.sampled.problems import car
+from experiments.sampled.problems import STRIDE, car
 
 CELLS = 10_000
 """Into so many an initial set may be halved."""
@@ -68,9 +68,9 @@ def between(settings: Settings) -> Iterator[Figures]:
     verdict = rj.decide(loop, given.X0, given.horizon, **sampled.required)
     yield {"verdict": verdict.status.name, "first, s": time.perf_counter() - began}
     example = verdict.counterexample
-    if example is not None:
-        periods = float(example.instant) / float(loop.plant.period)
-        yield {"instant, s": float(example.instant), "instant, periods": periods}
+    if example is not None and example.instant is not None:
+        instant = float(example.instant)
+        yield {"instant, s": instant, "instant, periods": instant / STRIDE}
 
 
 def _row(

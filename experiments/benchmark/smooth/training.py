@@ -51,9 +51,9 @@ class Lesson:
 
     def certified(self) -> float:
         """The penalty of the sets that `reach` proves, with rounding."""
-        template, required = self.asked["template"], {"safe": self.safe}
+        template = self.asked["template"]
         tube = rj.reach(self.loop, self.X0, self.horizon, template, rj.LinearBounds())
-        return float(rj.shortfall(tube, **required))
+        return float(rj.shortfall(tube, safe=self.safe))
 
 
 def pendulum(way: str, settings: Settings) -> Lesson:

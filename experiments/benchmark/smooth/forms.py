@@ -16,7 +16,7 @@ from experiments.benchmark.smooth.rows import Figures, Row
 from reachjax.programs.unrolled import unrolled_from_boxes
 
 SCALES = tuple(10.0**k for k in range(7))
-NOISE_STEP, PUSH, NOISE = 0.1, 0.5, 0.01
+NOISE_STEP, PUSH, NOISE = 0.05, 0.5, 0.01
 """Seconds of a step of the cart-pole with noise, its disturbance, and the noise of each state."""
 
 TWENTIETH = 0.05

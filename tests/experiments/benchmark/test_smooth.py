@@ -181,7 +181,7 @@ def test_noise_and_disturbances_enter_the_cart_pole():
     net = rj.MLP.from_layers([([[0.1, 0.2, 3.0, 0.5]], [0.0])])
     calm, noisy = loops.pole(net, 0.1), loops.noisy_pole(net, 0.1, 0.5, 0.01)
     x, u = np.array([0.1, 0.0, 0.05, 0.2]), np.array([0.3])
-    pushed = noisy.plant.propagate(x, u, 0, np.array([0.2]))
+    pushed = noisy.plant.propagate(x, u, w=np.array([0.2]))
     np.testing.assert_allclose(pushed, calm.plant.propagate(x, u + 0.2))
     X0, template = rj.Box(x, x), rj.Template.box(4)
     tube = rj.reach(noisy, X0, 1, template, rj.LinearBounds())

@@ -253,14 +253,17 @@ def nothing(loop: rj.ClosedLoop, states: jax.Array) -> jax.Array:
 
 
 def grown(loop: rj.ClosedLoop, region: rj.Box, settings: Settings) -> tuple[rj.ClosedLoop, rj.Box]:
-    """A loop of which a larger box is proved, box by box, and the last one."""
-    optimizer, factor = optax.adam(settings.learning_rate), WIDER
+    """A loop of which a larger box is proved, box by box, and the last one.
+
+    What is not proved in time is trained on, for a box that is not as wide.
+    """
+    optimizer, factor, latest = optax.adam(settings.learning_rate), WIDER, loop
     with bar() as shown:
         task = shown.add_task("training for size", total=settings.rounds)
         for seed in range(settings.rounds):
             wider = box_of(np.minimum(factor * np.asarray(region.upper), WIDEST))
             found = rj.train(
-                loop,
+                latest,
                 wider,
                 HORIZON,
                 nothing,
@@ -274,8 +277,9 @@ def grown(loop: rj.ClosedLoop, region: rj.Box, settings: Settings) -> tuple[rj.C
                 time_limit=settings.seconds,
             )
             shown.advance(task)
+            latest = found.loop
             if found.proved:
-                loop, region = found.loop, wider
+                loop, region = latest, wider
             else:
                 factor = 1 + (factor - 1) / 2
             if factor < LEAST:

@@ -213,6 +213,7 @@ def largest(loop: rj.ClosedLoop, settings: Settings) -> rj.Box:
     found = rj.largest_set(
         loop, simulated_box(loop), HORIZON, goal=GOAL, safe=SAFE, time_limit=settings.limit
     )
+    assert isinstance(found.region, rj.Box)
     return found.region
 
 
@@ -345,7 +346,10 @@ def draw(sizes: dict[str, Size], loops: dict[str, rj.ClosedLoop], path: Path) ->
 
     figure, (axes,) = report.panels(1, 2, (9.0, 4.2), sharex=True, sharey=True)
     for ax, (name, size) in zip(axes, sizes.items(), strict=True):
-        (left, bottom), (right, top) = (size.cells[:, end].T for end in (0, 1))
+        ends = size.cells
+        if not np.isnan(size.back).any():
+            ends = np.concatenate([ends, [[-size.back, size.back]]])
+        (left, bottom), (right, top) = (ends[:, end].T for end in (0, 1))
         corners = np.stack([[left, bottom], [right, bottom], [right, top], [left, top]])
         cells = PolyCollection(list(corners.transpose(2, 0, 1)), facecolor="tab:green", alpha=0.35)
         cells.set_label("safe for ever")

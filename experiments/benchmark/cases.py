@@ -19,7 +19,7 @@ from experiments.double_integrator.problem import INITIAL_BOX, closed_loop, temp
 
 RANDOM_BOX = np.array([[0.25, -0.25], [0.75, 0.25]])  # the size of the paper's X_0, near the kinks
 
-Study = Literal["steps", "growth", "loops", "rivals", "decisions", "limits"]
+Study = Literal["steps", "growth", "loops", "rivals", "decisions", "limits", "smooth"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Settings:
     study: tyro.conf.Positional[Study] = "steps"
     """One step of several networks; one facet as networks grow; tubes and training steps; tubes
     beside those of what a user would pick instead; verdicts beside the same; calls that must end in
-    time."""
+    time; smooth loops beside what is asked of them."""
 
     widths: tuple[int, ...] = (10, 20, 32)
     """`steps`: neurons in each of the two hidden layers, one network a width."""
@@ -45,14 +45,17 @@ class Settings:
     reference_facets: int = 8
     """At most so many are timed with cvxpy rebuilt; fewer are scaled up to 8."""
     loops: tuple[str, ...] = ()
-    """`rivals`, `limits`: names of loops as the table has them; all without any."""
+    """`rivals`, `limits`, `smooth`: names of loops as the table has them; all without any."""
+    folder: Path | None = None
+    """`smooth`: a clone of the competition's repository, whose networks are read; rows whose
+    networks are not there are left out."""
     methods: tuple[str, ...] = ()
     """`rivals`, `limits`: names of methods as the table has them; all without any."""
     limit: float = 5.0
     """`limits`: seconds that each call is given."""
     simulations: int = 20_000
-    """`rivals`: trajectories whose largest values bounds are compared with; `decisions`: those that
-    tell what a set's margin is, and that samples refute by."""
+    """`rivals`, `smooth`: trajectories whose largest values bounds are compared with; `decisions`:
+    those that tell what a set's margin is, and that samples refute by."""
     repetitions: int = 3
     """Warm calls of which the median is taken."""
     patience: float = 60.0
@@ -73,6 +76,8 @@ class Settings:
         counts = ("widths", "growth", "reference_facets", "training_steps", "simulations")
         sizes = ("repetitions", "patience", "reference_width", "seed")
         require_options(self, **dict.fromkeys(counts, 1), samples=2, **dict.fromkeys(sizes, 0))
+        if self.folder is not None and not self.folder.is_dir():
+            raise ValueError(f"--folder must be a folder, but {self.folder} arrived")
         if not self.networks:
             raise ValueError("--networks must name at least one kind, but none arrived")
 

@@ -53,7 +53,7 @@ def in_new_process(function: Callable[..., dict], *arguments: Any) -> dict:
 def grown(width: int, name: str, settings: Settings) -> dict:
     """One row of the table."""
     jax.config.update("jax_enable_x64", True)
-    case, before = random_case(width, settings.seed), _peak()
+    case, before = random_case(width, settings.seed), peak_memory()
     template, relaxation = rj.Template.regular(FACETS), rj.PaperQC(repeated=False)
 
     def bounds():
@@ -72,13 +72,13 @@ def grown(width: int, name: str, settings: Settings) -> dict:
         "method": name,
         "clock": settings.clock,
         **timing.row(FACETS),
-        "memory": _peak() - before,
+        "memory": peak_memory() - before,
         "bounds": found,
         "statuses": sorted(statuses),
     }
 
 
-def _peak() -> int:
+def peak_memory() -> int:
     """The most memory that this process has held, in bytes.
 
     On Linux `ru_maxrss` begins with what the process held that started this one.

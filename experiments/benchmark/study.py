@@ -7,7 +7,9 @@ set, some with random weights and a set of the same size where most of their neu
 trained 2-10-5-1 network, and training steps. `rivals`: tubes of ever larger loops beside HiGHS's
 mixed-integer programs, affine forms in plain numpy, and the paper's programs by cvxpy.
 `decisions`: verdicts on six initial sets of a car, beside affine forms and samples. `limits`: every
-entry point under a time limit, in a process where nothing is compiled yet. All methods run
+entry point under a time limit, in a process where nothing is compiled yet. `smooth`: products,
+noise, long horizons, many states, differential equations, training steps, beside what is asked of
+each; an interrupted run continues with what is there. All methods run
 one after the other, with one BLAS thread and one thread for Clarabel (XLA takes what cores there
 are), so their ratios mean more than their seconds.
 """
@@ -62,6 +64,15 @@ from experiments.benchmark.rivals.methods import chosen
 from experiments.benchmark.rivals.procedures import PROCEDURES
 from experiments.benchmark.rivals.table import NOTE, table
 from experiments.benchmark.rivals.tasks import tasks
+from experiments.benchmark.smooth.run import (
+    SMOOTH_NOTE,
+    available,
+    key_of,
+    record,
+    rows_of,
+    smooth_table,
+    stored,
+)
 from experiments.benchmark.steps import STEPS_NOTE, measured, methods, steps_table
 from experiments.command import bar, require_folder
 
@@ -185,6 +196,30 @@ def limits(settings: Settings) -> None:
         raise SystemExit(f"error: longer than {GRACE} times the limit: {', '.join(late)}")
 
 
+def smooth(settings: Settings) -> None:
+    """Smooth loops beside what is asked of them, each row in a process of its own.
+
+    Rows of an earlier run of the same commit are taken from its file.
+    """
+    rows, missing = available(rows_of(settings), settings.folder)
+    known = stored(settings.output / "smooth.json")
+    results: list[dict] = []
+    with bar() as shown:
+        task = shown.add_task("", total=len(rows))
+        for row in rows:
+            shown.update(task, description=row.title)
+            key = key_of(row, settings)
+            known[key] = known[key] if key in known else record(row, settings)
+            results.append(known[key])
+            shown.advance(task)
+            write(settings, rows=list(known.values()))
+    if results:
+        rich.print(smooth_table(results))
+        rich.print(SMOOTH_NOTE)
+    for words in missing:
+        rich.print(words)
+
+
 def write(settings: Settings, **results: list[dict]) -> None:
     """Settings, threads and every row of each table."""
     threads = {name: os.environ.get(name) for name in THREADS} | {"cores": os.cpu_count()}
@@ -197,6 +232,6 @@ def main(settings: Settings) -> None:
     """One study: its tables are printed, and its rows written."""
     require_folder(settings.output)
     jax.config.update("jax_enable_x64", True)
-    studies = {study.__name__: study for study in (steps, growth, loops, rivals, decisions, limits)}
-    studies[settings.study](settings)
+    known = steps, growth, loops, rivals, decisions, limits, smooth
+    {study.__name__: study for study in known}[settings.study](settings)
     rich.print(f"written: {settings.output / settings.study}.json")

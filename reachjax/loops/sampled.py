@@ -21,7 +21,7 @@ from reachjax.loops.tracing.values import UnsupportedError, Value
 from reachjax.loops.units import AtUnit, UnboundedError, evaluate
 from reachjax.numerics.checks import Numbers, is_concrete, real_number, require_kind, whole_number
 from reachjax.numerics.pytrees import converted, pytree, static
-from reachjax.numerics.rounding import namespace
+from reachjax.numerics.rounding import is_counted, namespace
 
 NAME = "SampledPlant"
 
@@ -158,14 +158,15 @@ class SampledAffinePlant(AbstractSampledPlant):
         kept = self.__dict__.get("_flow")
         if kept is None:
             kept = self._new_flow()
-            if all(isinstance(each, np.ndarray) for each in jax.tree.leaves(self)):
+            of_numpy = all(isinstance(each, np.ndarray) for each in jax.tree.leaves(self))
+            if of_numpy and is_counted():  # what has no rounding must not be kept for a proof
                 object.__setattr__(self, "_flow", kept)
         return kept
 
     def prepared(self) -> SampledAffinePlant:
         """A copy that has the exponentials of its flow."""
         found = self.replace()
-        object.__setattr__(found, "_flow", self.flow.prepared())
+        object.__setattr__(found, "_flow", self._new_flow().prepared())
         return found
 
     def _new_flow(self) -> LinearFlow:

@@ -9,7 +9,8 @@ from mpmath import mpf
 
 import reachjax as rj
 from reachjax.loops.flows.linear import exponential
-from reachjax.numerics.rounding import Ball
+from reachjax.numerics.host import in_numpy
+from reachjax.numerics.rounding import Ball, rounding
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.flows import flowed_forms
 from reachjax.programs.initial import InitialColumns
@@ -87,3 +88,20 @@ def test_errors_of_a_plant_of_matrices_name_what_is_wrong():
         rj.SampledPlant.affine(np.eye(2), np.ones((3, 1)), period=0.1)
     with pytest.raises(ValueError, match="period must be above 0"):
         rj.SampledPlant.affine(np.eye(2), np.ones((2, 1)), period=0.0)
+
+
+def test_what_is_computed_without_rounding_is_kept_for_no_proof():
+    given, (kept, other) = (np.array([0.2, 0.1]), np.array([0.5])), (slow_plant(), slow_plant())
+    with rounding(False):
+        kept.flow.prepared()
+        kept.prepared().flow.enclosed(tuple(map(Ball.exact, given)))
+    found, expected = (
+        plant.flow.enclosed(tuple(map(Ball.exact, given))) for plant in (kept, other)
+    )
+    assert (found.rad > 0).all()
+    assert (found.rad == expected.rad).all()
+
+
+def slow_plant():
+    A, B = [[0.0, 1.0], [-3.0, -0.4]], [[0.0], [1.0]]
+    return in_numpy(rj.SampledPlant.affine(A, B, period=0.3))

@@ -90,6 +90,10 @@ method closes most: should that take longer, its halves could not be followed in
 NARROWED = 1 / 2
 """Cells are narrowed as long as there are fewer than this part of what there may be."""
 
+ALIKE = 3 / 4
+"""Sides longer than this part of the longest are as long: what is left aside along others, which
+are easily settled where facets hang on little else, makes what forms leave out no smaller."""
+
 SEARCHING = 0.9
 """The part of the time in which cells are halved: sets, proofs and witnesses take the rest, 0.7 s
 of two hundred steps where measured."""
@@ -312,7 +316,8 @@ class _Search(AbstractSearch):
     def _halves(self, node: Node, by_method: bool = False) -> _Halves:
         """The halves of a cell, and what is said over the cells that they consist of.
 
-        They are those along its longest side, unless forms over the cell settle one along another.
+        They are those along its longest side, unless forms over the cell settle one along another
+        that is as long.
         Of a half that they do not settle, all is left aside that they do.
         """
         room = math.floor(NARROWED * self._method.most) - self.cells.count
@@ -342,7 +347,8 @@ class _Search(AbstractSearch):
         levels, source = self._wanted_bounds, node.found
         if levels is None or self._follows or not (node.is_box and source.holds_over_parts):
             return None
-        for axis in np.argsort(-part.widths / self.cells.sides, kind="stable").tolist():
+        widths = part.widths / self.cells.sides
+        for axis in np.flatnonzero(widths > ALIKE * widths.max()).tolist():
             if not self.cells.can_halve(part, axis):
                 continue
             halves = self.cells.halved(part, axis)

@@ -91,8 +91,9 @@ NARROWED = 1 / 2
 """Cells are narrowed as long as there are fewer than this part of what there may be."""
 
 ALIKE = 3 / 4
-"""Sides longer than this part of the longest are as long: what is left aside along others, which
-are easily settled where facets hang on little else, makes what forms leave out no smaller."""
+"""Sides longer than this part of the longest are as long: a cell is bounded anew once it is shorter
+along one of these, as others, along which facets may be settled easily, may have no say in what
+forms leave out."""
 
 SEARCHING = 0.9
 """The part of the time in which cells are halved: sets, proofs and witnesses take the rest, 0.7 s
@@ -348,8 +349,9 @@ class _Search(AbstractSearch):
         if levels is None or self._follows or not (node.is_box and source.holds_over_parts):
             return None
         widths = part.widths / self.cells.sides
-        for axis in np.flatnonzero(widths > ALIKE * widths.max()).tolist():
-            if not self.cells.can_halve(part, axis):
+        least = ALIKE * widths.max() if part is node else 0.0
+        for axis in np.argsort(-widths, kind="stable").tolist():
+            if widths[axis] <= least or not self.cells.can_halve(part, axis):
                 continue
             halves = self.cells.halved(part, axis)
             for half in halves:

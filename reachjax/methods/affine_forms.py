@@ -26,7 +26,7 @@ from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
 from reachjax.methods.steps import boxed, overflow
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.numerics.derivatives import moved_by
-from reachjax.programs.held import Facets, held_bounds, sources
+from reachjax.programs.held import Attained, Facets, Source, held_bounds, sources
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.moving import HeldBounds, Moving, moving
 from reachjax.programs.unrolled import ByForms, unrolled, unrolled_at_once
@@ -72,7 +72,7 @@ def moving_offsets(
     for facet, node in deciding.items():
         if id(node) not in known:
             held = _held(loop, region, rows, node, k, problem.start)
-            part, around = moving_cell(problem, node)
+            part, around = moving_cell(problem, node.source)
             parts = Moving(problem.loop, part, around, directions[k], everywhere)
             known[id(node)] = moving(parts, held, k + 1, problem.start)
         offsets[facet] = known[id(node)][facet]
@@ -115,14 +115,33 @@ def _held(
     What a box is cut by decides where programs bound a form better than its norms do. The box is a
     little larger for them, so that where the initial set has a corner, its own facets decide.
     """
-    loop, part, box = jax.device_get((loop, cell.part, cell.box))
+    source = cell.source
+    loop, part, box = jax.device_get((loop, source.part, source.box))
     horizon, facets = Horizon(loop, part, box, start), None
     for _ in range(k + 1):
         horizon.advance()
+    if cell.height:
+        bounds = _of_part(horizon, directions[k], cell.box)
+        return held_bounds(horizon, bounds, len(directions))
     if (flat := _programmed(X0)) is not None:
         room = LOOSE * np.max(box.upper - box.lower)
         facets = flat.cut(Box(box.lower - room, box.upper + room)).facets
     return _held_forms(horizon, directions, facets)
+
+
+def _of_part(horizon: Horizon, directions: Float[np.ndarray, "f n_x"], box: Box) -> list[Source]:
+    """What bounds of the last states of a horizon over a part of the initial box rest on."""
+    part, forms = horizon.start.over_part(box), directions @ horizon.state
+    rows = forms.of_first(horizon.start).over_part(part)
+    found = list[Source]()
+    for row, source in zip(
+        forms.columns, sources(part.start, rows, rows.ends(part.start)[1], None), strict=True
+    ):
+        if source is not None:
+            first = part.columns_of(source.columns[None])[0]
+            source = Attained(np.append(first, np.sign(row[len(first) :])))
+        found.append(source)
+    return found
 
 
 def _held_forms(

@@ -33,6 +33,7 @@ class Node:
     Attributes:
         axis: along which coordinate it is halved; -1 where it is not.
         halves: the parts of it that the initial set reaches.
+        height: so many halvings up is the part whose forms bound it; 0 where its own do.
     """
 
     def __init__(
@@ -45,7 +46,7 @@ class Node:
     ):
         self.lower, self.upper, self._part = lower, upper, part
         self.parent, self.found = parent, found
-        self.axis, self.halves = -1, list[Node]()
+        self.axis, self.halves, self.height = -1, list[Node](), 0
 
     @classmethod
     def of(cls, cell: Cell, parent: Node | None = None) -> Node:
@@ -90,6 +91,13 @@ class Node:
         return node
 
     @property
+    def source(self) -> Node:
+        """The part whose forms bound it."""
+        node = self.before(self.height)
+        assert node is not None  # it has one
+        return node
+
+    @property
     def parts(self) -> Iterator[Node]:
         """The node and all below it, each half with all of its own before the next."""
         left = [self]
@@ -101,7 +109,12 @@ class Node:
     @property
     def axes(self) -> list[int]:
         """Along which coordinates it and its parts are halved, as `from_tree` takes them."""
-        return [node.axis if node.halves else -1 for node in self.parts]
+        return [node.axis if node.halves else -1 - node.height for node in self.parts]
+
+    @property
+    def leaves(self) -> list[Node]:
+        """The cells that cover it: of its parts those that are not halved."""
+        return [node for node in self.parts if not node.halves]
 
 
 class CellTree:
@@ -154,7 +167,7 @@ class CellTree:
     @property
     def leaves(self) -> list[Node]:
         """All cells, which cover the set."""
-        return [node for root in self.roots for node in root.parts if not node.halves]
+        return [leaf for root in self.roots for leaf in root.leaves]
 
     @property
     def is_full(self) -> bool:
@@ -190,7 +203,7 @@ class CellTree:
         return [Node(node.lower, below, None, node), Node(above, node.upper, None, node)]
 
     def replace(self, node: Node, halves: list[Node], axis: int) -> None:
-        """Let halves stand in the place of a cell."""
+        """Let halves stand in the place of a cell, perhaps halved themselves already."""
         node.axis = axis
         node.halves = halves  # from here on they stand there
-        self.count += len(halves) - 1
+        self.count += len(node.leaves) - 1

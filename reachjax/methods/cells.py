@@ -5,6 +5,10 @@ that decides the facet with the widest gap is halved, all steps being looked at 
 bound is attained by a trajectory up to the gap that may stay open. Cells that have no bounds at all
 are halved first: the initial set is treated like any part of it.
 
+Forms over a cell also bound any part of it, at next to no cost. So before anything is bounded anew,
+halves are left aside over which the cell's own forms prove that no facet is larger than what is
+attained already, up to that gap: they keep these forms, and what is left is smaller.
+
 What forms leave out of units that switch falls slowly, and another method costs as much as many
 forms. It is tried on the cell that decides most, once forms had their chance. Where it closes most
 of what they leave open, the set is cut into as many cells as there is work for, the largest first,
@@ -38,7 +42,8 @@ from reachjax.numerics.budget import ENDLESS, Budget
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.affine_steps import step_columns
-from reachjax.programs.unrolled import ByForms, unrolled
+from reachjax.programs.initial import SubboxColumns
+from reachjax.programs.unrolled import ByForms, subbox_columns, unrolled
 from reachjax.proofs.by_forms import CellCertificate
 from reachjax.proofs.certificates import AbstractProof
 from reachjax.proofs.proposal import SolverStatus
@@ -81,6 +86,14 @@ as another cell, but half of a cell may have as many."""
 LEFT_TO_METHOD = 1 / 2
 """The part of a limited time that is kept from the first cell that is followed, where the other
 method closes most: should that take longer, its halves could not be followed in time either."""
+
+NARROWED = 1 / 2
+"""Cells are narrowed as long as there are fewer than this part of what there may be."""
+
+ALIKE = 3 / 4
+"""Sides longer than this part of the longest are as long: a cell is bounded anew once it is shorter
+along one of these, as others, along which facets may be settled easily, may have no say in what
+forms leave out."""
 
 SEARCHING = 0.9
 """The part of the time in which cells are halved: sets, proofs and witnesses take the rest, 0.7 s
@@ -152,6 +165,7 @@ class _Bounds(NamedTuple):
         lost: what has no bounds over it after these steps, if anything has not.
         sets: what another method says; nothing if that was not asked.
         levels: `(N, f)`, below which nothing was asked of it.
+        effort: what they took, in units of a form of the whole horizon along one way.
     """
 
     steps: Sequence[ByForms]
@@ -159,6 +173,7 @@ class _Bounds(NamedTuple):
     lost: UnboundedError | None = None
     sets: Sequence[ReachSet] = ()
     levels: Float[np.ndarray, "N f"] = np.zeros((0, 0))
+    effort: float = 1.0
 
     @property
     def is_bounded(self) -> bool:
@@ -166,9 +181,20 @@ class _Bounds(NamedTuple):
         return bool((self.offsets < np.inf).all())  # nothing is below where no state is
 
     @property
-    def effort(self) -> float:
-        """What they took, in units of a form of the whole horizon along one way."""
-        return max(1.0, sum(step.ways for step in self.steps) / max(1, len(self.offsets)))
+    def holds_over_parts(self) -> bool:
+        """Whether forms over it also bound each of its parts."""
+        every = len(self.steps) == len(self.offsets)
+        return every and all(step.forms is not None for step in self.steps)
+
+    def over(self, part: SubboxColumns, levels: Float[np.ndarray, "N f"]) -> _Bounds | None:
+        """What the same forms say over a part; None where a bound is larger than its level."""
+        steps = list[ByForms]()
+        for step, level in zip(self.steps[::-1], levels[::-1], strict=True):  # late ones are wide
+            steps.append(step.over_part(part))
+            if not (steps[-1].offsets <= level).all():
+                return None
+        steps.reverse()
+        return _Bounds(steps, np.array([step.offsets for step in steps]), effort=0.0)
 
     def proofs(self, first: int, k: int) -> tuple[AbstractProof, ...]:
         """The other method's proofs from one step on until `k`; none if it was not asked."""
@@ -186,6 +212,28 @@ class _Bounds(NamedTuple):
         offsets = np.array([np.asarray(each.region.facets[1]) for each in sets])
         both = np.fmin(self.offsets, offsets)
         return self._replace(offsets=both, sets=sets, levels=levels)
+
+
+class _Halves(NamedTuple):
+    """The halves of a cell.
+
+    Attributes:
+        axis: the coordinate along which it is halved.
+        halves: those that the initial set reaches.
+    """
+
+    axis: int
+    halves: list[Node]
+
+    @property
+    def leaves(self) -> list[Node]:
+        """The cells that they consist of."""
+        return [leaf for half in self.halves for leaf in half.leaves]
+
+    @property
+    def open_ones(self) -> list[Node]:
+        """The halves that the forms over a cell do not settle."""
+        return [half for half in self.halves if not half.height]
 
 
 class _Search(AbstractSearch):
@@ -250,7 +298,8 @@ class _Search(AbstractSearch):
         offsets = np.full(self._directions.shape[:2], np.inf)
         for row, step in zip(offsets, steps, strict=False):
             row[:] = np.where(np.isnan(step.offsets), np.inf, step.offsets)
-        return _Bounds(steps, offsets, lost)
+        effort = max(1.0, sum(step.ways for step in steps) / max(1, len(offsets)))
+        return _Bounds(steps, offsets, lost, effort=effort)
 
     def _by_method(self, node: Node, trial: bool = False) -> _Bounds:
         """What forms and the other method say over a cell, within a part of the work if tried."""
@@ -265,14 +314,53 @@ class _Search(AbstractSearch):
         self._left -= self._price
         return found
 
-    def _halves(self, node: Node, by_method: bool = False) -> list[Node]:
-        """The halves of a cell along its longest side, and what is said over them."""
-        halves = self.cells.halved(node, self.cells.longest(node))
-        for half in halves:
-            half.found = self._by_forms(half)
-            if by_method and half.found.is_bounded:
-                half.found = self._by_method(half)
-        return halves
+    def _halves(self, node: Node, by_method: bool = False) -> _Halves:
+        """The halves of a cell, and what is said over the cells that they consist of.
+
+        They are those along its longest side, unless forms over the cell settle one along another
+        that is as long.
+        Of a half that they do not settle, all is left aside that they do.
+        """
+        room = math.floor(NARROWED * self._method.most) - self.cells.count
+        found = self._cut(node, node) if room > 0 else None
+        room -= found is not None
+        axis = self.cells.longest(node)
+        found = found or _Halves(axis, self.cells.halved(node, axis))
+        for part in found.open_ones:
+            while room > 0 and (cut := self._cut(node, part)):
+                part.axis, part.halves = cut
+                part.found, room = node.found._replace(steps=(), sets=()), room - 1
+                if not cut.open_ones:
+                    break
+                (part,) = cut.open_ones
+            else:
+                part.found = self._by_forms(part)
+                if by_method and part.found.is_bounded:
+                    part.found = self._by_method(part)
+        return found
+
+    def _cut(self, node: Node, part: Node) -> _Halves | None:
+        """Halves of a part of a cell, one of which forms over that settle; None if none.
+
+        Settled is where no facet is larger than what is attained, but for the gap that may stay
+        open.
+        """
+        levels, source = self._wanted_bounds, node.found
+        if levels is None or self._follows or not (node.is_box and source.holds_over_parts):
+            return None
+        widths = part.widths / self.cells.sides
+        least = ALIKE * widths.max() if part is node else 0.0
+        for axis in np.argsort(-widths, kind="stable").tolist():
+            if widths[axis] <= least or not self.cells.can_halve(part, axis):
+                continue
+            halves = self.cells.halved(part, axis)
+            for half in halves:
+                columns = subbox_columns(self._loop, node.part, node.box, half.box)
+                half.found = source.over(columns, levels)
+                half.height = 0 if half.found is None else half.depth - node.depth
+            if any(half.height for half in halves):
+                return _Halves(axis, halves)
+        return None
 
     def _note(self) -> None:
         self.leaves = self.cells.leaves
@@ -479,13 +567,13 @@ class _Search(AbstractSearch):
     def _can_halve(self, node: Node) -> bool:
         return self.cells.can_halve(node, self.cells.longest(node))
 
-    def _halved(self, node: Node, halves: list[Node]) -> bool:
+    def _halved(self, node: Node, found: _Halves) -> bool:
         """Whether halves stand in the place of a cell, which have bounds if it has."""
-        if node.found.is_bounded and not all(half.found.is_bounded for half in halves):
+        if node.found.is_bounded and not all(leaf.found.is_bounded for leaf in found.leaves):
             return False
-        self.cells.replace(node, halves, self.cells.longest(node))
+        self.cells.replace(node, found.halves, found.axis)
         node.found = node.found._replace(steps=(), sets=())
-        self._left -= sum(half.found.effort for half in halves)
+        self._left -= sum(leaf.found.effort for leaf in found.leaves)
         self._halvings += 1
         self._note()
         return True

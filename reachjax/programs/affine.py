@@ -51,7 +51,7 @@ from reachjax.numerics.rounding import (
     settled,
     underflow,
 )
-from reachjax.programs.initial import Ends, InitialColumns, met
+from reachjax.programs.initial import SIZE, Ends, InitialColumns, SubboxColumns, met
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,6 +247,23 @@ class AffineForms(AbstractNumber):
         error = errors(lambda: gamma(2) * abs(middle))
         reach = self.radii[:, -1] * (1 + gamma(2)) + error
         return middle - reach, middle + reach
+
+    def of_first(self, start: InitialColumns) -> AffineForms:
+        """The numbers over the first columns, what all others add counted as an error (numpy)."""
+        own = start.count
+        off = (self.rest(own) + self.off) * (1 + gamma(4))
+        return AffineForms(self.rows[:, : 2 + own], radii_of(off, self.radii[:, -1]))
+
+    def over_part(self, part: SubboxColumns) -> AffineForms:
+        """Forms in the first columns, over those of a part of the initial box (numpy)."""
+        n, size = self.columns.shape[1], abs(self.columns).sum(axis=1)
+        constant = self.rows[:, 0] + self.columns @ part.change[:, 0]
+        columns = self.columns @ part.change[:, 1:]
+        lost = 4 * TINY * (n + 2) ** 2 * (1 + SIZE * size)
+        error = gamma(n + 24) * (abs(self.rows[:, 0]) + SIZE * size) + lost
+        rows = np.concatenate([constant[:, None], self.rows[:, 1:2], columns], axis=1)
+        off = (self.off + error) * (1 + gamma(4))
+        return AffineForms(rows, radii_of(off, self.radii[:, -1]))
 
     def widened(self, by) -> AffineForms:
         """The numbers up to an error of so much each."""

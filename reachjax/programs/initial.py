@@ -16,13 +16,18 @@ in `[-1, 1]`: forms over both are polynomials of degree two of the initial state
 and from `(1 - s_i w_i) (1 - s_j w_j) >= 0`, `s_i` being the sign of `g_i`, where `q s_i s_j < 0`,
 
     q w_i w_j  <=  |q| - m s_i w_i - m s_j w_j  for any m in [0, |q|].
+
+Over a box within the box, `w = c + d v` where `v` has its entries in `[-1, 1]`, and
+
+    2 w_i^2 - 1  =  2 c_i^2 + d_i^2 - 1 + 4 c_i d_i v_i + d_i^2 (2 v_i^2 - 1),
+    w_i w_j  =  c_i c_j + c_j d_i v_i + c_i d_j v_j + d_i d_j v_i v_j.
 """
 
 from __future__ import annotations
 
 import itertools
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -30,6 +35,7 @@ from jaxtyping import Array, Float
 
 from reachjax.numerics.pytrees import Replaceable, pytree, static
 from reachjax.numerics.rounding import (
+    TINY,
     Ball,
     constant,
     counting,
@@ -210,6 +216,27 @@ class InitialColumns(Replaceable):
         norms = self.norms(rows)
         return -norms, norms
 
+    def over_part(self, part: Box) -> SubboxColumns:
+        """The columns of a box within the box that these are of; in numpy."""
+        q, r = np.asarray(self.center), np.diagonal(self.spread)
+        wide = r > 0
+        ends = [(np.asarray(end) - q) / np.where(wide, r, 1.0) for end in (part.lower, part.upper)]
+        room = [gamma(4) * abs(end) + TINY for end in ends]
+        around = Ball.between(ends[0] - room[0], ends[1] + room[1])
+        c, d = np.where(wide, around.mid, 0.0), np.where(wide, around.rad, 1.0)
+        (i, j), n = self.pairs, len(q)
+        first, products = np.arange(n), n + np.arange(len(i))
+        change, square = np.zeros((self.count, 1 + self.count)), i == j
+        change[first, 0], change[first, 1 + first] = c, d
+        change[products, 0] = np.where(square, 2 * c[i] ** 2 + d[i] ** 2 - 1, c[i] * c[j])
+        change[products, 1 + i] = np.where(square, 4, 1) * c[j] * d[i]
+        mixed = products[~square]
+        change[mixed, 1 + j[~square]] = (c[i] * d[j])[~square]
+        change[products, 1 + products] = d[i] * d[j]
+        spread = np.diag(r * d)
+        start = self.replace(center=q + r * c, spread=spread, cut=None, box=part)
+        return SubboxColumns(start, change)
+
     def cut_ends(self, rows: Rows) -> Ends:
         """Bounds of `r . w` for each row, by the cut as well."""
         if self.cut is None:
@@ -222,6 +249,27 @@ class InitialColumns(Replaceable):
         lower = least - at - constant((error + gamma(4) * abs(least)) * (1 + gamma(n)))
         upper = most - at + constant((error + gamma(4) * abs(most)) * (1 + gamma(n)))
         return larger(-norms, lower), smaller(norms, upper)
+
+
+class SubboxColumns(NamedTuple):
+    """The columns of a box within the box of other columns, of which those are made.
+
+    Attributes:
+        start: its columns.
+        change: `(n, 1 + n)`, of each of the others its constant and its coefficients of these;
+            their absolute values add up to `SIZE` at most.
+    """
+
+    start: InitialColumns
+    change: Float[np.ndarray, "n n+1"]
+
+    def columns_of(self, values: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k n"]:
+        """Values of the other columns, of some of these; rounded."""
+        return self.change[:, 0] + values @ self.change[:, 1:].T
+
+
+SIZE = 10
+"""Those of a square are `2 c^2 + d^2 + 1`, `4 |c| d` and `d^2`, where `|c| + d` is about 1."""
 
 
 def met(one: Ends, other: Ends) -> Ends:

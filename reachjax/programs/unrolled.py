@@ -26,7 +26,7 @@ from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
 from reachjax.programs.flows import Between
 from reachjax.programs.followed import NoStatesError, OpenDecision, Way, ways
-from reachjax.programs.initial import InitialColumns, constant
+from reachjax.programs.initial import InitialColumns, SubboxColumns, constant
 from reachjax.programs.merging import merged_columns
 from reachjax.sets import AbstractSet, Box
 
@@ -47,6 +47,8 @@ class ByForms(NamedTuple):
         ways: along how many ways of decisions that is so.
         moved: `(n_x,)`, how far each coordinate of the initial set moves what decides between this
             way and others, all decisions together; empty where there is no other way.
+        forms: of the directions over the columns of the initial box alone, on the host, where one
+            way is followed from a set that has no round parts; None elsewhere.
     """
 
     offsets: Float[Array | np.ndarray, "*N m"]
@@ -57,6 +59,26 @@ class ByForms(NamedTuple):
     open: tuple[OpenDecision, ...] = ()
     ways: int = 1
     moved: Float[np.ndarray, " n_x"] = np.zeros(0)
+    forms: AffineForms | None = None
+
+    def over_part(self, part: SubboxColumns) -> ByForms:
+        """What the same forms say of the states that are reached from a part of the initial box.
+
+        Infinite where there are no forms.
+        """
+        if self.forms is None:
+            return self._replace(offsets=np.full(len(self.offsets), np.inf))
+        with np.errstate(all="ignore"):
+            forms = self.forms.over_part(part)
+            offsets = np.fmin(forms.ends(part.start)[1], self.offsets)
+            corners = part.start.farthest(forms.columns[:, : len(part.start.spread)])
+        return self._replace(offsets=offsets, corners=corners, forms=None)
+
+
+def subbox_columns(loop: ClosedLoop, X: AbstractSet, box: Box, part: Box) -> SubboxColumns:
+    """The columns of a part of the box around an initial set, as `unrolled` has its columns."""
+    X, box, part = map(in_numpy, (X, box, part))
+    return InitialColumns.of(X, box, loop.curved).over_part(part)
 
 
 def unrolled(
@@ -194,6 +216,8 @@ def _of_way(
         ]
         moved = _moved(np.asarray(way.facts.columns), start)
         found = found._replace(offsets=upper, corners=corners, moved=moved)
+    elif not start.round:
+        found = found._replace(forms=forms.of_first(start))
     return found._replace(drawn=tuple(drawn), open=way.open)
 
 

@@ -10,10 +10,10 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.units import UnboundedError
 from reachjax.numerics.checks import floats_of, require_double_precision
 from reachjax.numerics.pytrees import pytree, static
-from reachjax.programs.unrolled import unrolled
+from reachjax.programs.unrolled import ByForms, subbox_columns, unrolled
 from reachjax.proofs.certificates import AbstractProof, told
 from reachjax.sets import AbstractSet, Box
-from reachjax.sets.cells import from_tree
+from reachjax.sets.cells import Cell, from_tree
 
 
 @pytree
@@ -90,11 +90,32 @@ def _proved(
     most: int = 1,
 ) -> Float[np.ndarray, " f"]:
     """The offsets of the last step; infinite where they overflow or a unit has no bounds."""
+    last = _last(loop, X0, box, directions, start, slopes, most)
+    return _numbers(last, len(directions[-1]))
+
+
+def _last(
+    loop: ClosedLoop,
+    X0: AbstractSet,
+    box: Box,
+    directions: Float[np.ndarray, "k f n_x"],
+    start: int,
+    slopes: Float[np.ndarray, "k units"] | None = None,
+    most: int = 1,
+) -> ByForms | None:
+    """What forms say of the last step; None where a unit has no bounds."""
     try:
         *_, last = unrolled(loop, X0, box, directions, start, slopes, most=most)
     except UnboundedError:
-        return np.full(len(directions[-1]), np.inf)
-    return np.where(np.isnan(last.offsets), np.inf, last.offsets)
+        return None
+    return last
+
+
+def _numbers(found: ByForms | None, facets: int) -> Float[np.ndarray, " f"]:
+    """The offsets that forms prove, infinite where they prove none."""
+    if found is None:
+        return np.full(facets, np.inf)
+    return np.where(np.isnan(found.offsets), np.inf, found.offsets)
 
 
 @pytree
@@ -110,7 +131,8 @@ class CellCertificate(AbstractProof):
         X0: the initial set.
         directions: `(f, n_x)`, of the facets.
         axes: `(nodes,)`, along which coordinate each part is halved, the initial set first and each
-            half with all of its own before the next; -1 where it is a cell.
+            half with all of its own before the next; -1 where it is a cell. Of a cell with -2, -3,
+            ... nothing but what forms over the part 1, 2, ... halvings before say of it is used.
         k: how many steps after the initial set.
         start: the time of the initial set.
         proofs: for each cell what proves more than forms: the proof of this step, behind those of
@@ -164,9 +186,28 @@ class CellCertificate(AbstractProof):
         cells, proofs = from_tree(jax.device_put(self.X0), given), self.proofs
         if axes is not None or not proofs:
             proofs = ((),) * len(cells)
-        found = []
+        found, sources = [], dict[int, ByForms | None]()
         for cell, own in zip(cells, proofs, strict=True):
-            given = self.loop, cell.part, cell.box, directions, self.start
-            bounds = _proved(*given, most=self.ways)
+            bounds = self._over(cell, directions, sources)
             found.append(np.fmin(bounds, own[-1].recheck()) if own else bounds)
         return np.max(found, axis=0)
+
+    def _over(
+        self,
+        cell: Cell,
+        directions: Float[np.ndarray, "k f n_x"],
+        sources: dict[int, ByForms | None],
+    ) -> Float[np.ndarray, " f"]:
+        """What forms over a cell prove, or those over what it is a part of, which are kept."""
+        source = cell.source or cell
+        given = self.loop, source.part, source.box, directions, self.start
+        if cell.source is None:
+            return _proved(*given, most=self.ways)
+        if id(source) not in sources:
+            sources[id(source)] = _last(*given, most=self.ways)
+        known = sources[id(source)]
+        if known is not None and known.forms is not None:
+            known = known.over_part(subbox_columns(self.loop, source.part, source.box, cell.box))
+        elif known is not None:  # of what is cut by a ball, nothing is said of parts
+            known = None
+        return _numbers(known, directions.shape[1])

@@ -29,10 +29,17 @@ ENOUGH = 1000
 
 
 class Cell(NamedTuple):
-    """The part of a set that lies in a box, or a little more."""
+    """The part of a set that lies in a box, or a little more.
+
+    Attributes:
+        box: the box.
+        part: the part of the set.
+        source: the cell that it is a part of and whose bounds are its own; None if it has its own.
+    """
 
     box: Box
     part: AbstractSet
+    source: Cell | None = None
 
 
 def grid(X: AbstractSet, counts: Sequence[int]) -> list[Cell]:
@@ -102,7 +109,9 @@ def from_tree(X: AbstractSet, axes: Sequence[int]) -> list[Cell]:
     Args:
         X: the set, which no part is left out of.
         axes: of the box around it, and then of the halves that the set reaches, each with all of
-            its own before the next: along which coordinate it is halved, or -1 if it is not.
+            its own before the next: along which coordinate it is halved, or -1 if it is not. A
+            cell may also have -2, -3, ...: what is proved of it is proved of what it is a part of,
+            1, 2, ... halvings before.
 
     Raises:
         ValueError: an entry is missing, is left over, or is no coordinate.
@@ -112,15 +121,17 @@ def from_tree(X: AbstractSet, axes: Sequence[int]) -> list[Cell]:
         >>> [cell.box.upper.tolist() for cell in from_tree(X, [1, -1, 0, -1, -1])]
         [[1.0, 0.5], [0.5, 1.0], [1.0, 1.0]]
     """
-    found, left = [], [Cell(X.bounding_box(), X)]
+    found, left = [], [(Cell(X.bounding_box(), X),)]  # each behind all that it is a part of
     for axis in axes:
-        if not left or not -1 <= axis < X.dimension:
+        if not left or not -len(left[-1]) <= axis < X.dimension:
             break
-        cell = left.pop()
+        line = left.pop()
         if axis < 0:
-            found.append(cell)
+            source = None if axis == -1 else line[int(axis)]
+            found.append(line[-1]._replace(source=source))
         else:
-            left += halves_along(X, cell.box, int(axis))[::-1]
+            halves = halves_along(X, line[-1].box, int(axis))
+            left += [(*line, half) for half in halves[::-1]]
     else:
         if not left:
             return found

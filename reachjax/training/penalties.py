@@ -57,7 +57,8 @@ def volume_penalty(
     or networks) and `scan`. A penalty needs no proof: where `LinearBounds()` is compiled or
     differentiated, the sets are the certified ones but for rounding, and of a differential equation
     for what Taylor polynomials leave out: as many steps a period as its plant's `steps` says are
-    done, of its `order`, or of order four.
+    done, of its `order`, or of order four. Where states turn by a quarter of a round or more within
+    such a step, polynomials leave out much, and more `steps` are to be given.
 
     Args:
         loop: the closed loop.

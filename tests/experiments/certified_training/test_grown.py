@@ -60,13 +60,13 @@ def test_volumes_and_areas_are_compared():
     assert np.isnan(ratios({"before": nowhere, "after": after})[1])
 
 
-@pytest.mark.parametrize("half", [[0.05, 0.1]])
 @pytest.mark.costly
-def test_cells_of_a_region_of_attraction_come_into_a_box_that_is_come_back_to(half):
+def test_cells_of_a_region_of_attraction_come_into_a_box_that_is_come_back_to():
     loop = linear(-12.0, -5.0)
-    back, cells = grown.attraction(loop, replace(QUICK, limit=30.0, cells=60))
+    back, cells = grown.attraction(loop, replace(QUICK, limit=600.0, cells=60))
     assert np.all(back > 0)
-    assert np.all(back <= half)
+    assert np.all(back < np.asarray(grown.GOAL.upper))
+    assert len(cells) > 0
     corners = np.concatenate([cells[:, 0], cells[:, 1]])
     runs = np.asarray(loop.simulate(corners, 200))
     assert np.abs(runs[:, -1]).max(initial=0.0) < 1e-3

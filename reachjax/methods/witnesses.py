@@ -106,9 +106,11 @@ def initial_states(X0: AbstractSet, count: int, seed: int) -> Float[np.ndarray, 
 
     Where the set has a curved surface, half of the points are on it, just inside.
     """
-    key, drawn = jax.random.key(seed), _blocks(count)
-    states, surface = jax.device_get((X0.sample(key, drawn), X0.sample_boundary(key, drawn)))
-    states = states[:count]
+    if X0.intervals is not None:  # in numpy, and surely inside
+        return np.concatenate([jax.device_get(X0.corners()), X0.drawn(count, seed)])
+    drawn = _blocks(count)
+    states = X0.drawn(drawn, seed)[:count]
+    surface = jax.device_get(X0.sample_boundary(jax.random.key(seed), drawn))
     if surface is not None:
         middle = states.mean(axis=0)
         states = states.copy()

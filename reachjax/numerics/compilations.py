@@ -43,10 +43,12 @@ class CompiledBeside:
     thread of its own, for which neither a limit nor Ctrl-C waits, but the end of Python does: JAX
     must not be taken down under it. It begins once callers have spent as much in numpy as
     compiling takes; at once if one call takes as much, or if it is cheap; and only if what is left
-    of their time is longer. What it finds is of use only where it is faster.
+    of their time is longer. What it finds is of use only where it is faster. Where it finds
+    nothing, since compiling failed, its callers go on in numpy, and a warning is logged.
 
     Args:
-        function: made by `jax.jit`, with keywords for what is static.
+        function: made by `jax.jit`, with keywords for what is static. What it is called with is
+            what is compiled for: of loops all that depends on parameters alone is computed before.
     """
 
     def __init__(self, function: Any):
@@ -114,10 +116,16 @@ class CompiledBeside:
 
     @lenient
     def _compiled(self, known: _Compiled, given: Any, static: Any) -> None:
-        """Compile, and measure a call; what fails here fails as well where it is called.
+        """Compile, and measure a call; where that fails callers do without it."""
+        try:
+            self._measured(known, given, static)
+        except Exception as error:  # nobody waits for this thread
+            LOGGER.warning(
+                "JAX could not compile beside what goes on, which goes on in numpy: %r", error
+            )
 
-        Where no core is idle callers go first.
-        """
+    def _measured(self, known: _Compiled, given: Any, static: Any) -> None:
+        """Compile, and measure a call; where no core is idle callers go first."""
         if sys.platform == "linux":  # where threads have priorities of their own
             own = os.PRIO_PROCESS, threading.get_native_id()
             os.setpriority(*own, max(os.getpriority(*own), BEHIND))

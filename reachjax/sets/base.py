@@ -152,7 +152,11 @@ class AbstractSet(Replaceable, abc.ABC):
 
     def scale(self) -> Float[Array, "n n"]:
         """A matrix of half-widths, which maps the unit ball to about the size of the set."""
-        return jnp.diag(self.bounding_box().widths / 2)
+        box = self.bounding_box()
+        if is_concrete(box):  # compiles nothing
+            with np.errstate(over="ignore"):
+                return jnp.asarray(np.diag((np.asarray(box.upper) - np.asarray(box.lower)) / 2))
+        return jnp.diag(box.widths / 2)
 
     def bounds_along(self, directions: Float[Array, "m n"]) -> Float[Array, " m"]:
         """Upper bounds of `a . x` over the set that cost little in compiled code: the support."""
@@ -175,6 +179,10 @@ class AbstractSet(Replaceable, abc.ABC):
     @abc.abstractmethod
     def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
         """Points drawn uniformly from the set."""
+
+    def drawn(self, count: int, seed: int) -> Float[np.ndarray, "count n"]:
+        """Points drawn uniformly, on the host: a first call compiles nothing for boxes."""
+        return np.asarray(self.sample(jax.random.key(seed), count))
 
     def sample_boundary(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"] | None:
         """Points of the curved surface, up to rounding; None where there are facets alone."""
@@ -518,12 +526,21 @@ class Box(PolyhedralSet):
                 f"more than the {MOST_CORNERS} that are listed"
             )
         upper = np.stack(np.unravel_index(np.arange(2**self.dimension), (2,) * self.dimension), 1)
+        if is_concrete(self):  # compiles nothing
+            return jnp.asarray(np.where(upper, np.asarray(self.upper), np.asarray(self.lower)))
         return jnp.where(jnp.asarray(upper, dtype=bool), self.upper, self.lower)
 
     def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "count n"]:
         """Points drawn uniformly."""
         self._single()
         return _uniform(self.lower, self.upper, key, count)
+
+    def drawn(self, count: int, seed: int) -> Float[np.ndarray, "count n"]:
+        """Points drawn uniformly, by numpy."""
+        self._single()
+        lower, upper = np.asarray(self.lower), np.asarray(self.upper)
+        shares = np.random.default_rng(seed).random((count, len(lower)), lower.dtype)
+        return np.clip((1 - shares) * lower + shares * upper, lower, upper)
 
     def volume(self) -> Float[Array, ""]:
         """The product of the widths."""

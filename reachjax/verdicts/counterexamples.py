@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -118,7 +117,7 @@ def _moved_inwards(
     A set that is too thin to be sampled has no middle that is known: the scenario stays.
     """
     try:
-        states = np.asarray(scenarios.X0.sample(jax.random.key(0), AROUND))
+        states = scenarios.X0.drawn(AROUND, 0)
     except ThinSetError:
         return scenario
     middle = scenarios.middle(states.mean(axis=0))

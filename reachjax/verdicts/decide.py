@@ -358,7 +358,8 @@ class _Decision:
         self._loop, self._start, self._budget = loop, start, budget
         self._horizon, self._X0 = horizon, X0
         self._scenarios = Scenarios.of(loop, X0, horizon, start)
-        self._middle = self._scenarios.middle(np.asarray(boxed(X0, "X0").center))
+        lower, upper = map(np.asarray, boxed(X0, "X0").intervals)
+        self._middle = self._scenarios.middle((lower + upper) / 2)
         self._findings = Findings(loop, X0, horizon, start, required)
         self._certificates: dict[tuple[str, int], BranchCertificate] = {}
         self._climbs = list[ClimbRecord]()

@@ -121,7 +121,9 @@ class Sieve:
     """
 
     def __init__(self, loop: ClosedLoop, horizon: int, start: int, required: Sequence[Requirement]):
-        self._loop, self._on_host, self._start = jax.device_put(loop), in_numpy(loop), start
+        # what depends on parameters alone is an argument of what is compiled, and no part of it
+        self._loop, self._on_host = jax.device_put(with_constants(loop)), in_numpy(loop)
+        self._start = start
         self._rows, directions, whole = FacetRowsByTime.of(required, horizon, loop.states)
         self._directions, self._later = directions, jnp.asarray(directions[1:])
         self._whole = jnp.asarray(whole[1:]) if whole.any() else None
@@ -157,7 +159,7 @@ class Sieve:
     @cached_property
     def _of_subnormals(self) -> bool:
         """Whether the loop, or what is required, has numbers that compiled code takes for zero."""
-        return holds_subnormals(with_constants((self._loop, self._later)))
+        return holds_subnormals((self._loop, self._later))
 
     def _measured(self, cell: Ends) -> float | None:
         """The seconds that a call takes one by one; None where this cell has no bounds."""

@@ -124,6 +124,23 @@ def test_a_part_of_a_call_is_compared_with_what_that_part_takes():
     assert not found.pays(x, by=2.0, share=1e-9, **given)
 
 
+def test_what_cannot_be_compiled_is_done_without_and_logged(caplog, capfd):
+    """Nobody waits for the thread: what it raised would be on the screen, and nowhere else."""
+
+    def refused(x):
+        raise ValueError("it has no rule")
+
+    found, x = CompiledBeside(jax.jit(refused)), jnp.ones(9)
+    given = {"seconds": lambda: 1e-3, "evaluations": 1000, "left": np.inf}
+    assert not any(found.pays(x, **given) for _ in range(3))
+    (record,) = (each for each in caplog.records if each.name == "reachjax")
+    assert record.levelname == "WARNING"
+    assert record.getMessage().endswith("goes on in numpy: ValueError('it has no rule')")
+    assert "Traceback" not in capfd.readouterr().err
+    with pytest.raises(ValueError, match="it has no rule"):
+        found(x)
+
+
 @pytest.mark.costly
 def test_of_the_settings_of_the_suite_the_installed_xla_accepts_all_that_are_used():
     """XLA ends a process that names one which it no longer has."""

@@ -86,15 +86,24 @@ def test_vertices_are_all_combinations_of_bounds(bounds):
     assert sorted(map(tuple, vertices)) == sorted(map(tuple, corners(lower, upper)))
 
 
-def test_samples_lie_inside_and_fill_the_box(bounds):
+@pytest.mark.parametrize("on_host", [False, True])
+def test_samples_lie_inside_and_fill_the_box(bounds, on_host):
     lower, upper = bounds
     box = rj.Box(lower, upper)
-    samples = np.asarray(box.sample(jax.random.key(0), 2000))
+    samples = box.drawn(2000, 0) if on_host else np.asarray(box.sample(jax.random.key(0), 2000))
     assert samples.shape == (2000, len(lower))
     assert box.contains(samples).all()
     # the standard deviation of the mean of 2000 uniform draws is 0.0065 of the width
     np.testing.assert_allclose(samples.mean(axis=0), (lower + upper) / 2, atol=0.03 * 2)
     np.testing.assert_allclose(np.ptp(samples, axis=0), upper - lower, rtol=0.01)
+
+
+def test_what_is_drawn_on_the_host_hangs_on_the_seed_alone(bounds):
+    """The first points are the same however many are drawn."""
+    lower, upper = bounds
+    box = rj.Box(lower, upper)
+    np.testing.assert_array_equal(box.drawn(30, 3)[:7], box.drawn(7, 3))
+    np.testing.assert_array_equal((box.drawn(7, 3) != box.drawn(7, 4)).any(0), lower < upper)
 
 
 def test_the_volume_is_the_product_of_the_widths(bounds):

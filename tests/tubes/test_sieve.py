@@ -1,5 +1,8 @@
 """Cells that one compiled call decides are decided rightly, whatever the loop."""
 
+import time
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -25,12 +28,23 @@ def smooth():
     return rj.ClosedLoop(rj.NonlinearPlant(f, states=3, inputs=1), net)
 
 
+def prepared():
+    """A loop with a matrix that is computed, and rounded, of parameters alone."""
+
+    def law(p, x):
+        return -jax.nn.softplus(p) @ jnp.tanh(x)
+
+    net = rj.Network(jax.tree_util.Partial(law, np.array([[0.3, -0.2]])), 2, 1)
+    return rj.ClosedLoop(rj.AffinePlant([[1.0, 0.2], [0.0, 0.9]], [[0.0], [0.2]]), net)
+
+
 LOOPS = {
     "one state": lambda: closed_loop(random_loop(1, (3,), seed=4)),
     "three states": lambda: closed_loop(random_loop(3, (4, 3), seed=2)),
     "smooth": smooth,
     "disturbed": lambda: double_integrator()[0],
     "polytope of inputs": lambda: polytope_loop(polygon(4)),
+    "prepared": prepared,
 }
 
 
@@ -78,6 +92,18 @@ def test_what_compiled_code_takes_for_zero_is_not_sifted(where, monkeypatch):
 
     assert pays(1e-300, 0.0)
     assert not (pays(1e-310, 0.0) if where == "weights" else pays(1e-300, 1e-310))
+
+
+@pytest.mark.costly
+def test_what_is_computed_of_parameters_alone_is_sifted_as_well():
+    """It is an argument of the compiled call, which is there as soon as it pays."""
+    loop, boxes = LOOPS["prepared"](), cells(2)
+    sieve = Sieve(loop, HORIZON, 0, requirements(2, HORIZON, safe=rj.Box([-1.0] * 2, [1.0] * 2)))
+    for _ in range(1000):
+        if sieve.pays(boxes, Budget()):
+            return
+        time.sleep(0.05)
+    pytest.fail("it was not compiled beside those who asked for it")
 
 
 @pytest.mark.costly

@@ -128,7 +128,7 @@ class CellTree:
     Attributes:
         roots: as given.
         most: as given.
-        count: how many there are.
+        count: how many there are that are bounded by forms of their own.
         sides: `(n,)`, of the box around the set, by which those of cells are measured; 1 where it
             is flat.
     """
@@ -171,7 +171,7 @@ class CellTree:
 
     @property
     def is_full(self) -> bool:
-        """Whether there may be no more cells."""
+        """Whether there may be no more cells that are bounded on their own."""
         return self.most is not None and self.count >= self.most
 
     def longest(self, node: Node) -> int:
@@ -206,4 +206,5 @@ class CellTree:
         """Let halves stand in the place of a cell, perhaps halved themselves already."""
         node.axis = axis
         node.halves = halves  # from here on they stand there
-        self.count += len(node.leaves) - 1
+        own = sum(not leaf.height for leaf in node.leaves)
+        self.count += own - (not node.height)

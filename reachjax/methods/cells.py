@@ -87,8 +87,9 @@ LEFT_TO_METHOD = 1 / 2
 """The part of a limited time that is kept from the first cell that is followed, where the other
 method closes most: should that take longer, its halves could not be followed in time either."""
 
-NARROWED = 1 / 2
-"""Cells are narrowed as long as there are fewer than this part of what there may be."""
+LEFT_ASIDE = 8
+"""Cells are narrowed as long as there are fewer than so many times what may be bounded, with those
+that were left aside, which take memory alone."""
 
 ALIKE = 3 / 4
 """Sides longer than this part of the longest are as long: a cell is bounded anew once it is shorter
@@ -106,7 +107,7 @@ class Cells(AbstractMethod):
 
     Attributes:
         inner: what bounds a cell where forms leave more open.
-        most: how many cells there may be.
+        most: how many cells may be bounded; those are not counted that forms over a cell settle.
     """
 
     inner: AbstractMethod = AffineForms()  # noqa: RUF009  (immutable)
@@ -318,10 +319,9 @@ class _Search(AbstractSearch):
         """The halves of a cell, and what is said over the cells that they consist of.
 
         They are those along its longest side, unless forms over the cell settle one along another
-        that is as long.
-        Of a half that they do not settle, all is left aside that they do.
+        that is as long. Of a half that they do not settle, all is left aside that they do.
         """
-        room = math.floor(NARROWED * self._method.most) - self.cells.count
+        room = LEFT_ASIDE * self._method.most - len(self.leaves)
         found = self._cut(node, node) if room > 0 else None
         room -= found is not None
         axis = self.cells.longest(node)

@@ -44,7 +44,7 @@ def inherited(proof):
 
 def test_narrowed_cells_take_fewer_forms_and_bounds_are_as_small(loop, tube, monkeypatch):
     """Whatever halves keep the forms of a cell for, no bound is larger than the gap allows."""
-    monkeypatch.setattr(cells, "NARROWED", 0.0)
+    monkeypatch.setattr(cells, "LEFT_ASIDE", 0)
     plain = reached(loop)
     assert inherited(tube.proof(STEPS))
     assert not inherited(plain.proof(STEPS))

@@ -198,20 +198,23 @@ def broken_at(
 def enclosures(loop: ClosedLoop, scenario: Scenario, steps: int, start: int) -> list[Box]:
     """Boxes around the states of the exact trajectory of a scenario, rounding accounted for.
 
-    By forms over all steps; where these have no bounds, from box to box.
+    By forms over all steps; from where these have no bounds on, from box to box. A flow that leaves
+    forms leaves boxes as well, which takes long to see.
 
     Raises:
         UnboundedError: neither has, as a unit leaves its domain or a solution escapes.
     """
     loop, (x0, w, v) = in_numpy(loop), scenario
-    try:
-        found = [Box(x0, x0), *boxes_from_point(loop, scenario, steps, start)]
-        if all(map(_is_finite, found)):
-            return found
-    except UnboundedError:
-        pass
     found = [Box(x0, x0)]
-    for t in range(steps):
+    try:
+        for box in boxes_from_point(loop, scenario, steps, start):
+            if not _is_finite(box):
+                break
+            found.append(box)
+    except UnboundedError:
+        if loop.plant.continuous:
+            raise
+    for t in range(len(found) - 1, steps):
         drawn = (None if part is None else part[t] for part in (w, v))
         found.append(successor_box(loop, found[-1], start + t, *drawn))
     return found

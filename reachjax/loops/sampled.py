@@ -154,19 +154,25 @@ class SampledAffinePlant(AbstractSampledPlant):
 
     @property
     def flow(self) -> LinearFlow:
-        """Its flow over one period; kept of numpy, and of a plant that is prepared."""
-        kept = self.__dict__.get("_flow")
-        if kept is None:
+        """Its flow over one period: that of a plant that is prepared, else kept of numpy.
+
+        A flow keeps what it computes. So one that proofs use is never given where rounding is not
+        counted: nothing that is computed there must be kept for a proof.
+        """
+        if (prepared := self.__dict__.get("_prepared")) is not None:
+            return prepared
+        of_numpy = all(isinstance(each, np.ndarray) for each in jax.tree.leaves(self))
+        if not (of_numpy and is_counted()):
+            return self._new_flow()
+        if (kept := self.__dict__.get("_flow")) is None:
             kept = self._new_flow()
-            of_numpy = all(isinstance(each, np.ndarray) for each in jax.tree.leaves(self))
-            if of_numpy and is_counted():  # what has no rounding must not be kept for a proof
-                object.__setattr__(self, "_flow", kept)
+            object.__setattr__(self, "_flow", kept)
         return kept
 
     def prepared(self) -> SampledAffinePlant:
         """A copy that has the exponentials of its flow."""
         found = self.replace()
-        object.__setattr__(found, "_flow", self._new_flow().prepared())
+        object.__setattr__(found, "_prepared", self._new_flow().prepared())
         return found
 
     def _new_flow(self) -> LinearFlow:

@@ -39,7 +39,7 @@ from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
 from reachjax.methods.searches import AbstractSearch, Question
 from reachjax.methods.steps import overflow
 from reachjax.numerics.budget import ENDLESS, Budget
-from reachjax.numerics.checks import is_concrete, owned
+from reachjax.numerics.checks import is_concrete, owned, require_kind, whole_number
 from reachjax.numerics.derivatives import moved_by
 from reachjax.programs.affine_steps import step_columns
 from reachjax.programs.initial import SubboxColumns
@@ -108,10 +108,18 @@ class Cells(AbstractMethod):
     Attributes:
         inner: what bounds a cell where forms leave more open.
         most: how many cells may be bounded; those are not counted that forms over a cell settle.
+
+    Raises:
+        TypeError: `inner` is no method, or `most` no number.
+        ValueError: `most` is below 1.
     """
 
     inner: AbstractMethod = AffineForms()  # noqa: RUF009  (immutable)
     most: int = 1000
+
+    def __post_init__(self):
+        require_kind("inner", self.inner, AbstractMethod, "a method, such as AffineForms()")
+        whole_number("most", self.most, 1)
 
     def sets(self, problem: Problem, known: Sequence[ReachSet] = ()) -> Iterator[ReachSet]:
         """The smallest sets that are proved within the problem's gap and budget.

@@ -69,6 +69,13 @@ def test_cells_of_branches_are_tighter_than_both(switching, by_cells):
     assert 1 < own <= FEW
 
 
+def test_cells_say_what_they_take():
+    with pytest.raises(TypeError, match="inner must be a method"):
+        Cells(rj.LinearBounds())  # ty: ignore[invalid-argument-type]
+    with pytest.raises(ValueError, match="most must be"):
+        Cells(most=0)
+
+
 def test_tubes_by_cells_that_went_on_are_proved_again(switching, tmp_path):
     """Proofs of the first steps over later cells are kept as well."""
     options = {"relaxation": Cells(branching(), FEW), "gap": 1e-6}

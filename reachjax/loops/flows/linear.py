@@ -163,7 +163,7 @@ class LinearFlow(AbstractFlow):
         rates = [h * (rows[:, :-1] @ joined([x, *others]) + rows[:, -1]) for x in (here, there)]
         size = abs(h * self._generator())
         ends = joined([here, *others]).ends()
-        xp = namespace(rows)
+        xp = namespace(rows, *ends)
         z = xp.concatenate([larger(*map(abs, ends)), xp.ones(1)])
         growth = self._growth
         z = (growth.mid + growth.rad) @ z * error

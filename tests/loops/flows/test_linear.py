@@ -92,6 +92,7 @@ def test_errors_of_a_plant_of_matrices_name_what_is_wrong():
 
 def test_what_is_computed_without_rounding_is_kept_for_no_proof():
     given, (kept, other) = (np.array([0.2, 0.1]), np.array([0.5])), (slow_plant(), slow_plant())
+    assert kept.flow is kept.flow
     with rounding(False):
         kept.flow.prepared()
         kept.prepared().flow.enclosed(tuple(map(Ball.exact, given)))

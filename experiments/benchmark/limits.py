@@ -19,6 +19,7 @@ import reachjax as rj
 from experiments import report
 from experiments.benchmark.cases import Settings, he_network
 from experiments.benchmark.rivals.processes import Stopped, from_process
+from experiments.sampled.problems import runge_kutta
 
 GRACE = 1.3
 """So many times its limit a call may take."""
@@ -101,17 +102,11 @@ def pendulum() -> Question:
     def slope(x, u):
         return jnp.array([x[1], -jnp.sin(x[0]) - 0.5 * x[1] + u[0]])
 
-    def f(x, u):
-        one = slope(x, u)
-        two = slope(x + STEP / 2 * one, u)
-        three = slope(x + STEP / 2 * two, u)
-        four = slope(x + STEP * three, u)
-        return x + STEP / 6 * (one + 2 * two + 2 * three + four)
-
     layers = he_network((2, 16, 1), seed=0)
     layers[-1] = 0.1 * layers[-1][0], 0.0 * layers[-1][1]
     net = rj.MLP.from_layers(layers, activation=rj.Tanh())
-    return _around(rj.ClosedLoop(rj.NonlinearPlant(f, 2, 1), net), 0.2, 200, 1.0)
+    plant = rj.NonlinearPlant(runge_kutta(slope, STEP), 2, 1)
+    return _around(rj.ClosedLoop(plant, net), 0.2, 200, 1.0)
 
 
 def _around(loop: rj.ClosedLoop, half: float, horizon: int, room: float) -> Question:

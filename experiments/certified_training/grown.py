@@ -1,6 +1,6 @@
 """How large a set is proved of a controller, and of one that is trained for size.
 
-    python -m experiments.certified_training.grown  # some minutes; interrupted, it continues
+    python -m experiments.certified_training.grown  # up to 40 minutes; interrupted, it continues
 
 A pendulum is balanced by a force that is limited. A plain network imitates a cautious law, which
 uses a part of the force; so it balances the pendulum from near the top only. It is trained for

@@ -1,6 +1,7 @@
 """Loops whose plants are differential equations, the laws that networks imitate, what is asked."""
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -163,6 +164,19 @@ def cartpole() -> Sampled:
     )
 
 
+def runge_kutta(f: Callable[..., Any], h: float) -> Callable[..., Any]:
+    """One step of Runge and Kutta of `dx/dt = f(x, u)`, of length `h`, the input held."""
+
+    def step(x, u):
+        one = f(x, u)
+        two = f(x + h / 2 * one, u)
+        three = f(x + h / 2 * two, u)
+        four = f(x + h * three, u)
+        return x + h / 6 * (one + 2 * two + 2 * three + four)
+
+    return step
+
+
 def car() -> Sampled:
     """A car of constant speed that goes back to its lane, in which a thin wall is passed.
 
@@ -172,14 +186,6 @@ def car() -> Sampled:
 
     def f(x, u):
         return jnp.array([jnp.cos(x[2]), jnp.sin(x[2]), u[0]])
-
-    def step(x, u):
-        h = STRIDE
-        one = f(x, u)
-        two = f(x + h / 2 * one, u)
-        three = f(x + h / 2 * two, u)
-        four = f(x + h * three, u)
-        return x + h / 6 * (one + 2 * two + 2 * three + four)
 
     def law(x):
         return np.clip(-0.5 * x[:, 1:2] - 1.2 * x[:, 2:], -1, 1)
@@ -210,7 +216,7 @@ def car() -> Sampled:
             axes=("$p_x$ (m)", "$p_y$ (m)"),
             view=((-0.2, 5.4), (-1.1, 1.1)),
         ),
-        discrete=rj.NonlinearPlant(step, 3, 1),
+        discrete=rj.NonlinearPlant(runge_kutta(f, STRIDE), 3, 1),
     )
 
 

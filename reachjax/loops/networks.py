@@ -213,11 +213,11 @@ class Network(AbstractNetwork):
     def from_file(cls, path: str | os.PathLike[str]) -> Network:
         """A network from a file, by its ending.
 
-        ONNX (`.onnx`, see `from_onnx`); Keras (`.keras`, or the legacy `.h5` of a whole model),
-        whose layers are read at inference, without Keras; MATLAB (`.mat`, version 7 or older) with
-        variables `W`, `b` and `act_fcns`, in a struct or not; NNet (`.nnet`), whose inputs are
-        clipped and scaled; and plain text as Sherlock has it, of ReLUs throughout, or as POLAR has
-        it, with names of activations.
+        ONNX (`.onnx`, see `from_onnx`); Keras (`.keras`, or the legacy `.h5` or `.hdf5` of a whole
+        model), whose layers are read at inference, without Keras; MATLAB (`.mat`, version 7 or
+        older) with variables `W`, `b` and `act_fcns`, in a struct or not; NNet (`.nnet`), whose
+        inputs are clipped and scaled; and plain text as Sherlock has it, of ReLUs throughout, or as
+        POLAR has it, with names of activations.
 
         Args:
             path: of the file.

@@ -22,6 +22,9 @@ from jaxtyping import Float, Int
 MOST = 1000
 """A linear program is as fast as twice as many: 3 ms for ten directions in five coordinates."""
 
+LARGEST = 1 << 22
+"""Entries of an array of all bases and directions, 32 MB: more are left to a linear program."""
+
 SINGULAR = 1e-9
 """Rows of a size about 1 whose determinant is smaller count as dependent."""
 
@@ -54,7 +57,7 @@ def maximisers_by_bases(
         ([[1.0, 3.0, 0.0, 0.0]], [[1.0, 2.0]])
     """
     m, n = A.shape
-    if not n <= m or comb(m, n) > MOST:
+    if not n <= m or comb(m, n) > MOST or comb(m, n) * D.size > LARGEST:
         return None
     with np.errstate(all="ignore"):
         bases, inverses, corners = _corners(A, b)

@@ -155,6 +155,10 @@ def boxed(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, Maxima]:
 
     Returns:
         What is kept for the next call on the same polytope: arrays that cannot be written to.
+
+    Raises:
+        RuntimeError: the linear programs were not solved.
+        ValueError: the polytope is empty or unbounded.
     """
     return _boxed(*(np.asarray(part, float).tobytes() for part in (A, b)), A.shape)
 
@@ -169,6 +173,7 @@ def _boxed(normals: bytes, offsets: bytes, shape: tuple[int, int]) -> tuple[Bala
 
 
 def _boxed_anew(A: np.ndarray, b: np.ndarray) -> tuple[Balanced, Maxima]:
+    """A polytope in balanced coordinates, and its box there, both computed."""
     region = Balanced.of(A, b)
     try:
         box = _box(region)

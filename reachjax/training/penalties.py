@@ -56,9 +56,10 @@ def volume_penalty(
     Differentiable in the loop and the initial set, also inside `jax.jit`, `vmap` (over initial sets
     or networks) and `scan`. A penalty needs no proof: where `LinearBounds()` is compiled or
     differentiated, the sets are the certified ones but for rounding, and of a differential equation
-    for what Taylor polynomials leave out: as many steps a period as its plant's `steps` says are
-    done, of its `order`, or of order four. Where states turn by a quarter of a round or more within
-    such a step, polynomials leave out much, and more `steps` are to be given.
+    but for the remainders of Taylor polynomials: as many steps a period are done as its plant's
+    `steps` says, of its `order`, but of six at most, or of order four where none is given. Where
+    states turn by a quarter of a round or more within such a step, remainders are large, and more
+    `steps` are to be given. Affine equations are sampled exactly (`SampledPlant.affine`).
 
     Args:
         loop: the closed loop.
@@ -124,7 +125,7 @@ def specification_penalty(
 
     A hinge on the distance to the goal, the avoided sets and the boundary of the safe set, summed
     over facets and times (see `shortfall`); the mean over cells, if there are any. Differentiable
-    as `volume_penalty` is.
+    as `volume_penalty` is, whose sets it has: in compiled code a zero is no proof.
 
     Args:
         loop: the closed loop.
@@ -183,7 +184,7 @@ def _penalised(
 ) -> Float[Array, ""]:
     """The penalty of a tube, or its mean over those from the cells of an initial set.
 
-    Between samples it asks for sets or not, as is said.
+    `between` says whether the penalty asks for sets in between samples.
     """
     template = template_of(loop, template)
     require_kinds(loop=loop, X0=X0, template=template)

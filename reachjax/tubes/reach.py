@@ -244,7 +244,12 @@ class ReachTube(Replaceable):
         """Trajectories from corners of the initial set and `samples` points drawn from it.
 
         Disturbances and noise are drawn as well: extreme ones, and any.
+
+        Raises:
+            TypeError, ValueError: `samples` or `seed` is no whole number, or below 0.
         """
+        samples = whole_number("samples", samples, 0)
+        seed = whole_number("seed", seed, 0)
         states = initial_states(self.sets[0], samples, seed)
         scenarios = Scenarios.of(self.loop, self.sets[0], self.horizon, self.start)
         states, disturbances, noises = self.loop.split(scenarios.drawn(states, seed))

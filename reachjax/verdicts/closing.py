@@ -104,7 +104,7 @@ def closed(
 
     Raises:
         Interrupted: Ctrl-C.
-        UnsoundError: a trajectory breaks what is proved.
+        UnsoundError: a trajectory breaks what is proved, or JAX runs a counterexample otherwise.
     """
     if loop.varies or horizon < LONG:
         return None

@@ -8,7 +8,7 @@ compute powers and products otherwise, and then differ lawfully. Such a step is 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -64,6 +64,7 @@ def compiled_steps(
     start: int,
 ) -> Float[np.ndarray, "h n_x"]:
     """The successor of each of some states, one for each time, as JAX runs the loop."""
+    # tiled to the shape for which `compiled_runs` compiles a step: nothing is compiled anew
     loop, found = jax.device_put(loop), [np.zeros((0, states.shape[1]))]
     for k, x in enumerate(states):
         given = x, *(None if part is None else part[k] for part in (disturbances, noises))
@@ -135,8 +136,7 @@ def _followed(body: Any, given: Sequence[Any]) -> list[Any]:
         if name in (*CALLS, *OWN_SLOPES):
             outputs = _followed(body_of(params), inputs)
         else:
-            for inner, arguments in _turns(name, params, inputs):
-                _followed(inner, arguments)
+            _follow_inner(name, params, inputs)
             outputs = equation.primitive.bind(*inputs, **params)
             outputs = outputs if equation.primitive.multiple_results else [outputs]
         if name not in EXACT and _is_lost(name, inputs, outputs):
@@ -145,26 +145,27 @@ def _followed(body: Any, given: Sequence[Any]) -> list[Any]:
     return [read(each) for each in jaxpr.outvars]
 
 
-def _turns(name: str, params: dict[str, Any], inputs: Sequence[Any]) -> Iterator[tuple[Any, list]]:
-    """The jaxprs that an equation runs on numbers, one after the other, and on which."""
+def _follow_inner(name: str, params: dict[str, Any], inputs: Sequence[Any]) -> None:
+    """Follow the jaxprs that an equation runs on numbers, one after the other.
+
+    Raises:
+        _LostError: what one of their equations makes says nothing.
+    """
     if name == "cond":
-        yield params["branches"][int(inputs[0])], list(inputs[1:])
+        _followed(params["branches"][int(inputs[0])], inputs[1:])
     elif name == "scan":
         first = params["num_consts"]
         last = first + params["num_carry"]
         carry, places = list(inputs[first:last]), range(params["length"])
         for k in reversed(places) if params["reverse"] else places:
             given = [*inputs[:first], *carry, *(each[k] for each in inputs[last:])]
-            yield params["jaxpr"], given
             carry = _followed(params["jaxpr"], given)[: last - first]
     elif name == "while":
         first = params["cond_nconsts"]
         last = first + params["body_nconsts"]
         carry = list(inputs[last:])
         while _followed(params["cond_jaxpr"], [*inputs[:first], *carry])[0]:
-            given = [*inputs[first:last], *carry]
-            yield params["body_jaxpr"], given
-            carry = _followed(params["body_jaxpr"], given)
+            carry = _followed(params["body_jaxpr"], [*inputs[first:last], *carry])
 
 
 def _is_lost(name: str, inputs: Sequence[Any], outputs: Sequence[Any]) -> bool:

@@ -151,7 +151,8 @@ def decide(
         TypeError: an argument is of another kind, or a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, `X0` is
             empty or unbounded, or numbers are traced inside `jax.jit`.
-        UnsoundError: a simulated trajectory breaks what is proved: a defect to be reported.
+        UnsoundError: JAX runs the loop otherwise than it was proved or refuted: a defect to be
+            reported.
 
     Source: equations (reach_avoid) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 

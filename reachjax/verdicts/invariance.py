@@ -89,7 +89,7 @@ def for_ever(
 
     Raises:
         ValueError: the loop varies in time, or nothing is required at all times.
-        UnsoundError: a trajectory breaks what is proved.
+        UnsoundError: a trajectory breaks what is proved, or JAX runs a counterexample otherwise.
     """
     loop, start = tubes[0].loop, tubes[0].start
     if loop.varies:

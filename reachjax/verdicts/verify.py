@@ -66,7 +66,8 @@ def verify(
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, a part
             of the tube was exchanged for another one, or the tube is traced inside `jax.jit`; or
             something is required for ever of a loop that varies in time, or at given times only.
-        UnsoundError: a simulated trajectory breaks what is proved: a defect to be reported.
+        UnsoundError: JAX runs the loop otherwise than it was proved or refuted: a defect to be
+            reported.
 
     Source: equations (reach_avoid) and (reach_avoid_approx) of the paper.
 

@@ -134,7 +134,8 @@ def winning_set(
         TypeError: an argument is of another kind, or a set is of a kind without facets.
         ValueError: nothing is required, dimensions disagree, a time is beyond the horizon, or what
             is known is of another question.
-        UnsoundError: a simulated trajectory breaks what is proved: a defect to be reported.
+        UnsoundError: JAX runs the loop otherwise than it was proved or refuted: a defect to be
+            reported.
 
     Example:
         >>> from reachjax import MLP, AffinePlant

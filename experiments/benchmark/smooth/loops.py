@@ -12,7 +12,7 @@ from experiments.competition.instances import Instance, instances
 from experiments.competition.networks import networks, trained
 from experiments.nonlinear.problems import Layers
 from experiments.sampled import study as continuous
-from experiments.sampled.problems import Sampled
+from experiments.sampled.problems import Sampled, runge_kutta
 
 BALANCING = "balancing-reach"
 DOUBLE = "double-pendulum-less-robust"
@@ -50,14 +50,7 @@ def at_samples(loop: rj.ClosedLoop) -> rj.ClosedLoop:
     """The loop in discrete time, a step of which is one of Runge and Kutta, as if it were exact."""
     plant = loop.plant
     assert isinstance(plant, rj.SampledPlant)
-    f, h = plant.f, float(plant.period)
-
-    def step(x, u):
-        one = f(x, u)
-        two = f(x + h / 2 * one, u)
-        three = f(x + h / 2 * two, u)
-        return x + h / 6 * (one + 2 * two + 2 * three + f(x + h * three, u))
-
+    step = runge_kutta(plant.f, float(plant.period))
     return loop.replace(plant=rj.NonlinearPlant(step, plant.states, plant.inputs))
 
 

@@ -269,7 +269,8 @@ class SubboxColumns(NamedTuple):
 
 
 SIZE = 10
-"""Those of a square are `2 c^2 + d^2 + 1`, `4 |c| d` and `d^2`, where `|c| + d` is about 1."""
+"""The coefficients of a square are `2 c^2 + d^2 + 1`, `4 |c| d` and `d^2`, where `|c| + d` is about
+1."""
 
 
 def met(one: Ends, other: Ends) -> Ends:

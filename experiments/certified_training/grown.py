@@ -50,8 +50,9 @@ HIDDEN = (16, 16)
 HORIZON = 20
 """Periods until the goal must be reached, and until all states of a box are back in it."""
 
-SAFE = rj.Box([-0.7, -1.6], [0.7, 1.6])
-GOAL = rj.Box([-0.05, -0.12], [0.05, 0.12])
+SAFE, GOAL = (0.7, 1.6), (0.05, 0.12)
+"""Half the boxes in which states must stay, and into which they must come."""
+
 WIDEST = np.array([0.6, 1.4])
 """Half the box in which initial states are looked for."""
 
@@ -192,13 +193,23 @@ def box_of(half: Float[ndarray, " 2"]) -> rj.Box:
     return rj.Box(-half, half)
 
 
+def safe() -> rj.Box:
+    """The box in which states must stay."""
+    return box_of(np.array(SAFE))
+
+
+def goal() -> rj.Box:
+    """The box into which states must come by the horizon."""
+    return box_of(np.array(GOAL))
+
+
 def simulated_box(loop: rj.ClosedLoop, count: int = 21) -> rj.Box:
     """A large box around the origin, all of whose simulated states do what is required."""
     sides = np.linspace(-1, 1, count)
     grid = WIDEST * np.stack(np.meshgrid(sides, sides, indexing="ij"), axis=-1)
     runs = np.asarray(loop.simulate(grid.reshape(-1, 2), HORIZON))
-    fine = np.asarray(SAFE.contains(runs.reshape(-1, 2))).reshape(runs.shape[:2]).all(axis=1)
-    fine = (fine & np.asarray(GOAL.contains(runs[:, -1]))).reshape(count, count)
+    fine = np.asarray(safe().contains(runs.reshape(-1, 2))).reshape(runs.shape[:2]).all(axis=1)
+    fine = (fine & np.asarray(goal().contains(runs[:, -1]))).reshape(count, count)
     middle, most = count // 2, (0, 0)
     for i, j in product(range(middle + 1), repeat=2):
         within = fine[middle - i : middle + i + 1, middle - j : middle + j + 1]
@@ -211,7 +222,7 @@ def simulated_box(loop: rj.ClosedLoop, count: int = 21) -> rj.Box:
 def largest(loop: rj.ClosedLoop, settings: Settings) -> rj.Box:
     """The largest box that is proved, from one on which simulations look well."""
     found = rj.largest_set(
-        loop, simulated_box(loop), HORIZON, goal=GOAL, safe=SAFE, time_limit=settings.limit
+        loop, simulated_box(loop), HORIZON, goal=goal(), safe=safe(), time_limit=settings.limit
     )
     assert isinstance(found.region, rj.Box)
     return found.region
@@ -224,15 +235,17 @@ def attraction(
 
     From each of the cells all states come into the box, safely, and from the box into itself.
     """
-    half = np.asarray(GOAL.upper)
+    half = np.asarray(GOAL)
     for part in PARTS:
         back = box_of(part * half)
-        found = rj.decide(loop, back, HORIZON, goal=back, safe=SAFE, time_limit=settings.limit / 10)
+        found = rj.decide(
+            loop, back, HORIZON, goal=back, safe=safe(), time_limit=settings.limit / 10
+        )
         if found.proved:
             break
     else:
         return np.full(2, np.nan), np.zeros((0, 2, 2))
-    asked = {"goal": back, "safe": SAFE, "cells": settings.cells, "time_limit": settings.limit}
+    asked = {"goal": back, "safe": safe(), "cells": settings.cells, "time_limit": settings.limit}
     won = rj.winning_set(loop, simulated_region(loop), LONGER * HORIZON, **asked)
     proved = [cell for cell in won.cells if cell.status is rj.VerdictStatus.PROVED]
     ends = [(np.asarray(cell.lower), np.asarray(cell.upper)) for cell in proved]
@@ -244,7 +257,7 @@ def simulated_region(loop: rj.ClosedLoop, count: int = 61) -> rj.Box:
     sides = np.linspace(-1, 1, count)
     grid = (WIDEST * np.stack(np.meshgrid(sides, sides), axis=-1)).reshape(-1, 2)
     last = np.asarray(loop.simulate(grid, LONGER * HORIZON))[:, -1]
-    come = grid[np.asarray(GOAL.contains(last))]
+    come = grid[np.asarray(goal().contains(last))]
     return rj.Box(come.min(axis=0), come.max(axis=0))
 
 
@@ -268,8 +281,8 @@ def grown(loop: rj.ClosedLoop, region: rj.Box, settings: Settings) -> tuple[rj.C
                 wider,
                 HORIZON,
                 nothing,
-                goal=GOAL,
-                safe=SAFE,
+                goal=goal(),
+                safe=safe(),
                 optimizer=optimizer,
                 stages=STAGES,
                 margin=0.005,
@@ -355,7 +368,7 @@ def draw(sizes: dict[str, Size], loops: dict[str, rj.ClosedLoop], path: Path) ->
         cells.set_label("safe for ever")
         ax.add_collection(cells)
         box = rj.Box(size.lower, size.upper)
-        for each, colour, label in ((box, "tab:blue", "largest box"), (GOAL, "black", "goal")):
+        for each, colour, label in ((box, "tab:blue", "largest box"), (goal(), "black", "goal")):
             style: dict[str, Any] = {"edgecolor": colour, "facecolor": "none"}
             rj.plot_set(each, ax, label=label, **style)
         parts = 8 if loops[name].plant.continuous else 1

@@ -38,14 +38,14 @@ def test_the_plain_law_uses_a_part_of_the_force_and_more_than_the_weight():
 def test_a_box_is_simulated_all_of_whose_states_do_what_is_required():
     loop = linear(-12.0, -5.0)
     box = grown.simulated_box(loop)
-    assert box.volume() > grown.GOAL.volume()
+    assert box.volume() > grown.goal().volume()
     runs = np.asarray(loop.simulate(box.corners(), grown.HORIZON))
-    assert np.asarray(grown.GOAL.contains(runs[:, -1])).all()
+    assert np.asarray(grown.goal().contains(runs[:, -1])).all()
     wider = rj.Box(1.2 * box.lower, 1.2 * box.upper)
     region = grown.simulated_region(loop)
     assert np.all(np.asarray(region.upper) >= box.upper)
     last = np.asarray(loop.simulate(wider.corners(), grown.HORIZON))[:, -1]
-    assert not np.asarray(grown.GOAL.contains(last)).all()
+    assert not np.asarray(grown.goal().contains(last)).all()
     falls = grown.simulated_box(linear(0.0, 0.0))
     assert falls.volume() < box.volume()
 
@@ -65,12 +65,12 @@ def test_cells_of_a_region_of_attraction_come_into_a_box_that_is_come_back_to():
     loop = linear(-12.0, -5.0)
     back, cells = grown.attraction(loop, replace(QUICK, limit=600.0, cells=60))
     assert np.all(back > 0)
-    assert np.all(back < np.asarray(grown.GOAL.upper))
+    assert np.all(back < np.asarray(grown.GOAL))
     assert len(cells) > 0
     corners = np.concatenate([cells[:, 0], cells[:, 1]])
     runs = np.asarray(loop.simulate(corners, 200))
     assert np.abs(runs[:, -1]).max(initial=0.0) < 1e-3
-    assert np.asarray(grown.SAFE.contains(runs.reshape(-1, 2))).all()
+    assert np.asarray(grown.safe().contains(runs.reshape(-1, 2))).all()
 
 
 @pytest.mark.costly

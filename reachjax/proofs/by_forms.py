@@ -77,21 +77,8 @@ class LinearCertificate(AbstractProof):
             )
         directions = np.broadcast_to(self.directions, (self.k, *self.directions.shape))
         box = self.X0.bounding_box()
-        return _proved(self.loop, self.X0, box, directions, self.start, chosen)
-
-
-def _proved(
-    loop: ClosedLoop,
-    X0: AbstractSet,
-    box: Box,
-    directions: Float[np.ndarray, "k f n_x"],
-    start: int,
-    slopes: Float[np.ndarray, "k units"] | None = None,
-    most: int = 1,
-) -> Float[np.ndarray, " f"]:
-    """The offsets of the last step; infinite where they overflow or a unit has no bounds."""
-    last = _last(loop, X0, box, directions, start, slopes, most)
-    return _numbers(last, len(directions[-1]))
+        last = _last(self.loop, self.X0, box, directions, self.start, chosen)
+        return _numbers(last, len(self.directions))
 
 
 def _last(
@@ -112,7 +99,7 @@ def _last(
 
 
 def _numbers(found: ByForms | None, facets: int) -> Float[np.ndarray, " f"]:
-    """The offsets that forms prove, infinite where they prove none."""
+    """The offsets that forms prove; infinite where they overflow or a unit has no bounds."""
     if found is None:
         return np.full(facets, np.inf)
     return np.where(np.isnan(found.offsets), np.inf, found.offsets)
@@ -202,7 +189,7 @@ class CellCertificate(AbstractProof):
         source = cell.source or cell
         given = self.loop, source.part, source.box, directions, self.start
         if cell.source is None:
-            return _proved(*given, most=self.ways)
+            return _numbers(_last(*given, most=self.ways), directions.shape[1])
         if id(source) not in sources:
             sources[id(source)] = _last(*given, most=self.ways)
         known = sources[id(source)]

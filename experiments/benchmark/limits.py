@@ -19,7 +19,7 @@ import reachjax as rj
 from experiments import report
 from experiments.benchmark.cases import Settings, he_network
 from experiments.benchmark.rivals.processes import Stopped, from_process
-from experiments.sampled.problems import runge_kutta
+from experiments.sampled.problems import RungeKutta
 
 GRACE = 1.3
 """So many times its limit a call may take."""
@@ -105,7 +105,7 @@ def pendulum() -> Question:
     layers = he_network((2, 16, 1), seed=0)
     layers[-1] = 0.1 * layers[-1][0], 0.0 * layers[-1][1]
     net = rj.MLP.from_layers(layers, activation=rj.Tanh())
-    plant = rj.NonlinearPlant(runge_kutta(slope, STEP), 2, 1)
+    plant = rj.NonlinearPlant(RungeKutta(slope, STEP), 2, 1)
     return _around(rj.ClosedLoop(plant, net), 0.2, 200, 1.0)
 
 

@@ -164,17 +164,21 @@ def cartpole() -> Sampled:
     )
 
 
-def runge_kutta(f: Callable[..., Any], h: float) -> Callable[..., Any]:
-    """One step of Runge and Kutta of `dx/dt = f(x, u)`, of length `h`, the input held."""
+@dataclass(frozen=True)
+class RungeKutta:
+    """A step of `dx/dt = f(x, u)` that other processes can be sent, as a closure cannot."""
 
-    def step(x, u):
+    f: Callable[..., Any]
+    h: float
+
+    def __call__(self, x: Any, u: Any) -> Any:
+        """The state after one step of Runge and Kutta, of length `h`, the input held."""
+        f, h = self.f, self.h
         one = f(x, u)
         two = f(x + h / 2 * one, u)
         three = f(x + h / 2 * two, u)
         four = f(x + h * three, u)
         return x + h / 6 * (one + 2 * two + 2 * three + four)
-
-    return step
 
 
 def car() -> Sampled:
@@ -216,7 +220,7 @@ def car() -> Sampled:
             axes=("$p_x$ (m)", "$p_y$ (m)"),
             view=((-0.2, 5.4), (-1.1, 1.1)),
         ),
-        discrete=rj.NonlinearPlant(runge_kutta(f, STRIDE), 3, 1),
+        discrete=rj.NonlinearPlant(RungeKutta(f, STRIDE), 3, 1),
     )
 
 

@@ -12,7 +12,7 @@ from experiments.competition.instances import Instance, instances
 from experiments.competition.networks import networks, trained
 from experiments.nonlinear.problems import Layers
 from experiments.sampled import study as continuous
-from experiments.sampled.problems import Sampled, runge_kutta
+from experiments.sampled.problems import RungeKutta, Sampled
 
 BALANCING = "balancing-reach"
 DOUBLE = "double-pendulum-less-robust"
@@ -50,7 +50,7 @@ def at_samples(loop: rj.ClosedLoop) -> rj.ClosedLoop:
     """The loop in discrete time, a step of which is one of Runge and Kutta, as if it were exact."""
     plant = loop.plant
     assert isinstance(plant, rj.SampledPlant)
-    step = runge_kutta(plant.f, float(plant.period))
+    step = RungeKutta(plant.f, float(plant.period))
     return loop.replace(plant=rj.NonlinearPlant(step, plant.states, plant.inputs))
 
 

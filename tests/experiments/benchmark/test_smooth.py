@@ -1,6 +1,7 @@
 """Smooth loops beside what is asked of them: rows in processes of their own, kept, in a table."""
 
 import json
+import pickle
 import re
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from experiments.benchmark import study
 from experiments.benchmark.cases import Settings
 from experiments.benchmark.smooth import decisions, forms, loops, run, training, widths
 from experiments.benchmark.smooth.rows import MEMORY, Row, kept
+from experiments.competition import fields
 from experiments.competition.instances import instances
 
 COLUMNS = 100
@@ -188,3 +190,12 @@ def test_noise_and_disturbances_enter_the_cart_pole():
     seen = np.asarray(calm.plant.propagate(x, np.asarray(net(x))))
     assert tube.sets[-1].contains(seen)
     assert widths.widths_of(tube.sets[-1])[1] >= 2 * 0.1 * 2 * (0.5 + 0.01 * 3.8) - 1e-9
+
+
+def test_loops_at_samples_can_be_sent_to_other_processes():
+    """Decisions by cells send them; a step that stands within a function cannot be sent."""
+    pole = rj.SampledPlant(fields.cart_pole, 4, 1, 0.02)
+    loop = rj.ClosedLoop(pole, rj.MLP(((np.ones((1, 4)), np.zeros(1)),)))
+    sent = pickle.loads(pickle.dumps(loops.at_samples(loop)))
+    x, u = np.array([0.1, 0.0, 0.2, -0.1]), np.array([0.3])
+    np.testing.assert_array_equal(sent.plant.f(x, u), loops.at_samples(loop).plant.f(x, u))

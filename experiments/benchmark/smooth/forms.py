@@ -60,8 +60,7 @@ def noise(settings: Settings) -> Iterator[Figures]:
     began = time.perf_counter()
     tube = rj.reach(loop, X0, steps, template)
     yield {"seconds": time.perf_counter() - began}
-    above, below = np.split(np.asarray(tube.proof(steps).witnesses), 2)
-    attained = above + below
+    attained = widths.widths_of(rj.Polytope(template.directions, tube.proof(steps).witnesses))
     yield {"default": widths.ratio(widths.widths_of(tube.sets[-1]), attained)}
     tube = rj.reach(loop, X0, steps, template, rj.LinearBounds())
     yield {"LinearBounds": widths.ratio(widths.widths_of(tube.sets[-1]), attained)}

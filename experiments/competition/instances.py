@@ -36,6 +36,7 @@ class Shape:
         law: inputs `(c, n_u)` at states `(c, n)`, to be imitated.
         spread: `(n,)`, how far around the initial set it is learned.
         sees: what it is given of states `(c, n)`; None for the states.
+        penalty: of squared weights, in training: a steep network is what few cells do not prove.
     """
 
     hidden: tuple[int, ...]
@@ -43,6 +44,7 @@ class Shape:
     law: Callable[[np.ndarray], np.ndarray]
     spread: tuple[float, ...]
     sees: Callable[[np.ndarray], np.ndarray] | None = None
+    penalty: float = 1e-5
 
     def samples(self, X0: rj.Box, count: int = 5000) -> tuple[np.ndarray, np.ndarray]:
         """What the network sees, and what the law does there."""
@@ -386,7 +388,7 @@ def _quadrotor() -> Instance:
         50,
         {"goal": within(12, {3: (0.94, 1.06)})},
         ((0, 3),),
-        Shape((64, 64, 64), "tanh", law, (0.6,) * 6 + (0.3,) * 6),
+        Shape((64, 64, 64), "tanh", law, (0.6,) * 6 + (0.3,) * 6, penalty=1e-3),
         "the published file has a product for a sum in x4', a sine for a cosine in x2', and signs "
         "of another axis in x5' and x9': the physics is taken, as all tools do; at t = 5",
     )

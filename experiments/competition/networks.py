@@ -40,7 +40,7 @@ def trained(instance: Instance, steps: int, kept: Path) -> rj.MLP:
     fit = train_network(
         samples,
         shape.hidden,
-        penalty=1e-5,
+        penalty=shape.penalty,
         steps=steps,
         learning_rate=3e-3,
         restarts=1,

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
+from reachjax.loops.units import UnboundedError
 from reachjax.methods.cell_tree import Node
 from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
 from reachjax.methods.steps import boxed, overflow
@@ -160,33 +161,79 @@ def _held_forms(
     return held_bounds(horizon, bounds, len(directions), facets)
 
 
+SMALLER = 1e-3
+"""A set is smaller than what forms say if a bound of it is, by this part of the set's width."""
+
+
 def spans_by_forms(
-    loop: ClosedLoop, X0: AbstractSet, template: AbstractTemplate, horizon: int, start: int
+    loop: ClosedLoop, sets: Sequence[AbstractSet], template: AbstractTemplate, start: int
 ) -> tuple[Polytope, ...]:
     """The smallest sets that affine forms show to hold the states of each period.
 
+    They are forms of the initial set. Where another method found a smaller set of the sample that a
+    period begins with, those of that set are asked, too. In what is traced they are not, so that
+    one call is compiled.
+
     Args:
         loop: the closed loop, whose plant is a differential equation.
-        X0: the initial set.
+        sets: the initial set, and what is proved of each sample after it.
         template: of facets; of another one the axes are taken.
-        horizon: the number of periods.
         start: the time of the initial set.
+
+    Raises:
+        UnboundedError: no form of a period has bounds.
     """
-    facets = template.alone or Template.box(loop.states)
-    shapes, box = [facets.at(k) for k in range(1, horizon + 1)], boxed(X0, "X0")
+    facets, X0 = template.alone or Template.box(loop.states), sets[0]
+    shapes, box = [facets.at(k) for k in range(1, len(sets))], boxed(X0, "X0")
     directions = jnp.stack([each.directions for each in shapes])
-    given = loop, X0, box, directions
-    if is_concrete(given):
-        found = [
-            np.max(np.asarray(step.between), axis=0)
-            for step in unrolled(loop, X0, box, np.asarray(directions), start, between=1)
-        ]
+    if is_concrete((loop, sets, directions)):
+        known = None if template.alone is None else sets
+        found = [*_spans(loop, sets, np.asarray(directions), start, known)]
     else:
-        steps = unrolled_at_once(loop, X0.closed_form(box), box, directions, start, between=1)
+        given = X0.closed_form(box), box, directions, start
+        steps = unrolled_at_once(loop, *given, between=1)
         assert steps.between is not None  # they were asked for
         found = [*jnp.max(steps.between, axis=1)]
     pairs = zip(shapes, found, strict=True)
     return tuple(shape.polytope(owned(offsets)) for shape, offsets in pairs)
+
+
+def _spans(
+    loop: ClosedLoop,
+    sets: Sequence[AbstractSet],
+    directions: Float[np.ndarray, "N f n_x"],
+    start: int,
+    polytopes: Sequence[AbstractSet] | None,
+) -> Iterator[Float[np.ndarray, " f"]]:
+    """Offsets of each period: of `polytopes` those that are no smaller than forms are not asked."""
+    whole = unrolled(loop, sets[0], boxed(sets[0], "X0"), directions, start, between=1)
+    before = None
+    for k, rows in enumerate(directions):
+        found, lost = list[ByForms](), None
+        try:
+            found += itertools.islice(whole, 1)
+        except UnboundedError as error:  # it is at its end
+            lost = error
+        begun = [*found]
+        if k and (before is None or polytopes is None or _is_smaller(polytopes[k], before)):
+            box = boxed(sets[k], "X0")
+            given = loop, sets[k].closed_form(box), box, rows[None], start + k
+            try:
+                found += unrolled(*given, between=1)
+            except UnboundedError as error:
+                lost = error
+        if not found:
+            assert lost is not None
+            raise lost
+        before = np.asarray(begun[0].offsets) if begun else None
+        yield np.fmin.reduce([np.max(np.asarray(step.between), axis=0) for step in found])
+
+
+def _is_smaller(region: AbstractSet, bounds: Float[np.ndarray, " f"]) -> bool:
+    """Whether a polytope lies more tightly than within these bounds of its facets."""
+    offsets, widths = np.asarray(region.facets[1]), np.asarray(region.bounding_box().widths)
+    room = SMALLER * widths.max()
+    return not (offsets >= bounds - room).all()  # also where there is no bound
 
 
 ENDS = SolverStatus.AFFINE_FORM, SolverStatus.FAILED

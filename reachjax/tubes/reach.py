@@ -135,7 +135,8 @@ class ReachTube(Replaceable):
         """Sets that hold all states from each sample to the next one, of a differential equation.
 
         They have the directions of the tube's own sets, of ellipsoids the axes, and are bounded by
-        affine forms. Of known numbers they are kept.
+        affine forms: of the initial set, and of known numbers of the set at the sample before, too,
+        where that is smaller. Of known numbers they are kept.
 
         Raises:
             TypeError: the plant is one in discrete time, which has no states in between.
@@ -147,7 +148,7 @@ class ReachTube(Replaceable):
             )
         kept = self.__dict__.get("_spans")
         if kept is None:
-            kept = spans_by_forms(self.loop, self.sets[0], self.template, self.horizon, self.start)
+            kept = spans_by_forms(self.loop, self.sets, self.template, self.start)
             if is_concrete(kept):
                 object.__setattr__(self, "_spans", kept)
         return kept

@@ -159,3 +159,23 @@ def test_bounds_of_each_part_of_a_period_hold_the_states_in_it():
     for number, upper in enumerate(bounds.reshape(2 * parts, -1)):
         assert np.all(values[:, 4 * number : 4 * number + 5] <= upper + 1e-9)
     assert np.all(bounds.min(axis=1) < bounds.max(axis=1) - 0.9)  # the circle has a radius of one
+
+
+def test_spans_are_smaller_where_the_sets_of_samples_are():
+    """Forms leave out what ReLUs do; spans go by sets that programs, which do not, found."""
+    rng = np.random.default_rng(2)
+    net = rj.MLP.from_layers(
+        [(rng.normal(size=(8, 2)), np.zeros(8)), (rng.normal(size=(1, 8)), [0])]
+    )
+    plant = rj.SampledPlant.affine([[0.0, 1.0], [-1.0, -1.0]], [[0.0], [1.0]], period=0.2)
+    loop, wide = rj.ClosedLoop(plant, net), rj.Box([-1.0, -1.0], [1.0, 1.0])
+    given = loop, wide, 3, rj.Template.box(2)
+    tube, by_forms = rj.reach(*given), rj.reach(*given, rj.LinearBounds())
+    states = np.asarray(loop.simulate(wide.sample(jax.random.key(0), 500), 3, parts=8))
+    sizes = []
+    for k, spans in enumerate(zip(tube.spans, by_forms.spans, strict=True)):
+        seen = states[:, 8 * k : 8 * (k + 1) + 1].reshape(-1, 2)
+        assert np.all(np.asarray(spans[0].contains(seen)))
+        sizes.append([np.prod(np.asarray(span.bounding_box().widths)) for span in spans])
+    assert sizes[-1][0] < 0.8 * sizes[-1][1]
+    assert all(one <= other * (1 + 1e-9) for one, other in sizes)

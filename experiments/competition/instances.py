@@ -36,7 +36,7 @@ class Shape:
         law: inputs `(c, n_u)` at states `(c, n)`, to be imitated.
         spread: `(n,)`, how far around the initial set it is learned.
         sees: what it is given of states `(c, n)`; None for the states.
-        penalty: of squared weights, in training: a steep network is what few cells do not prove.
+        penalty: on squared weights in training: a steep network takes more cells to prove.
     """
 
     hidden: tuple[int, ...]

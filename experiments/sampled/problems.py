@@ -166,13 +166,20 @@ def cartpole() -> Sampled:
 
 @dataclass(frozen=True)
 class RungeKutta:
-    """A step of `dx/dt = f(x, u)` that other processes can be sent, as a closure cannot."""
+    """One step of Runge and Kutta of `dx/dt = f(x, u)`, the input held.
+
+    Other processes can be sent it where they can be sent `f`, as they cannot a closure.
+
+    Attributes:
+        f: the right-hand side.
+        h: the length of the step.
+    """
 
     f: Callable[..., Any]
     h: float
 
     def __call__(self, x: Any, u: Any) -> Any:
-        """The state after one step of Runge and Kutta, of length `h`, the input held."""
+        """The state after the step."""
         f, h = self.f, self.h
         one = f(x, u)
         two = f(x + h / 2 * one, u)

@@ -162,7 +162,8 @@ def _held_forms(
 
 
 SMALLER = 1e-3
-"""A set is smaller than what forms say if a bound of it is, by this part of the set's width."""
+"""A set is smaller than forms say if a bound is, by this part of the set's largest width: less is
+not worth a period's flow."""
 
 
 def spans_by_forms(
@@ -170,9 +171,9 @@ def spans_by_forms(
 ) -> tuple[Polytope, ...]:
     """The smallest sets that affine forms show to hold the states of each period.
 
-    They are forms of the initial set. Where another method found a smaller set of the sample that a
-    period begins with, those of that set are asked, too. In what is traced they are not, so that
-    one call is compiled.
+    Bounds are those of forms of the initial set and, where another method found a smaller set at
+    the sample that a period begins with, of the box around that set. Traced numbers have the first
+    alone: whether a set is smaller is not known, and one call is compiled.
 
     Args:
         loop: the closed loop, whose plant is a differential equation.

@@ -135,10 +135,11 @@ class ReachTube(Replaceable):
         """Sets that hold all states from each sample to the next one, of a differential equation.
 
         They have the directions of the tube's own sets, of ellipsoids the axes, and are bounded by
-        affine forms: of the initial set, and of known numbers of the set at the sample before, too,
-        where that is smaller. Of known numbers they are kept.
+        affine forms of the initial set; of known numbers also by those of the box around the set at
+        the sample before, where that is smaller, and they are kept.
 
         Raises:
+            UnboundedError: forms of a period have no bounds.
             TypeError: the plant is one in discrete time, which has no states in between.
         """
         if not self.loop.plant.continuous:
@@ -430,7 +431,8 @@ def reach(
     ellipsoids, also in centre and shape of an ellipsoid `X0`. A derivative is that of the bound
     that is reported, which the same `gap` ends with and without derivatives: where a program was
     not solved, of what is proved without its optimum; where no trajectory attains a bound of
-    `BranchAndCut`, of what its multipliers prove. It is NaN where there is no bound.
+    `BranchAndCut`, of what its multipliers prove. It is NaN where there is no bound. Sets in
+    between samples (`ReachTube.spans`) are wider where derivatives are taken.
 
     Source: equation (seq_SDP) of Hu, Fazlyab, Morari, Pappas (CDC 2020).
 

@@ -477,7 +477,8 @@ def shortfall(
 
     The sum of `max(0, margin - m)` over the certified margins `m` of all requirements: one for each
     facet of the goal and of the safe set at each time, one for each avoided set at each time.
-    Differentiable, and the same inside `jax.jit`: where a facet of a tube's set has the normal of a
+    Differentiable, and the same inside `jax.jit`, but for what is required between samples, where
+    spans are wider in both (`ReachTube.spans`): where a facet of a tube's set has the normal of a
     facet of the goal or of the safe set, its offset counts, though others may cut it off.
 
     Args:

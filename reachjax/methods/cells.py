@@ -55,9 +55,10 @@ MULTIPLICATIONS = 1.5e11
 OVERHEAD = 2.5e7
 """The products that a step costs beside those of its matrices."""
 
-A_FLOW, A_PLANT, A_LAYER = 2e8, 1e8, 1e7
-"""Those that the flow of a differential equation costs besides, a plant of functions, and each
-layer of its units: measured on eleven loops, whose plants take most of the time."""
+FLOW, FUNCTIONS, LAYER = 2e8, 1e8, 1e7
+"""The products that take as long, at each step, as the flow of a differential equation; as a plant
+of functions; and as each layer of its units. Measured on eleven loops, which mostly wait for
+these."""
 
 PER_WORK = 300.0
 """The products that take as long as a unit of the work of linear programs."""
@@ -283,9 +284,9 @@ class _Search(AbstractSearch):
         self.ways = WAYS if self._follows and not self._asks else 1
         self._wanted_bounds: np.ndarray | None = None
         root.found = self._by_forms(root)
-        given, plant = (self._loop, problem.horizon), _of_functions(self._loop)
-        self._all = self._left = affordable(*given, problem.budget, plant)
-        self._form = MULTIPLICATIONS / affordable(*given, Budget(), plant)
+        steps, more = problem.horizon, _plant_products(self._loop)
+        self._all = self._left = affordable(self._loop, steps, problem.budget, more)
+        self._form = MULTIPLICATIONS / affordable(self._loop, steps, Budget(), more)
         self._stuck = False
         self._planned, self._wanted, self._halvings, self._looked = False, 1, 0, -1
         self.end = SolverStatus.UNKNOWN_GAP
@@ -640,26 +641,26 @@ class _Slopes:
         return self._by_method[id(node)]
 
 
-def _of_functions(loop: ClosedLoop) -> float:
-    """The products that take as long as the functions of a plant do at a step."""
+def _plant_products(loop: ClosedLoop) -> float:
+    """The products that take as long as a step of the plant; none of matrices alone."""
     if loop.plant.continuous:
-        return A_FLOW
+        return FLOW
     layers = len(loop.plant_layers)
-    return A_PLANT + A_LAYER * layers if layers else 0.0
+    return FUNCTIONS + LAYER * layers if layers else 0.0
 
 
-def affordable(loop: ClosedLoop, horizon: int, budget: Budget, plant: float = 0.0) -> float:
+def affordable(loop: ClosedLoop, horizon: int, budget: Budget, more: float = 0.0) -> float:
     """How many cells may be bounded: any number where time is a limit.
 
     Args:
         loop: the closed loop.
         horizon: the number of steps.
         budget: of time.
-        plant: what a step costs besides; zero for decisions, which are worth the wait.
+        more: products that each step costs besides; none for decisions, which are worth the wait.
     """
     if budget.timed:
         return np.inf
     more, between = step_columns(loop)
     columns = loop.states**2 + between + more * np.arange(1, horizon + 1)
     parameters = sum(np.size(leaf) for leaf in jax.tree.leaves(loop))
-    return MULTIPLICATIONS / float(np.sum(OVERHEAD + plant + parameters * columns))
+    return MULTIPLICATIONS / float(np.sum(OVERHEAD + more + parameters * columns))

@@ -284,9 +284,9 @@ class _Search(AbstractSearch):
         self.ways = WAYS if self._follows and not self._asks else 1
         self._wanted_bounds: np.ndarray | None = None
         root.found = self._by_forms(root)
-        steps, more = problem.horizon, _plant_products(self._loop)
-        self._all = self._left = affordable(self._loop, steps, problem.budget, more)
-        self._form = MULTIPLICATIONS / affordable(self._loop, steps, Budget(), more)
+        steps, besides = problem.horizon, _plant_products(self._loop)
+        self._all = self._left = affordable(self._loop, steps, problem.budget, besides)
+        self._form = MULTIPLICATIONS / affordable(self._loop, steps, Budget(), besides)
         self._stuck = False
         self._planned, self._wanted, self._halvings, self._looked = False, 1, 0, -1
         self.end = SolverStatus.UNKNOWN_GAP
@@ -649,18 +649,18 @@ def _plant_products(loop: ClosedLoop) -> float:
     return FUNCTIONS + LAYER * layers if layers else 0.0
 
 
-def affordable(loop: ClosedLoop, horizon: int, budget: Budget, more: float = 0.0) -> float:
+def affordable(loop: ClosedLoop, horizon: int, budget: Budget, besides: float = 0.0) -> float:
     """How many cells may be bounded: any number where time is a limit.
 
     Args:
         loop: the closed loop.
         horizon: the number of steps.
         budget: of time.
-        more: products that each step costs besides; none for decisions, which are worth the wait.
+        besides: products of each step; none for decisions, which are worth the wait.
     """
     if budget.timed:
         return np.inf
     more, between = step_columns(loop)
     columns = loop.states**2 + between + more * np.arange(1, horizon + 1)
     parameters = sum(np.size(leaf) for leaf in jax.tree.leaves(loop))
-    return MULTIPLICATIONS / float(np.sum(OVERHEAD + more + parameters * columns))
+    return MULTIPLICATIONS / float(np.sum(OVERHEAD + besides + parameters * columns))

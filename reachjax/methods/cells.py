@@ -284,7 +284,7 @@ class _Search(AbstractSearch):
         self.ways = WAYS if self._follows and not self._asks else 1
         self._wanted_bounds: np.ndarray | None = None
         root.found = self._by_forms(root)
-        steps, besides = problem.horizon, _plant_products(self._loop)
+        steps, besides = problem.horizon, plant_products(self._loop)
         self._all = self._left = affordable(self._loop, steps, problem.budget, besides)
         self._form = MULTIPLICATIONS / affordable(self._loop, steps, Budget(), besides)
         self._stuck = False
@@ -641,7 +641,7 @@ class _Slopes:
         return self._by_method[id(node)]
 
 
-def _plant_products(loop: ClosedLoop) -> float:
+def plant_products(loop: ClosedLoop) -> float:
     """The products that take as long as a step of the plant; none of matrices alone."""
     if loop.plant.continuous:
         return FLOW

@@ -7,6 +7,8 @@ import pytest
 
 import reachjax as rj
 from reachjax.methods.cell_tree import Node
+from reachjax.methods.cells import affordable, plant_products
+from reachjax.numerics.budget import Budget
 from tests.quick_cases import some
 
 PERIOD = 0.1
@@ -155,3 +157,17 @@ def test_derivatives_in_polytopes_are_those_of_their_facets(kind, cells, toleran
         step = h * jnp.eye(4)[i]
         along = (offset(at[0], at[1] + step) - offset(at[0], at[1] - step)) / (2 * h)
         np.testing.assert_allclose(slopes[1][i], along, atol=tolerance)
+
+
+def test_fewer_cells_are_affordable_where_a_plant_takes_long():
+    net = rj.MLP.from_layers([(np.ones((4, 2)), np.zeros(4)), (np.ones((1, 4)), np.zeros(1))])
+    plants = (
+        rj.NonlinearPlant(lambda x, u: x + 0.1 * jnp.array([x[1], jnp.sin(x[0]) + u[0]]), 2, 1),
+        rj.SampledPlant(lambda x, u: jnp.array([x[1], jnp.sin(x[0]) + u[0]]), 2, 1, 0.1),
+    )
+    for plant in plants:
+        loop = rj.ClosedLoop(plant, net)
+        products, counted = affordable(loop, 10, Budget()), plant_products(loop)
+        assert affordable(loop, 10, Budget(), counted) < products / 2
+    affine = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.ones((2, 1))), net)
+    assert plant_products(affine) == 0

@@ -461,13 +461,14 @@ def test_processes_that_have_no_long_floats_of_their_own_answer_to_the_last_digi
     sampled = rj.SampledPlant(swing, states=2, inputs=1, period=0.1)
     loop, X0 = rj.ClosedLoop(sampled, rj.Network(push, 2, 1)), rj.Box([-1.0, -1.0], [1.0, 1.0])
     thirds = rj.Box([-4.0 / 3, -10 / 3], [4.0 / 3, 10 / 3])  # which short floats would round
-    here = rj.decide(loop, X0, 3, safe=thirds, cells=(2, 2))
+    few = (3, 1)  # of more, how long they take says whether they are bounded in a compiled call
+    here = rj.decide(loop, X0, 3, safe=thirds, cells=few)
     assert here.proved
     rj.decide(loop, X0, 1, safe=thirds)  # functions of the loop are recorded
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=spawn) as pool, warnings.catch_warnings():
         warnings.simplefilter("error")
-        there = rj.decide(loop, X0, 3, safe=thirds, cells=(2, 2), executor=pool)
+        there = rj.decide(loop, X0, 3, safe=thirds, cells=few, executor=pool)
     np.testing.assert_array_equal(there.margins["safe"], here.margins["safe"])
 
 

@@ -55,7 +55,7 @@ from reachjax.methods.problem import AbstractMethod, Problem, ReachSet
 from reachjax.methods.recursion import Recursion
 from reachjax.numerics.archives import UnreadableError
 from reachjax.numerics.budget import Interrupted
-from reachjax.numerics.compilations import keep_compilations
+from reachjax.numerics.compilations import compiler_options, keep_compilations
 from reachjax.programs.basis import ChangeOfBasis, change_of_basis
 from reachjax.programs.relaxations import (
     AbstractRelaxation,
@@ -237,6 +237,7 @@ __all__ = [
     "WinningSet",
     "XLogX",
     "change_of_basis",
+    "compiler_options",
     "decide",
     "delayed",
     "failures",

@@ -44,7 +44,7 @@ def parts(
     def size(loop):
         return rj.log_volume(rj.reach(loop, case.box, 1, template, relaxation, 1, solver))
 
-    gradient = jax.jit(jax.value_and_grad(size))
+    gradient = jax.jit(jax.value_and_grad(size), compiler_options=rj.compiler_options())
     ready = (
         step,
         lambda: solver.solve(program, Facets(template.directions)),

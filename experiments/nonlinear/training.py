@@ -1,6 +1,7 @@
 """Training on: what the certified sets lack of a specification is a part of the loss."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +54,7 @@ def trained_on(
         error = jnp.mean((jax.vmap(net)(x) - u) ** 2)
         return lacking + IMITATION * error, (lacking, error)
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=rj.compiler_options())
     def step(layers, state):
         slope, parts = jax.grad(losses, has_aux=True)(layers)
         updates, state = optimiser.update(slope, state, layers)

@@ -100,7 +100,9 @@ def certified(studied: StudiedLoop, relaxation: rj.AbstractRelaxation) -> Gradie
         )
 
     gradient = jax.value_and_grad(penalty)
-    return gradient if isinstance(relaxation, rj.BranchAndCut) else jax.jit(gradient)
+    if isinstance(relaxation, rj.BranchAndCut):
+        return gradient
+    return jax.jit(gradient, compiler_options=rj.compiler_options())
 
 
 def sampled(studied: StudiedLoop) -> Gradient:

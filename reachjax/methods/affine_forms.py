@@ -27,6 +27,7 @@ from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
 from reachjax.methods.steps import boxed, overflow
 from reachjax.numerics.checks import is_concrete, owned
 from reachjax.numerics.derivatives import moved_by
+from reachjax.numerics.host import in_numpy
 from reachjax.programs.held import Attained, Facets, Source, held_bounds, sources
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.moving import HeldBounds, Moving, moving
@@ -162,8 +163,8 @@ def _held_forms(
 
 
 SMALLER = 1e-3
-"""A set is smaller than forms say if a bound is, by this part of the set's largest width: less is
-not worth a period's flow."""
+"""A set is smaller than forms say if along a row it is, by this part of the width of the box around
+it: less is not worth a period's flow."""
 
 
 def spans_by_forms(
@@ -185,12 +186,12 @@ def spans_by_forms(
         UnboundedError: no form of a period has bounds.
     """
     facets, X0 = template.alone or Template.box(loop.states), sets[0]
-    shapes, box = [facets.at(k) for k in range(1, len(sets))], boxed(X0, "X0")
+    shapes = [facets.at(k) for k in range(1, len(sets))]
     directions = jnp.stack([each.directions for each in shapes])
     if is_concrete((loop, sets, directions)):
-        known = None if template.alone is None else sets
-        found = [*_spans(loop, sets, np.asarray(directions), start, known)]
+        found = [*_spans(in_numpy(loop), sets, np.asarray(directions), start)]
     else:
+        box = boxed(X0, "X0")
         given = X0.closed_form(box), box, directions, start
         steps = unrolled_at_once(loop, *given, between=1)
         assert steps.between is not None  # they were asked for
@@ -204,11 +205,10 @@ def _spans(
     sets: Sequence[AbstractSet],
     directions: Float[np.ndarray, "N f n_x"],
     start: int,
-    polytopes: Sequence[AbstractSet] | None,
 ) -> Iterator[Float[np.ndarray, " f"]]:
-    """Offsets of each period: of `polytopes` those that are no smaller than forms are not asked."""
+    """Offsets of each period, from forms of the first set and from smaller sets in between."""
     whole = unrolled(loop, sets[0], boxed(sets[0], "X0"), directions, start, between=1)
-    before = None
+    before = np.zeros(0)
     for k, rows in enumerate(directions):
         found, lost = list[ByForms](), None
         try:
@@ -216,8 +216,8 @@ def _spans(
         except UnboundedError as error:  # it is at its end
             lost = error
         begun = [*found]
-        if k and (before is None or polytopes is None or _is_smaller(polytopes[k], before)):
-            box = boxed(sets[k], "X0")
+        if k and not (begun and _holds_all(sets[k], directions[k - 1], before)):
+            box = boxed(sets[k], f"the set at t = {start + k}")
             given = loop, sets[k].closed_form(box), box, rows[None], start + k
             try:
                 found += unrolled(*given, between=1)
@@ -226,15 +226,18 @@ def _spans(
         if not found:
             assert lost is not None
             raise lost
-        before = np.asarray(begun[0].offsets) if begun else None
+        if begun:
+            before = np.asarray(begun[0].offsets)
         yield np.fmin.reduce([np.max(np.asarray(step.between), axis=0) for step in found])
 
 
-def _is_smaller(region: AbstractSet, bounds: Float[np.ndarray, " f"]) -> bool:
-    """Whether a polytope lies more tightly than within these bounds of its facets."""
-    offsets, widths = np.asarray(region.facets[1]), np.asarray(region.bounding_box().widths)
-    room = SMALLER * widths.max()
-    return not (offsets >= bounds - room).all()  # also where there is no bound
+def _holds_all(
+    region: AbstractSet, rows: Float[np.ndarray, "f n_x"], bounds: Float[np.ndarray, " f"]
+) -> bool:
+    """Whether a set is hardly smaller, along all rows, than bounds of these say."""
+    room = SMALLER * (abs(rows) @ np.asarray(region.bounding_box().widths))
+    upper = np.asarray(region.bounds_along(jnp.asarray(rows)))
+    return bool((upper >= bounds - room).all())  # not where there is no bound
 
 
 ENDS = SolverStatus.AFFINE_FORM, SolverStatus.FAILED

@@ -20,6 +20,11 @@ def is_concrete(*trees: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def is_staged() -> bool:
+    """Whether what is computed now is recorded, to be compiled with what is around it."""
+    return isinstance(jnp.zeros(()), Tracer)
+
+
 def evaluated(*trees: Any) -> AbstractContextManager[Any]:
     """A scope: what is computed in it from known numbers is known, inside `jax.jit` as well."""
     return jax.ensure_compile_time_eval() if is_concrete(*trees) else nullcontext()

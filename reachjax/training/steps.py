@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.numerics.compilations import compiler_options
 from reachjax.sets import PolyhedralSet
 from reachjax.training.objectives import TrainingBatch
 from reachjax.verdicts.specification import Requirement
@@ -91,21 +92,10 @@ def under(loop: ClosedLoop, weights: Sequence[Array]) -> ClosedLoop:
     return loop.replace(controller=jax.tree.unflatten(structure, found))
 
 
-QUICKLY = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-"""How steps are compiled for processors: those of twenty periods of an affine loop with 2-32-32-1
-neurons in 8 CPU seconds, and they take 0.11 s. Without optimisation that is 4 and 0.25 s; by the
-newer emitters of fused code 9 and 0.42 s, and 15 and 0.14 s with it. The default takes minutes."""
-
-
-def _options() -> dict[str, Any] | None:
-    """How code is compiled for the default device."""
-    return QUICKLY if jax.default_backend() == "cpu" else None
-
-
 @functools.cache
 def compiled_step() -> Callable[..., Any]:
     """The step as it is compiled for the default device."""
-    return jax.jit(_advanced, static_argnames="program", compiler_options=_options())
+    return jax.jit(_advanced, static_argnames="program", compiler_options=compiler_options())
 
 
 @functools.cache
@@ -117,7 +107,7 @@ def compiled_loss() -> Callable[..., Any]:
     ) -> Array:
         return _one_number("task_loss", task_loss(under(loop, weights), states))
 
-    return jax.jit(loss, static_argnames="task_loss", compiler_options=_options())
+    return jax.jit(loss, static_argnames="task_loss", compiler_options=compiler_options())
 
 
 def _advanced(

@@ -12,7 +12,6 @@ import reachjax as rj
 from reachjax.numerics.rounding import gamma, is_counted, rounding
 from reachjax.programs.affine_steps import step_columns
 from reachjax.programs.unrolled import unrolled_at_once
-from reachjax.training.steps import QUICKLY
 from tests.networks import directions
 from tests.programs.test_merging import pendulum
 
@@ -103,7 +102,7 @@ def test_few_columns_lose_nothing_of_one_input(kind):
         given = rj.ClosedLoop(plant, net), X0, X0, rows
         return unrolled_at_once(*given, counted=False, columns=columns).offsets
 
-    found = jax.jit(offsets, static_argnums=0, compiler_options=QUICKLY)
+    found = jax.jit(offsets, static_argnums=0, compiler_options=rj.compiler_options())
     for seed in range(4):
         rng = np.random.default_rng(seed)
         net, lower = OF_ONE_OUTPUT[kind](rng), rng.uniform(-0.5, 0.3, 2)

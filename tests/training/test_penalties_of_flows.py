@@ -9,7 +9,6 @@ import pytest
 import reachjax as rj
 from reachjax.loops.flows.taylor_models import Symbols
 from reachjax.methods.problem import Problem
-from reachjax.training.steps import QUICKLY
 from reachjax.tubes.sketches import sketched
 from tests.differences import central_difference, dot
 
@@ -97,7 +96,7 @@ def test_gradients_of_penalties_at_all_times_are_central_differences(kind):
     def penalty(given):
         return rj.specification_penalty(loop_of(kind, given), given["X0"], HORIZON, safe=SAFE)
 
-    both = jax.jit(jax.value_and_grad(penalty), compiler_options=QUICKLY)
+    both = jax.jit(jax.value_and_grad(penalty), compiler_options=rj.compiler_options())
     value, slopes = both(given)
     assert float(value) == pytest.approx(float(penalty(given)), rel=1e-3)  # which is certified
     rng = np.random.default_rng(0)

@@ -9,6 +9,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.loops.batches import in_between
+from reachjax.loops.units import UnboundedError
 from reachjax.programs.unrolled import unrolled_from_boxes
 
 TURN = 2 * math.pi
@@ -204,3 +205,34 @@ def test_spans_are_smaller_where_the_sets_of_samples_are(loop, given, start):
         sizes.append([np.prod(np.asarray(span.bounding_box().widths)) for span in spans])
     assert sizes[-1][0] < 0.9 * sizes[-1][1]
     assert all(one <= other * (1 + 1e-9) for one, other in sizes)
+
+
+def test_spans_of_unlike_units_are_as_small():
+    """Whether a set is smaller is asked along each row, in its own units."""
+    sizes = np.array([1.0, 1e4])
+
+    def rescaled(x, u):
+        return damped(x / sizes, u) * sizes
+
+    plain = switching(damped)
+    layers = [(W / sizes if W.shape[1] == 2 else W, b) for W, b in plain.controller.layers]
+    loop = rj.ClosedLoop(rj.SampledPlant(rescaled, 2, 1, 0.2), rj.MLP.from_layers(layers))
+    X0, one = rj.Box(-sizes, sizes), rj.Template.box(2)
+    found, expected = rj.reach(loop, X0, 3, one), rj.reach(plain, WIDE, 3, one)
+    for span, other in zip(found.spans, expected.spans, strict=True):
+        widths = (np.asarray(each.bounding_box().widths) for each in (span, other))
+        np.testing.assert_allclose(next(widths) / sizes, next(widths), rtol=1e-3)
+
+
+def test_spans_where_the_form_of_the_initial_set_is_lost_are_those_of_sets_in_between():
+    def rooted(x, u):
+        return damped(x, u) + jnp.array([0.0, 0.1 * jnp.sqrt(x[0] + 1.7)])
+
+    loop, template = switching(rooted), rj.Template.box(2)
+    with pytest.raises(UnboundedError, match="Sqrt"):
+        rj.reach(loop, WIDE, 4, template, relaxation=rj.LinearBounds())
+    tube = rj.reach(loop, WIDE, 4, template)
+    states = np.asarray(loop.simulate(WIDE.sample(jax.random.key(0), 500), 4, parts=8))
+    for k, span in enumerate(tube.spans):
+        seen = states[:, 8 * k + 1 : 8 * (k + 1) + 1].reshape(-1, 2)
+        assert np.all(np.asarray(span.contains(seen, 1e-9)))

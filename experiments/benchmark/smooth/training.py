@@ -87,7 +87,8 @@ def _around(n: int, half: float) -> rj.Box:
 def jitted(lesson: Callable[[Settings], Lesson], settings: Settings) -> Iterator[Figures]:
     """Milliseconds of value and gradient in compiled code, and what compiling takes."""
     given = lesson(settings)
-    yield from _timed(given, jax.jit(jax.value_and_grad(given.penalty)), settings)
+    both = jax.jit(jax.value_and_grad(given.penalty), compiler_options=rj.compiler_options())
+    yield from _timed(given, both, settings)
 
 
 def eager(lesson: Callable[[Settings], Lesson], settings: Settings) -> Iterator[Figures]:

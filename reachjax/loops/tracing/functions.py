@@ -30,7 +30,8 @@ from reachjax.loops.tracing.rules.picks import number as number_of
 from reachjax.loops.tracing.traces import Sizes, Trace, UpdatedError
 from reachjax.loops.tracing.values import Choice, Operand, Parameter, UnsupportedError, Value
 from reachjax.loops.units import AtUnit, evaluate
-from reachjax.numerics.checks import described, is_concrete
+from reachjax.numerics.checks import described, is_concrete, is_staged
+from reachjax.numerics.compilations import compiler_options
 from reachjax.numerics.pytrees import pytree, static, unchecked
 from reachjax.numerics.rounding import counting
 
@@ -266,23 +267,40 @@ class Compiled:
 
     Args:
         function: which one.
+        compiler_options: of JAX, for code that is not within other code; None: what pays for what
+            is called often.
         **options: of `jax.jit`.
     """
 
-    def __init__(self, function: Callable[..., Any], **options: Any):
-        self._jitted = jax.jit(counting(function), **options)
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        compiler_options: dict[str, Any] | None = None,
+        **options: Any,
+    ):
+        self._function, self._options = counting(function), options
+        self._own = compiler_options
+        self._within = jax.jit(self._function, **options)
         functools.update_wrapper(self, function)
+
+    @functools.cached_property
+    def _alone(self) -> Any:
+        """What is compiled by itself: code within other code takes no options of a compiler."""
+        own = compiler_options() if self._own is None else self._own
+        return jax.jit(self._function, compiler_options=own, **self._options)
 
     def __call__(self, *given: Any, **static: Any) -> Any:
         """The value, of arguments whose constants are computed."""
-        return self._jitted(*with_constants(given), **with_constants(static))
+        given, static = with_constants(given), with_constants(static)
+        known = is_concrete(given, static) and not is_staged()
+        return (self._alone if known else self._within)(*given, **static)
 
     def lower(self, *given: Any, **static: Any) -> Any:
         """What is compiled for such arguments."""
-        return self._jitted.lower(*with_constants(given), **with_constants(static))
+        return self._alone.lower(*with_constants(given), **with_constants(static))
 
     def _cache_size(self) -> int:
-        return self._jitted._cache_size()  # type: ignore[attr-defined]
+        return sum(each._cache_size() for each in (self._within, self._alone))
 
 
 def _require_bound(function: Any, name: str) -> None:

@@ -424,7 +424,7 @@ def _docking() -> Instance:
         40,
         {"safe": slow(0.2, 2 * fields.MOTION)},
         ((0, 1),),
-        Shape((256, 256, 4), "tanh", law, (20.0, 20, 0.2, 0.2)),
+        Shape((256, 256, 4), "tanh", law, (20.0, 20, 0.2, 0.2), penalty=1e-3),
         f"the limit of speed is a cone: {HALF_PLANES} half-spaces within it are proved",
     )
 

@@ -123,6 +123,7 @@ class _Decisions(AbstractSearch):
         self._open, self._last = deque(cells.leaves), deque[Node]()
         self._left_over = deque[tuple[Node, Margins | None]]()
         self._unshot, self._shot = list[Node](), 0
+        self._sifts, self._compared = True, list[Node]()
         self._lost: tuple[Unbounded, list[float]] | None = None
         self._bounded = False
 
@@ -161,8 +162,10 @@ class _Decisions(AbstractSearch):
     def _many(self) -> bool:
         """Whether there are cells for a compiled call; of flows it takes less than a few do."""
         loop = self._task.loop
-        return not loop.jumps and len(self._open) >= (
-            FEW_OF_A_FLOW if loop.plant.continuous else TOGETHER
+        return (
+            self._sifts
+            and not loop.jumps
+            and len(self._open) >= (FEW_OF_A_FLOW if loop.plant.continuous else TOGETHER)
         )
 
     def _about(self, node: Node, task: CellTask, known: Margins | None = None) -> Question:
@@ -171,16 +174,35 @@ class _Decisions(AbstractSearch):
     def answered(self, question: Question, answer: Any) -> int:
         """How many cells are decided, as far as a bar is concerned."""
         if question.function is sifted:
-            for node, outcome in zip(question.nodes, answer, strict=True):
-                if outcome is not None and outcome.proved:
-                    self._judge(node, outcome)
-                else:
-                    self._left_over.append((node, outcome and outcome.margins))
+            self._sort(question.nodes, answer)
         else:
             (node,), (task, *_) = question.nodes, question.given
+            if answer.proved and node in self._compared:
+                self._sifts = False
+                self._left_over = deque((other, None) for other, _ in self._left_over)
             self._judge(node, answer, task is self._first)
         waiting = len(self._open) + len(self._left_over) + len(self._last)
         return self._cells.count - waiting
+
+    def _sort(self, nodes: Sequence[Node], outcomes: Sequence[Outcome | None]) -> None:
+        """Keep what a compiled call proves, and leave over what it does not.
+
+        Steps of compiled flows are as long as they are. Where none of many cells is proved, one of
+        them is bounded on the host, which halves its steps: if that proves it, nothing is compiled
+        any more, and all that are left over are bounded so.
+        """
+        alone = self._task.loop.plant.continuous and not any(
+            outcome is not None and outcome.proved for outcome in outcomes
+        )
+        for node, outcome in zip(nodes, outcomes, strict=True):
+            if outcome is not None and outcome.proved:
+                self._judge(node, outcome)
+                continue
+            known = None if outcome is None else outcome.margins
+            if alone and known is not None:
+                self._compared.append(node)
+                alone, known = False, None
+            self._left_over.append((node, known))
 
     def _judge(self, node: Node, outcome: Outcome, first: bool = True) -> None:
         """Keep what is found of a cell, or halve it, as long as there may be more.

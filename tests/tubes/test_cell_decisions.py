@@ -15,6 +15,7 @@ from reachjax.methods.ladder import Ladder
 from reachjax.methods.propagation import simulations_from
 from reachjax.numerics.budget import Budget
 from reachjax.verdicts.cell_tasks import CellTask, far_from, outcome_of
+from reachjax.verdicts.sieve import Sieve
 from reachjax.verdicts.specification import requirements
 from tests.networks import he_network
 
@@ -286,3 +287,22 @@ def test_flat_coordinates_do_not_say_how_far_bounds_may_be():
     assert beyond is not None
     assert np.isfinite(beyond[:, 0]).all()
     assert beyond[:, 1].tolist() == [-np.inf, np.inf]
+
+
+@pytest.mark.costly
+def test_cells_that_compiled_steps_leave_open_are_proved_by_shorter_ones(monkeypatch):
+    """A period of 1.5 rad is too long for one step; the host halves it, compiled code does not."""
+    turning = rj.SampledPlant(
+        lambda x, u: jnp.array([x[1], u[0] - jnp.sin(x[0])]), states=2, inputs=1, period=1.5
+    )
+    loop = rj.ClosedLoop(turning, rj.MLP.from_layers([([[0.0, -0.1]], [0.0])]))
+    X0, safe = rj.Box([0.1, 0.1], [0.2, 0.2]), rj.Box([-0.8] * 2, [0.8] * 2)
+    called = list[int]()
+
+    def pays(sieve, cells, budget):
+        called.append(len(cells))
+        return True
+
+    monkeypatch.setattr(Sieve, "pays", pays)
+    assert rj.decide(loop, X0, 2, safe=safe, cells=(2, 2), time_limit=120).proved
+    assert called == [4]

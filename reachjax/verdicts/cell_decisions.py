@@ -123,7 +123,8 @@ class _Decisions(AbstractSearch):
         self._open, self._last = deque(cells.leaves), deque[Node]()
         self._left_over = deque[tuple[Node, Margins | None]]()
         self._unshot, self._shot = list[Node](), 0
-        self._sifts, self._compared = True, list[Node]()
+        self._sifts, self._waits = True, False
+        self._compared: Node | None = None
         self._lost: tuple[Unbounded, list[float]] | None = None
         self._bounded = False
 
@@ -134,6 +135,8 @@ class _Decisions(AbstractSearch):
 
     def question(self, asked: int, workers: int) -> Question | None:
         """Forms of many cells, of one, or what programs say of one that is not halved any more."""
+        if self._waits:
+            return None
         while (self._open or self._left_over) and not self._budget.overdue:
             if not self._left_over and self._many and not self._budget.late:
                 some = [self._open.popleft() for _ in range(min(TOGETHER, len(self._open)))]
@@ -150,8 +153,9 @@ class _Decisions(AbstractSearch):
                 if self.ended:
                     return None
                 continue
-            axis = None if bounded else self._hopeless(node)
+            axis = None if bounded or node is self._compared else self._hopeless(node)
             if axis is None:
+                self._waits = node is self._compared
                 return self._about(node, self._first, known)
             self._halve(node, axis)
         if self._last and not (self._open or self._left_over or self._budget.late):
@@ -160,7 +164,10 @@ class _Decisions(AbstractSearch):
 
     @property
     def _many(self) -> bool:
-        """Whether there are cells for a compiled call; of flows it takes less than a few do."""
+        """Whether there are cells for a compiled call, if that says something of this loop.
+
+        Of flows it takes less than a few one by one do.
+        """
         loop = self._task.loop
         return (
             self._sifts
@@ -177,9 +184,8 @@ class _Decisions(AbstractSearch):
             self._sort(question.nodes, answer)
         else:
             (node,), (task, *_) = question.nodes, question.given
-            if answer.proved and node in self._compared:
-                self._sifts = False
-                self._left_over = deque((other, None) for other, _ in self._left_over)
+            if node is self._compared:
+                self._compare(answer)
             self._judge(node, answer, task is self._first)
         waiting = len(self._open) + len(self._left_over) + len(self._last)
         return self._cells.count - waiting
@@ -187,22 +193,26 @@ class _Decisions(AbstractSearch):
     def _sort(self, nodes: Sequence[Node], outcomes: Sequence[Outcome | None]) -> None:
         """Keep what a compiled call proves, and leave over what it does not.
 
-        Steps of compiled flows are as long as they are. Where none of many cells is proved, one of
-        them is bounded on the host, which halves its steps: if that proves it, nothing is compiled
-        any more, and all that are left over are bounded so.
+        Compiled code cannot halve the steps of a flow. Where it proves none of many cells, one of
+        them is bounded on the host, which does, before anything else is asked.
         """
-        alone = self._task.loop.plant.continuous and not any(
-            outcome is not None and outcome.proved for outcome in outcomes
-        )
+        proved = any(outcome is not None and outcome.proved for outcome in outcomes)
+        compares = self._task.loop.plant.continuous and not proved and self._compared is None
         for node, outcome in zip(nodes, outcomes, strict=True):
             if outcome is not None and outcome.proved:
                 self._judge(node, outcome)
                 continue
-            known = None if outcome is None else outcome.margins
-            if alone and known is not None:
-                self._compared.append(node)
-                alone, known = False, None
+            known = None if outcome is None or not self._sifts else outcome.margins
+            if compares and known is not None:
+                self._compared, compares, known = node, False, None
             self._left_over.append((node, known))
+
+    def _compare(self, answer: Outcome) -> None:
+        """Compile nothing any more if forms prove on the host what no compiled call did."""
+        self._compared, self._waits = None, False
+        if answer.proved and not answer.leaves:
+            self._sifts = False
+            self._left_over = deque((node, None) for node, _ in self._left_over)
 
     def _judge(self, node: Node, outcome: Outcome, first: bool = True) -> None:
         """Keep what is found of a cell, or halve it, as long as there may be more.

@@ -207,21 +207,21 @@ def test_spans_are_smaller_where_the_sets_of_samples_are(loop, given, start):
     assert all(one <= other * (1 + 1e-9) for one, other in sizes)
 
 
-def test_spans_of_unlike_units_are_as_small():
-    """Whether a set is smaller is asked along each row, in its own units."""
-    sizes = np.array([1.0, 1e4])
+def test_spans_are_smaller_beside_a_coordinate_of_larger_units():
+    """Whether a set is smaller is asked along each row: of the third coordinate it is not."""
 
-    def rescaled(x, u):
-        return damped(x / sizes, u) * sizes
+    def beside(x, u):
+        return jnp.concatenate([damped(x[:2], u), -x[2:]])
 
     plain = switching(damped)
-    layers = [(W / sizes if W.shape[1] == 2 else W, b) for W, b in plain.controller.layers]
-    loop = rj.ClosedLoop(rj.SampledPlant(rescaled, 2, 1, 0.2), rj.MLP.from_layers(layers))
-    X0, one = rj.Box(-sizes, sizes), rj.Template.box(2)
-    found, expected = rj.reach(loop, X0, 3, one), rj.reach(plain, WIDE, 3, one)
+    (W, b), *rest = plain.controller.layers
+    net = rj.MLP.from_layers([(jnp.pad(W, ((0, 0), (0, 1))), b), *rest])
+    loop = rj.ClosedLoop(rj.SampledPlant(beside, 3, 1, 0.2), net)
+    X0 = rj.Box([-1.0, -1.0, -1e4], [1.0, 1.0, 1e4])
+    found, expected = rj.reach(loop, X0, 3), rj.reach(plain, WIDE, 3)
     for span, other in zip(found.spans, expected.spans, strict=True):
-        widths = (np.asarray(each.bounding_box().widths) for each in (span, other))
-        np.testing.assert_allclose(next(widths) / sizes, next(widths), rtol=1e-3)
+        widths, wanted = (np.asarray(each.bounding_box().widths) for each in (span, other))
+        np.testing.assert_allclose(widths[:2], wanted, rtol=1e-3)
 
 
 def test_spans_where_the_form_of_the_initial_set_is_lost_are_those_of_sets_in_between():

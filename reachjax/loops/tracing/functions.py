@@ -267,8 +267,8 @@ class Compiled:
 
     Args:
         function: which one.
-        compiler_options: of JAX, for code that is not within other code; None: what pays for what
-            is called often.
+        compiler_options: of JAX, for code that is not within other code; None:
+            `compiler_options()`.
         **options: of `jax.jit`.
     """
 
@@ -285,7 +285,7 @@ class Compiled:
 
     @functools.cached_property
     def _alone(self) -> Any:
-        """What is compiled by itself: code within other code takes no options of a compiler."""
+        """The function compiled by itself: code within other code takes no compiler's options."""
         own = compiler_options() if self._own is None else self._own
         return jax.jit(self._function, compiler_options=own, **self._options)
 

@@ -212,7 +212,9 @@ class _Decisions(AbstractSearch):
         self._compared, self._waits = None, False
         if answer.proved and not answer.leaves:
             self._sifts = False
-            self._left_over = deque((node, None) for node, _ in self._left_over)
+            nodes = [node for node, _ in self._left_over]
+            self._left_over.clear()
+            self._left_over.extend((node, None) for node in nodes)
 
     def _judge(self, node: Node, outcome: Outcome, first: bool = True) -> None:
         """Keep what is found of a cell, or halve it, as long as there may be more.

@@ -300,7 +300,8 @@ class Compiled:
         return self._alone.lower(*with_constants(given), **with_constants(static))
 
     def _cache_size(self) -> int:
-        return sum(each._cache_size() for each in (self._within, self._alone))
+        each: Any = self._within, self._alone
+        return sum(one._cache_size() for one in each)
 
 
 def _require_bound(function: Any, name: str) -> None:

@@ -193,8 +193,9 @@ class _Decisions(AbstractSearch):
     def _sort(self, nodes: Sequence[Node], outcomes: Sequence[Outcome | None]) -> None:
         """Keep what a compiled call proves, and leave over what it does not.
 
-        Compiled code cannot halve the steps of a flow. Where it proves none of many cells, one of
-        them is bounded on the host, which does, before anything else is asked.
+        Compiled code cannot halve the steps of a flow. Where it proves none of many cells, one that
+        it loses in the first period is bounded on the host, which does, before anything else is
+        asked.
         """
         proved = any(outcome is not None and outcome.proved for outcome in outcomes)
         compares = self._task.loop.plant.continuous and not proved and self._compared is None
@@ -203,12 +204,12 @@ class _Decisions(AbstractSearch):
                 self._judge(node, outcome)
                 continue
             known = None if outcome is None or not self._sifts else outcome.margins
-            if compares and known is not None:
+            if compares and known is not None and _lost_at_once(known):
                 self._compared, compares, known = node, False, None
             self._left_over.append((node, known))
 
     def _compare(self, answer: Outcome) -> None:
-        """Compile nothing any more if forms prove on the host what no compiled call did."""
+        """Compile nothing any more if forms prove on the host what a compiled call lost."""
         self._compared, self._waits = None, False
         if answer.proved and not answer.leaves:
             self._sifts = False
@@ -337,3 +338,8 @@ class _Decisions(AbstractSearch):
             if np.all((node.lower <= first) & (first <= node.upper)):
                 status = VerdictStatus.REFUTED
         return DecidedCell(*node.ends, status, outcome.margin)
+
+
+def _lost_at_once(margins: Margins) -> bool:
+    """Whether something is not proved of the first period."""
+    return any(bool(row[1] <= 0) for row in margins.values() if len(row) > 1)

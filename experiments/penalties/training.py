@@ -100,9 +100,7 @@ def certified(studied: StudiedLoop, relaxation: rj.AbstractRelaxation) -> Gradie
         )
 
     gradient = jax.value_and_grad(penalty)
-    if isinstance(relaxation, rj.BranchAndCut):
-        return gradient
-    return jax.jit(gradient, compiler_options=rj.compiler_options())
+    return gradient if isinstance(relaxation, rj.BranchAndCut) else jax.jit(gradient)
 
 
 def sampled(studied: StudiedLoop) -> Gradient:

@@ -142,9 +142,10 @@ def rechecked(title: str, settings: Settings) -> Iterator[dict]:
     jax.config.update("jax_compilation_cache_dir", None)
     loop = loop_of(title, settings)
     yield {}
-    began = time.perf_counter()
-    rj.load(settings.output / "verdicts" / f"{title}.verdict", loop, recheck=True)
-    yield {"recheck": time.perf_counter() - began}
+    path, began = settings.output / "verdicts" / f"{title}.verdict", time.perf_counter()
+    with workers(settings.processes) as executor:
+        rj.load(path, loop, recheck=True, executor=executor)
+        yield {"recheck": time.perf_counter() - began}
 
 
 def least(verdict: rj.Verdict) -> float:

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import os
+from concurrent.futures import Executor
 
 from reachjax.loops import ClosedLoop
 from reachjax.methods.searches import Bar
 from reachjax.numerics.archives import UnreadableError, existing_file
-from reachjax.numerics.checks import owned, require_bar, require_double_precision, require_kind
+from reachjax.numerics.checks import (
+    owned,
+    require_bar,
+    require_double_precision,
+    require_executor,
+    require_kind,
+)
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
 from reachjax.numerics.storage import read
@@ -39,6 +46,7 @@ def load(
     *,
     recheck: bool = False,
     progress: Bar | None = None,
+    executor: Executor | None = None,
 ) -> ReachTube | PartitionedTube | Verdict:
     """A tube, or a verdict, from the file that `tube.save(path)` or `verdict.save(path)` wrote.
 
@@ -51,7 +59,10 @@ def load(
             the initial set, template and start that it has, all else follows; how searches ended
             and what they took is not said any more. Of a verdict all is proved anew, from what it
             is about, without a search; without `recheck` its status is what the file says.
-        progress: wraps the iteration over steps that are rechecked, such as `tqdm.tqdm`.
+        progress: wraps the iteration over steps, or over cells of a verdict, that are rechecked,
+            such as `tqdm.tqdm`.
+        executor: rechecks the cells of a verdict, as that of `decide`. None: one after the other,
+            here, as the steps of a tube always are.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -73,6 +84,7 @@ def load(
     """
     require_double_precision()
     require_bar(progress)
+    require_executor(executor)
     if loop is not None:
         require_kind("loop", loop, ClosedLoop, "a ClosedLoop")
     found = existing_file("path", path)
@@ -91,7 +103,7 @@ def load(
     if not recheck:
         return tube
     if isinstance(tube, Verdict):
-        return rechecked_verdict(tube, progress)
+        return rechecked_verdict(tube, progress, executor)
     return rechecked_tube(tube, progress)
 
 

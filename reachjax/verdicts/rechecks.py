@@ -11,21 +11,23 @@ taken: both questions are asked again as they follow from these.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
+from concurrent.futures import Executor
+from contextlib import closing
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.methods.cell_tree import CellTree, Node
 from reachjax.methods.ladder import Ladder
-from reachjax.methods.searches import Bar
+from reachjax.methods.searches import Bar, CellJobs
 from reachjax.methods.steps import boxed
 from reachjax.numerics.budget import ENDLESS
 from reachjax.numerics.checks import wrapped
+from reachjax.numerics.flags import lenient
 from reachjax.numerics.host import in_numpy
 from reachjax.programs.affine import AffineForms, joined
 from reachjax.proofs.branches import Branches, bounds_of, leaf_bounds
@@ -41,13 +43,22 @@ from reachjax.verdicts.specification import Requirement
 from reachjax.verdicts.targets import values_of
 from reachjax.verdicts.verdict import Verdict, VerdictStatus
 
+AHEAD = 4
+"""So many cells an executor is given for each of its workers."""
 
-def rechecked(verdict: Verdict, progress: Bar | None = None) -> Verdict:
+Margins = dict[Key, tuple[float, bool]]
+"""The least margin of each requirement that is known, and whether it surely holds."""
+
+
+def rechecked(
+    verdict: Verdict, progress: Bar | None = None, executor: Executor | None = None
+) -> Verdict:
     """The verdict as it is proved anew; of one that is unknown nothing is claimed.
 
     Args:
         verdict: with what was asked, whose parts have the kinds that they should have.
         progress: wraps the iteration over cells.
+        executor: runs the cells; None: here.
 
     Raises:
         DisagreementError: it says what is not proved.
@@ -63,7 +74,7 @@ def rechecked(verdict: Verdict, progress: Bar | None = None) -> Verdict:
             _refute(verdict, asked, findings)
         elif verdict.status is VerdictStatus.PROVED:
             grounds = verdict.grounds or Grounds()
-            proof = _proved(asked, grounds, progress)
+            proof = _proved(asked, grounds, progress, executor)
             for item in asked.required:
                 findings.prove(item, *proof.margins[item.name, item.time])
             left_out = proof.left_out
@@ -106,42 +117,42 @@ def _refute(verdict: Verdict, asked: Asked, findings: Findings) -> None:
     findings.simulate(runs, broken)
 
 
-def _proved(asked: Asked, grounds: Grounds | Closing, progress: Bar | None) -> Proof:
+def _proved(
+    asked: Asked, grounds: Grounds | Closing, progress: Bar | None, executor: Executor | None
+) -> Proof:
     """What grounds prove of a question, in two parts where there is a set halfway.
 
     Raises:
         ValueError: they are of another question.
     """
     if isinstance(grounds, Grounds):
-        return _over_cells(asked, grounds, progress)
+        return _over_cells(asked, grounds, progress, executor)
     halfway = Halfway(asked, grounds.step, grounds.region, grounds.period)
-    before = _proved(halfway.before, grounds.before, progress)
-    after = _proved(halfway.after, grounds.after, progress)
+    before = _proved(halfway.before, grounds.before, progress, executor)
+    after = _proved(halfway.after, grounds.after, progress, executor)
     return halfway.joined(before, after)
 
 
-def _over_cells(asked: Asked, grounds: Grounds, progress: Bar | None) -> Proof:
+def _over_cells(
+    asked: Asked, grounds: Grounds, progress: Bar | None, executor: Executor | None
+) -> Proof:
     """The least margin of each requirement over all cells, and whether it holds over each.
 
     Raises:
         ValueError: the tree is none of the initial set's, or there are not as many climbs as cells.
     """
-    loop, cells = asked.loop, _cells(asked.X0, grounds)
+    cells = _cells(asked.X0, grounds)
     if not cells or len(cells) != len(grounds.climbs):
         raise ValueError(f"it has {len(cells)} cells, but {len(grounds.climbs)} proofs")
     found = {(item.name, item.time): (np.inf, True) for item in asked.required}
-    given = zip(_by_forms(loop, asked, cells, grounds), cells, grounds.climbs, strict=True)
     left = len(cells)
-    for _ in wrapped(progress, list(range(len(cells)))):  # whatever a bar passes on, in order
-        margins, cell, climbs = next(given)
-        left -= 1
-        if margins is None and not climbs:
-            margins = _along_ways(loop, asked, cell.part)
-        if margins is None:
-            margins = _over(loop, asked, cell.part, climbs or (Climb(),))
-        for key, (least, holds) in found.items():
-            margin, right = margins.get(key, (-np.inf, False))
-            found[key] = min(least, margin), holds and right
+    with closing(_of_cells(asked, cells, grounds, executor)) as given:
+        for _ in wrapped(progress, list(range(len(cells)))):  # whatever a bar passes on
+            margins = next(given)
+            left -= 1
+            for key, (least, holds) in found.items():
+                margin, right = margins.get(key, (-np.inf, False))
+                found[key] = min(least, margin), holds and right
     return Proof(found, left)
 
 
@@ -168,51 +179,63 @@ def _cells(X0: AbstractSet, grounds: Grounds) -> list[Node]:
     return tree.leaves
 
 
-def _by_forms(
-    loop: ClosedLoop, asked: Asked, cells: Sequence[Node], grounds: Grounds
-) -> Iterator[dict[Key, tuple[float, bool]] | None]:
-    """The margins of each cell by forms in compiled calls of many; None where that does not pay."""
-    task = _task(loop, asked)
+def _of_cells(
+    asked: Asked, cells: Sequence[Node], grounds: Grounds, executor: Executor | None
+) -> Generator[Margins, None, None]:
+    """The margins of all cells as they come, by forms in compiled calls of many where that pays."""
+    task, jobs = _task(asked), CellJobs[None](executor, AHEAD)
     pays = len(cells) >= TOGETHER and all(cell.is_box for cell in cells)
-    for first in range(0, len(cells), TOGETHER):
-        some = range(first, min(first + TOGETHER, len(cells)))
-        alone = pays and not any(grounds.climbs[number] for number in some)
-        outcomes = sifted(task, [cells[number].ends for number in some], ENDLESS) if alone else []
-        for outcome in outcomes or [None] * len(some):
-            yield None if outcome is None else _margins(asked, outcome)
+    try:
+        for first in range(0, len(cells), TOGETHER):
+            some = range(first, min(first + TOGETHER, len(cells)))
+            alone = pays and not any(grounds.climbs[number] for number in some)
+            outcomes = sifted(task, [cells[each].ends for each in some], ENDLESS) if alone else []
+            for number, outcome in zip(some, outcomes or [None] * len(some), strict=True):
+                if outcome is not None and outcome.proved:
+                    yield _margins(asked, outcome)
+                    continue
+                part = jax.device_get(cells[number].part)
+                jobs.submit(None, _of_cell, asked, part, grounds.climbs[number])
+                if len(jobs) >= jobs.most:
+                    yield from (margins for _, margins in jobs.finished())
+        while len(jobs):
+            yield from (margins for _, margins in jobs.finished())
+    finally:
+        jobs.cancelled()
 
 
-def _along_ways(
-    loop: ClosedLoop, asked: Asked, part: AbstractSet
-) -> dict[Key, tuple[float, bool]] | None:
+@lenient
+def _of_cell(asked: Asked, part: AbstractSet, climbs: Sequence[Climb]) -> Margins:
+    """The margins over one cell, wherever it runs."""
+    with jax.enable_x64(True):
+        along = None if climbs else _along_ways(asked, part)
+        return _over(asked, part, climbs or (Climb(),)) if along is None else along
+
+
+def _along_ways(asked: Asked, part: AbstractSet) -> Margins | None:
     """The margins along all ways of decisions, of a smooth loop that jumps; None if none."""
-    task = _task(loop, asked)
-    if not task.follows:
-        return None
-    return _margins(asked, outcome_of(task, jax.device_get(part), ENDLESS))
+    task = _task(asked)
+    outcome = outcome_of(task, part, ENDLESS) if task.follows else None
+    return None if outcome is None or not outcome.proved else _margins(asked, outcome)
 
 
-def _task(loop: ClosedLoop, asked: Asked) -> CellTask:
+def _task(asked: Asked) -> CellTask:
     """What is to be proved of a cell, without programs."""
-    return CellTask(loop, asked.horizon, asked.start, asked.required, 0)
+    return CellTask(asked.loop, asked.horizon, asked.start, asked.required, 0)
 
 
-def _margins(asked: Asked, outcome: Outcome) -> dict[Key, tuple[float, bool]] | None:
-    """The margins of a cell that is proved; None of another one."""
-    if not outcome.proved:
-        return None
+def _margins(asked: Asked, outcome: Outcome) -> Margins:
+    """The margins of a cell that is proved."""
     return {
         (item.name, item.time): (float(outcome.margins[item.name][item.time]), True)
         for item in asked.required
     }
 
 
-def _over(
-    loop: ClosedLoop, asked: Asked, part: AbstractSet, climbs: Sequence[Climb]
-) -> dict[Key, tuple[float, bool]]:
+def _over(asked: Asked, part: AbstractSet, climbs: Sequence[Climb]) -> Margins:
     """The margins over a part of the initial set, by all of the climbs."""
-    found: dict[Key, tuple[float, bool]] = {}
-    part, around = jax.device_get((part, boxed(jax.device_put(part), "X0")))
+    loop, found = asked.loop, Margins()
+    around = jax.device_get(boxed(jax.device_put(part), "X0"))
     scenarios = Scenarios.of(loop, part, asked.horizon, asked.start)
     between = any(item.throughout for item in asked.required)
     for item in asked.required:

@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import multiprocessing
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -83,6 +85,44 @@ def test_what_is_proved_is_proved_anew_with_the_same_margins(kind, tmp_path):
         known = ~np.isnan(margins)
         assert np.array_equal(known, ~np.isnan(again.margins[name]))
         assert np.allclose(margins[known], again.margins[name][known], rtol=0, atol=1e-9)
+
+
+def test_cells_are_proved_anew_by_processes_as_they_are_here(tmp_path):
+    """And what one of them does not prove is proved by none."""
+    loop, path = rectified(), tmp_path / "a.verdict"
+    verdict = decided("grid")[1]
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=spawn) as pool:
+        verdict.save(path)
+        here, there = rj.load(path, recheck=True), rj.load(path, recheck=True, executor=pool)
+        for name, margins in here.margins.items():
+            np.testing.assert_array_equal(margins, there.margins[name])
+        assert there.proved
+        grounds = verdict.grounds
+        forged(path, verdict, grounds=grounds._replace(climbs=grounds.climbs[:-1]))
+        with pytest.raises(rj.DisagreementError, match="5 proofs"):
+            rj.load(path, recheck=True, executor=pool)
+        tighter = rj.decide(loop, X0, STEPS, goal=around(loop, -0.05))
+        forged(path, verdict, asked=tighter.asked)
+        with pytest.raises(rj.DisagreementError, match="does not bear that out"):
+            rj.load(path, recheck=True, executor=pool)
+    with pytest.raises(TypeError, match="executor must be an object with a method submit"):
+        rj.load(path, recheck=True, executor=2)
+
+
+@pytest.mark.parametrize("count", ["2", "0"])
+def test_a_command_takes_processes(count, tmp_path):
+    decided("grid")[1].save(tmp_path / "a.verdict")
+    command = [sys.executable, "-m", "reachjax", "recheck", tmp_path / "a.verdict"]
+    done = subprocess.run(
+        [*command, "--processes", count], capture_output=True, text=True, check=False
+    )
+    if count == "0":
+        assert done.returncode == 2
+        assert "must be a whole number from 1 on, but 0 arrived" in done.stderr
+    else:
+        assert done.returncode == 0
+        assert "PROVED" in done.stdout
 
 
 def test_a_recheck_solves_and_searches_nothing(tmp_path, monkeypatch):

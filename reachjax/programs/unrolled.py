@@ -263,7 +263,7 @@ def _columns_kept(loop: ClosedLoop) -> int:
     return max(COLUMNS, MEMORY * step_columns(loop)[0])
 
 
-@partial(Compiled, static_argnames=("t", "between", "counted", "columns"))
+@partial(Compiled, in_reverse=True, static_argnames=("t", "between", "counted", "columns"))
 def unrolled_at_once(
     loop: ClosedLoop,
     X0: AbstractSet,

@@ -245,7 +245,7 @@ class Requirement:
         """What every state surely does not exceed, and should not: of each facet, or of the set."""
         return self.compared_with(self.holding(tube))
 
-    def holding(self, tube: ReachTube | Sketch) -> AbstractSet:
+    def holding(self, tube: ReachTube) -> AbstractSet:
         """The set of a tube that holds all states which the requirement is about."""
         return tube.spans[self.time - 1] if self.throughout else tube.sets[self.time]
 
@@ -260,6 +260,10 @@ class Requirement:
             C, d, norms = self.region.facets_in_units(inner=True)
             return Compared((reached.bounds_along if by_offsets else reached.support)(C), d, norms)
         return Compared(-reached.separation(self.region)[None], jnp.zeros(1), jnp.ones(1))
+
+    def margins_in(self, reached: AbstractSet) -> Float[Array, " k"]:
+        """The margins in a set that holds every state at this time, by its facets' offsets."""
+        return self.compared_with(reached, by_offsets=True).margins
 
     def simulated(self, trajectories: np.ndarray) -> np.ndarray:
         """How far each trajectory `(c,)` is on the right side; negative on the wrong one."""
@@ -510,11 +514,28 @@ def missing(
     required: Sequence[Requirement], tube: ReachTube | Sketch, margin: float
 ) -> Float[Array, ""]:
     """By how much sets miss requirements, in all: see `shortfall`."""
+
+    def hinged(margins: Float[Array, "*k"]) -> Float[Array, ""]:
+        return jnp.sum(jnp.maximum(0.0, margin - margins))
+
     total = jnp.zeros(())
-    for item in required:
-        margins = item.compared_with(item.holding(tube), by_offsets=True).margins
-        total += jnp.sum(jnp.maximum(0.0, margin - margins))
+    for items in _alike(required):
+        if isinstance(tube, Sketch):
+            times, (first, *_) = [item.time for item in items], items
+            found = tube.of_each(first.margins_in, times, first.throughout)
+        else:
+            found = [item.margins_in(item.holding(tube)) for item in items]
+        total += sum(map(hinged, found), start=jnp.zeros(()))
     return total
+
+
+def _alike(required: Sequence[Requirement]) -> Iterable[list[Requirement]]:
+    """Requirements that differ in their times alone; of the initial set, each for itself."""
+    found: dict[Any, list[Requirement]] = {}
+    for item in required:
+        key = id(item.region), item.inside, item.throughout, item.time == 0
+        found.setdefault(key, []).append(item)
+    return found.values()
 
 
 def check_margin(margin: Any) -> None:

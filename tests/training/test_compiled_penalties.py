@@ -3,10 +3,12 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.programs.unrolled import unrolled_at_once
 from reachjax.verdicts.specification import requirements
 
 CORNERS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
@@ -100,3 +102,60 @@ def test_penalties_are_the_same_whatever_is_traced(X0):
     assert float(jax.jit(penalty)(net, X0)) == pytest.approx(plain, rel=1e-9)
     assert float(jax.jit(lambda net: penalty(net, X0))(net)) == pytest.approx(plain, rel=1e-9)
     assert float(jax.value_and_grad(penalty)(net, X0)[0]) == pytest.approx(plain, rel=1e-9)
+
+
+def turning(weights):
+    """A network whose loop turns, and comes near a square that is to be avoided."""
+    return rj.MLP.from_layers([(weights, [0.1, -0.2]), ([[0.4, -0.3]], [0.0])], rj.Tanh())
+
+
+FIELD = rj.NonlinearPlant(lambda x, u: x + 0.2 * jnp.array([x[1], u[0] - jnp.sin(x[0])]), 2, 1)
+START, STEPS = rj.Box([-0.1, 0.2], [0.1, 0.4]), 3
+ASKED = {
+    "goal": {1: rj.Box([-1.0, -1.0], [0.1, 0.3]), 3: rj.Box([-1.0, -1.0], [0.3, 0.3])},
+    "safe": rj.Polytope(SLANTED, [0.2, 0.1, 0.4, 0.5]),
+    "avoid": {range(1, 4): [rj.Box([0.1, 0.1], [0.3, 0.3])], 2: [REGIONS["triangle"]]},
+}
+WEIGHTS = np.array([[1.0, 0.3], [-0.4, 0.8]])
+
+TEMPLATES = {
+    "one": rj.Template.octagonal(2),
+    "for each step": rj.Template(np.stack([OCTAGON, 2.0 * OCTAGON, OCTAGON])),
+}
+
+
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_a_penalty_of_all_steps_at_once_is_the_sum_over_them(kind):
+    """Compiled and not, with its gradient, whatever sets differ in."""
+    template = TEMPLATES[kind]
+
+    def penalty(weights):
+        loop = rj.ClosedLoop(FIELD, turning(weights))
+        return rj.specification_penalty(loop, START, STEPS, template, **ASKED)
+
+    loop = rj.ClosedLoop(FIELD, turning(WEIGHTS))
+    tube = rj.reach(loop, START, STEPS, template, rj.LinearBounds(programs=False))
+    value, slopes = jax.value_and_grad(penalty)(WEIGHTS)
+    assert float(value) == pytest.approx(float(rj.shortfall(tube, **ASKED)), rel=1e-9)
+    compiled, others = jax.jit(jax.value_and_grad(penalty))(WEIGHTS)
+    assert float(compiled) == pytest.approx(float(value), rel=1e-12)
+    np.testing.assert_allclose(others, slopes, rtol=1e-9, atol=1e-12)
+
+
+def test_derivatives_outside_of_compiled_code_are_compiled_once_and_apart():
+    """What JAX would compile for them by itself takes twice as long, and twice as much memory."""
+
+    def penalty(weights):
+        loop = rj.ClosedLoop(FIELD, turning(weights))
+        return rj.volume_penalty(loop, START, STEPS, TEMPLATES["one"])
+
+    within, pulled = unrolled_at_once._within._cache_size(), unrolled_at_once._pulled._cache_size()
+    slopes = [jax.grad(penalty)(k * WEIGHTS) for k in (1.0, 1.1)]
+    assert unrolled_at_once._within._cache_size() == within
+    assert unrolled_at_once._pulled._cache_size() <= pulled + 1
+    assert not np.allclose(*slopes)
+    many = jax.vmap(jax.grad(penalty))(np.stack([WEIGHTS, 1.1 * WEIGHTS]))
+    np.testing.assert_allclose(many, np.stack(slopes), rtol=1e-9, atol=1e-12)
+    for other in (jax.hessian, jax.jacfwd):
+        with pytest.raises(TypeError, match="first derivatives only"):
+            other(penalty)(WEIGHTS)

@@ -9,12 +9,14 @@ layers of units, that any kind of number can be run through.
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from reachjax.loops.tracing.interpreter import Constants
 from reachjax.loops.tracing.readings import (
@@ -269,6 +271,8 @@ class Compiled:
         function: which one.
         compiler_options: of JAX, for code that is not within other code; None:
             `compiler_options()`.
+        in_reverse: whether derivatives are taken in reverse mode and no other. Outside of compiled
+            code they are then compiled apart, with these options: JAX takes none for them.
         **options: of `jax.jit`.
     """
 
@@ -276,24 +280,79 @@ class Compiled:
         self,
         function: Callable[..., Any],
         compiler_options: dict[str, Any] | None = None,
+        in_reverse: bool = False,
         **options: Any,
     ):
         self._function, self._options = counting(function), options
-        self._own = compiler_options
+        self._own, self._in_reverse = compiler_options, in_reverse
         self._within = jax.jit(self._function, **options)
         functools.update_wrapper(self, function)
 
     @functools.cached_property
     def _alone(self) -> Any:
         """The function compiled by itself: code within other code takes no compiler's options."""
-        own = compiler_options() if self._own is None else self._own
-        return jax.jit(self._function, compiler_options=own, **self._options)
+        return jax.jit(self._function, compiler_options=self._compiler_options, **self._options)
+
+    @property
+    def _compiler_options(self) -> dict[str, Any]:
+        return compiler_options() if self._own is None else self._own
 
     def __call__(self, *given: Any, **static: Any) -> Any:
         """The value, of arguments whose constants are computed."""
         given, static = with_constants(given), with_constants(static)
-        known = is_concrete(given, static) and not is_staged()
-        return (self._alone if known else self._within)(*given, **static)
+        if not is_staged():
+            if is_concrete(given, static):
+                return self._alone(*given, **static)
+            if self._in_reverse and is_concrete(jax.tree.map(_primal, (given, static))):
+                return self._differentiated(given, static)
+        return self._within(*given, **static)
+
+    def _differentiated(self, given: tuple[Any, ...], static: dict[str, Any]) -> Any:
+        """The value of known numbers of which a derivative is being taken."""
+        bound = inspect.signature(self._function).bind(*given, **static).arguments
+        names = self._options.get("static_argnames", ())
+        leaves, structure = jax.tree.flatten({k: v for k, v in bound.items() if k not in names})
+        form = structure, tuple((k, v) for k, v in bound.items() if k in names)
+        moves = [isinstance(leaf, Tracer) for leaf in leaves]
+        moving, held = (
+            [leaf if one is own else None for leaf, one in zip(leaves, moves, strict=True)]
+            for own in (True, False)
+        )
+
+        @jax.custom_vjp
+        def value(moving: list[Any]) -> Any:
+            return self._pulled(moving, held, form)[0]
+
+        def slopes(pull: Any, above: Any) -> tuple[list[Any]]:
+            floats = [each for each in jax.tree.leaves(above) if each.dtype != jax.dtypes.float0]
+            return (self._pull(pull, floats),)
+
+        value.defvjp(lambda moving: self._pulled(moving, held, form), slopes)
+        return value(moving)
+
+    @functools.cached_property
+    def _pulled(self) -> Any:
+        """The value, and what takes slopes of its floats back to the leaves that move."""
+
+        def pulled(moving: list[Any], held: list[Any], form: tuple[Any, Any]) -> tuple[Any, Any]:
+            structure, static = form
+
+            def of(moving: list[Any]) -> tuple[list[Any], Any]:
+                pairs = zip(moving, held, strict=True)
+                rest = structure.unflatten([b if a is None else a for a, b in pairs])
+                found = self._function(**rest, **dict(static))
+                return _floats(found), found
+
+            _, pull, found = jax.vjp(of, moving, has_aux=True)
+            return found, pull
+
+        return jax.jit(pulled, static_argnames="form", compiler_options=self._compiler_options)
+
+    @functools.cached_property
+    def _pull(self) -> Any:
+        """That, done."""
+        own = self._compiler_options
+        return jax.jit(lambda pull, floats: pull(floats)[0], compiler_options=own)
 
     def lower(self, *given: Any, **static: Any) -> Any:
         """What is compiled for such arguments."""
@@ -302,6 +361,17 @@ class Compiled:
     def _cache_size(self) -> int:
         each: Any = self._within, self._alone
         return sum(one._cache_size() for one in each)
+
+
+def _primal(leaf: Any) -> Any:
+    """The number of which a derivative is being taken, if one is."""
+    return getattr(leaf, "primal", leaf) if isinstance(leaf, Tracer) else leaf
+
+
+def _floats(tree: Any) -> list[Any]:
+    """What of a tree derivatives are taken of."""
+    kinds = ((leaf, jnp.result_type(leaf)) for leaf in jax.tree.leaves(tree))
+    return [leaf for leaf, kind in kinds if jnp.issubdtype(kind, jnp.floating)]
 
 
 def _require_bound(function: Any, name: str) -> None:

@@ -149,10 +149,13 @@ def test_derivatives_outside_of_compiled_code_are_compiled_once_and_apart():
         loop = rj.ClosedLoop(FIELD, turning(weights))
         return rj.volume_penalty(loop, START, STEPS, TEMPLATES["one"])
 
-    within, pulled = unrolled_at_once._within._cache_size(), unrolled_at_once._pulled._cache_size()
+    within, before = (
+        unrolled_at_once._within._cache_size(),
+        unrolled_at_once._with_pullback._cache_size(),
+    )
     slopes = [jax.grad(penalty)(k * WEIGHTS) for k in (1.0, 1.1)]
     assert unrolled_at_once._within._cache_size() == within
-    assert unrolled_at_once._pulled._cache_size() <= pulled + 1
+    assert unrolled_at_once._with_pullback._cache_size() <= before + 1
     assert not np.allclose(*slopes)
     many = jax.vmap(jax.grad(penalty))(np.stack([WEIGHTS, 1.1 * WEIGHTS]))
     np.testing.assert_allclose(many, np.stack(slopes), rtol=1e-9, atol=1e-12)

@@ -321,20 +321,22 @@ class Compiled:
 
         @jax.custom_vjp
         def value(moving: list[Any]) -> Any:
-            return self._pulled(moving, held, form)[0]
+            return self._with_pullback(moving, held, form)[0]
 
         def slopes(pull: Any, above: Any) -> tuple[list[Any]]:
             floats = [each for each in jax.tree.leaves(above) if each.dtype != jax.dtypes.float0]
-            return (self._pull(pull, floats),)
+            return (self._pulled_back(pull, floats),)
 
-        value.defvjp(lambda moving: self._pulled(moving, held, form), slopes)
+        value.defvjp(lambda moving: self._with_pullback(moving, held, form), slopes)
         return value(moving)
 
     @functools.cached_property
-    def _pulled(self) -> Any:
-        """The value, and what takes slopes of its floats back to the leaves that move."""
+    def _with_pullback(self) -> Any:
+        """The value, and the pullback of its floats to the leaves that move."""
 
-        def pulled(moving: list[Any], held: list[Any], form: tuple[Any, Any]) -> tuple[Any, Any]:
+        def with_pullback(
+            moving: list[Any], held: list[Any], form: tuple[Any, Any]
+        ) -> tuple[Any, Any]:
             structure, static = form
 
             def of(moving: list[Any]) -> tuple[list[Any], Any]:
@@ -346,11 +348,13 @@ class Compiled:
             _, pull, found = jax.vjp(of, moving, has_aux=True)
             return found, pull
 
-        return jax.jit(pulled, static_argnames="form", compiler_options=self._compiler_options)
+        return jax.jit(
+            with_pullback, static_argnames="form", compiler_options=self._compiler_options
+        )
 
     @functools.cached_property
-    def _pull(self) -> Any:
-        """That, done."""
+    def _pulled_back(self) -> Any:
+        """A pullback, applied to slopes of the floats of a value."""
         own = self._compiler_options
         return jax.jit(lambda pull, floats: pull(floats)[0], compiler_options=own)
 

@@ -42,6 +42,11 @@ Kept = TypeVar("Kept")
 UNSENT = pickle.PicklingError, AttributeError, TypeError
 """How it is said that a value cannot be packed."""
 
+
+class UnsentError(TypeError):
+    """An executor's other processes cannot be sent a job."""
+
+
 DEAD = "KilledWorker", "CommClosedError", "FutureCancelledError"
 """What dask calls workers that have died: its classes are not imported for their names."""
 
@@ -115,7 +120,7 @@ class CellJobs(Generic[Kept]):
         Processes may have none before the job asks for them, and would round arrays of JAX.
 
         Raises:
-            TypeError: a process would be sent a function that is none of a module.
+            UnsentError: a process would be sent a function that is none of a module.
         """
         if isinstance(self._executor, ThreadPoolExecutor):
             return function, *given
@@ -124,7 +129,7 @@ class CellJobs(Generic[Kept]):
         try:
             return _answered, dumps((function, first)), dumps(rest)
         except UNSENT as error:
-            raise TypeError(
+            raise UnsentError(
                 "executor sends the loop to other processes, but a function that is a lambda or "
                 f"stands within another one cannot be sent ({error}): define it at the top of a "
                 "module, or take threads (ThreadPoolExecutor) or dask (client.get_executor())"

@@ -49,6 +49,7 @@ from reachjax.numerics.rounding import (
     namespace,
     select,
     settled,
+    smaller,
     underflow,
 )
 from reachjax.programs.initial import SIZE, Ends, InitialColumns, SubboxColumns, met
@@ -231,6 +232,17 @@ class AffineForms(AbstractNumber):
         """
         by_interval = self.ends_by_interval()
         return met(self.ends_by_form(start, cut), by_interval)
+
+    def uppers(self, start: InitialColumns, cut: bool = False) -> Any:
+        """The upper bounds of `ends`; arguments are the same. Sketches have them at half the price.
+
+        Where nothing is proved, lower bounds need not be known to keep these above them.
+        """
+        if is_counted() or not start.curved or start.round or (cut and start.cut is not None):
+            return self.ends(start, cut)[1]
+        own = start.count
+        above = self.rows[:, 0] + start.highest(self.rows[:, 2 : 2 + own]) + self.rest(own)
+        return smaller(above + self.off, self.ends_by_interval()[1])
 
     def ends_by_form(self, start: InitialColumns, cut: bool = False) -> Ends:
         """Lower and upper bounds `(k,)` by forms alone."""

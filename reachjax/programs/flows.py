@@ -59,7 +59,7 @@ class Between(NamedTuple):
             start: what the first columns are.
             parts: as of `values`.
         """
-        ends = self.values(directions, parts).ends(start, True)[1]
+        ends = self.values(directions, parts).uppers(start, True)
         each = ends.reshape(-1, 4, len(directions))
         largest = reduce(larger, (each[:, k] for k in range(4)))
         xp = namespace(ends)

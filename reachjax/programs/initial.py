@@ -128,17 +128,21 @@ class InitialColumns(Replaceable):
         products = mixed * np.where(i == j, 0.25, 1.0)
         return (one * other).sum(axis=1) / 2, products
 
+    def highest(self, rows: Rows) -> Any:
+        """Upper bounds of each row over all columns of a box, products among them; rounded."""
+        return _highest(rows, self.pairs)
+
     def curved_ends(self, rows: Rows) -> Ends:
         """Bounds of each row over all columns, products among them, by the formulas above."""
         n, counted = self.spread.shape[1], is_counted()
         if not self.round and not counted:  # the norm is no better
-            both = _highest(namespace(rows).concatenate([rows, -rows]), self.pairs)
+            both = self.highest(namespace(rows).concatenate([rows, -rows]))
             return -both[len(rows) :], both[: len(rows)]
         error = errors(lambda: gamma(4 * rows.shape[1] + 16) * abs(rows).sum(axis=1))
         rest = abs(rows[:, n:]).sum(axis=1)
         below, above = self.ends(rows[:, :n])
         if not self.round:
-            both = _highest(namespace(rows).concatenate([rows, -rows]), self.pairs)
+            both = self.highest(namespace(rows).concatenate([rows, -rows]))
             above = smaller(above + rest, both[: len(rows)])
             below = larger(below - rest, -both[len(rows) :])
         else:

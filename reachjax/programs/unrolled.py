@@ -378,7 +378,7 @@ def _bounds(
     xp = jnp if isinstance(rows.rows, jax.Array) else np
     slopes = xp.concatenate([layer.slope for layer in units] or [xp.zeros(0)])
     corners = start.farthest(constant(rows.columns[:, : len(start.spread)]))
-    found = ByForms(rows.ends(start, cut=True)[1], slopes, corners)
+    found = ByForms(rows.uppers(start, cut=True), slopes, corners)
     if not spans:
         return found
     return found._replace(between=spans[0].bounds(directions, start, between))

@@ -83,10 +83,11 @@ class Sketch:
         if offsets is None:
             raise ValueError("sets in between samples must be asked for, but none were")
         if 0 in times:
-            return [value(self.X0)]
+            return [value(self.X0)] * len(times)
         if self.facets.steps is not None or not is_concrete(self.facets):
             return [value(self._region(offsets, t)) for t in times]
-        some = offsets if len(times) == len(offsets) else offsets[np.array(times) - 1]
+        every = list(times) == list(range(1, len(offsets) + 1))
+        some = offsets if every else offsets[np.array(times) - 1]
         return [jax.vmap(lambda each: value(self.facets.polytope(each)))(some)]
 
 

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from reachjax.loops.scenarios import Runs, Scenarios
 from reachjax.methods.cell_tree import CellTree, Node
 from reachjax.methods.ladder import Ladder
-from reachjax.methods.searches import Bar, CellJobs
+from reachjax.methods.searches import Bar, CellJobs, UnsentError
 from reachjax.methods.steps import boxed
 from reachjax.numerics.budget import ENDLESS
 from reachjax.numerics.checks import wrapped
@@ -62,6 +62,7 @@ def rechecked(
 
     Raises:
         DisagreementError: it says what is not proved.
+        UnsentError: the executor's processes cannot be sent the loop.
         ValueError: the progress bar leaves out cells.
     """
     assert verdict.asked is not None
@@ -79,7 +80,7 @@ def rechecked(
                 findings.prove(item, *proof.margins[item.name, item.time])
             left_out = proof.left_out
             more |= {"grounds": grounds, "recurrence": proof.recurrence}
-    except DisagreementError:
+    except (DisagreementError, UnsentError):
         raise
     except Exception as error:  # what is read may be of any shape and size
         raise DisagreementError(f"the recheck of the verdict proves nothing: {error}") from error
@@ -148,6 +149,8 @@ def _over_cells(
     left = len(cells)
     with closing(_of_cells(asked, cells, grounds, executor)) as given:
         for _ in wrapped(progress, list(range(len(cells)))):  # whatever a bar passes on
+            if not left:
+                break
             margins = next(given)
             left -= 1
             for key, (least, holds) in found.items():

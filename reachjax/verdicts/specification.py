@@ -10,11 +10,13 @@ Goals and sets to avoid may be those of some times only.
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -96,7 +98,7 @@ def _in_units(goal: Mapping[Any, Any], horizon: int, period: float | None) -> It
 
     Raises:
         TypeError: the plant is one in discrete time, or a span is no pair of numbers.
-        ValueError: a time is no sample, or beyond the horizon.
+        ValueError: a time is no sample, or beyond the horizon, or the period is traced.
     """
     for when, region in goal.items():
         if not isinstance(when, float | tuple):
@@ -105,6 +107,12 @@ def _in_units(goal: Mapping[Any, Any], horizon: int, period: float | None) -> It
             raise TypeError(
                 f"goal names {when}, a time in a plant's units, but the plant is one in discrete "
                 "time: name steps, or ranges of them"
+            )
+        if math.isnan(period):
+            raise ValueError(
+                f"goal names {when}, a time in the plant's units, but its period is traced, so "
+                "that nobody can say which sample that is: name steps, goal={2: G}, or make the "
+                "plant outside of the function that is compiled"
             )
         given = when if isinstance(when, tuple) else (when, when)
         if len(given) != 2 or not all(isinstance(each, float | int) for each in given):
@@ -308,14 +316,15 @@ def of_tube(tube: ReachTube, **required: Any) -> list[Requirement]:
 
 
 def period_of(loop: ClosedLoop) -> float | None:
-    """The period of a plant in continuous time, where it is known; None in discrete time.
+    """The period of a plant in continuous time, NaN where it is not known; None in discrete time.
 
-    Traced ones count as one unit of time.
+    A period of which a derivative is taken is known.
     """
     plant: Any = loop.plant
     if not plant.continuous:
         return None
-    return float(plant.period) if is_concrete(plant.period) else 1.0
+    period = jax.lax.stop_gradient(plant.period)
+    return float(period) if is_concrete(period) else math.nan
 
 
 def requirements(
@@ -530,7 +539,7 @@ def missing(
 
 
 def _alike(required: Sequence[Requirement]) -> Iterable[list[Requirement]]:
-    """Requirements that differ in their times alone; of the initial set, each for itself."""
+    """Requirements that differ in their times alone, those of the initial set apart."""
     found: dict[Any, list[Requirement]] = {}
     for item in required:
         key = id(item.region), item.inside, item.throughout, item.time == 0

@@ -149,16 +149,91 @@ def test_derivatives_outside_of_compiled_code_are_compiled_once_and_apart():
         loop = rj.ClosedLoop(FIELD, turning(weights))
         return rj.volume_penalty(loop, START, STEPS, TEMPLATES["one"])
 
-    within, before = (
-        unrolled_at_once._within._cache_size(),
-        unrolled_at_once._with_pullback._cache_size(),
-    )
+    alone = unrolled_at_once._with_pullback[1]
+    within, before = unrolled_at_once._within._cache_size(), alone._cache_size()
     slopes = [jax.grad(penalty)(k * WEIGHTS) for k in (1.0, 1.1)]
     assert unrolled_at_once._within._cache_size() == within
-    assert unrolled_at_once._with_pullback._cache_size() <= before + 1
+    assert alone._cache_size() <= before + 1
     assert not np.allclose(*slopes)
     many = jax.vmap(jax.grad(penalty))(np.stack([WEIGHTS, 1.1 * WEIGHTS]))
     np.testing.assert_allclose(many, np.stack(slopes), rtol=1e-9, atol=1e-12)
     for other in (jax.hessian, jax.jacfwd):
         with pytest.raises(TypeError, match="first derivatives only"):
             other(penalty)(WEIGHTS)
+
+
+def scaled(scale, gain):
+    """A loop `x+ = scale x + gain x`, and the penalty of its sets' sizes."""
+    net = rj.MLP.from_layers([([[gain]], [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant(jnp.array([[1.0]]) * scale, [[1.0]]), net)
+    return rj.volume_penalty(loop, rj.Box([1.0], [2.0]), 2, rj.Template.box(1))
+
+
+def test_a_derivative_within_a_derivative_is_held_or_refused():
+    """As JAX has it for other functions, whose code takes no compiler's options."""
+
+    def steered(scale):
+        inner = jax.lax.stop_gradient(jax.grad(scaled, 1)(scale, -0.4))
+        return scaled(scale, -0.4 + 0.0 * inner)
+
+    expected = jax.jit(jax.grad(scaled))(1.1, -0.4)
+    assert float(jax.grad(steered)(1.1)) == pytest.approx(float(expected), rel=1e-12)
+    valued = jax.grad(lambda scale: jax.value_and_grad(partial(scaled, scale))(-0.4)[0])
+    assert float(valued(1.1)) == pytest.approx(float(expected), rel=1e-12)
+    with pytest.raises(TypeError, match="first derivatives only"):
+        jax.grad(lambda scale: jax.grad(partial(scaled, scale))(-0.4))(1.1)
+
+
+def test_a_pullback_may_be_used_in_compiled_code():
+    _, pull = jax.vjp(partial(scaled, 1.1), -0.4)
+    slope = float(pull(1.0)[0])
+    assert float(jax.jit(pull)(1.0)[0]) == pytest.approx(slope, rel=1e-12)
+    many = jax.lax.map(lambda above: pull(above)[0], jnp.arange(3.0))
+    np.testing.assert_allclose(many, slope * np.arange(3.0), rtol=1e-12)
+
+
+def test_numbers_that_a_plant_closes_over_have_derivatives():
+    def penalty(scale, gain):
+        plant = rj.NonlinearPlant(lambda x, u: scale * x + u + 0.1 * jnp.sin(scale * x), 1, 1)
+        net = rj.MLP.from_layers([([[gain]], [0.0])])
+        return rj.volume_penalty(rj.ClosedLoop(plant, net), rj.Box([1.0], [2.0]), 2)
+
+    slopes = jax.grad(penalty, (0, 1))(1.1, -0.4)
+    np.testing.assert_allclose(slopes, jax.jit(jax.grad(penalty, (0, 1)))(1.1, -0.4), rtol=1e-12)
+
+
+def test_what_is_required_more_than_once_counts_more_than_once():
+    """Of one set object too, at the beginning and later, compiled and not."""
+    net = rj.MLP.from_layers([([[-0.5]], [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant([[1.0]], [[1.0]]), net)
+    near, far = rj.Box([0.0], [0.2]), rj.Box([0.0], [1.5])
+    for asked in (
+        {"avoid": {1: [near], range(1, 3): [near]}},
+        {"avoid": {range(1, 4): [far], 2: [far]}},
+        {"avoid": {0: [far, far]}},
+        {"goal": {0: near, 3: near}, "safe": near},
+    ):
+
+        def penalty(X0, asked=asked):
+            return rj.specification_penalty(loop, X0, 3, rj.Template.box(1), **asked)
+
+        X0 = rj.Box([1.0], [2.0])
+        plain = float(penalty(X0))
+        assert float(jax.jit(penalty)(X0)) == pytest.approx(plain, rel=1e-9, abs=1e-9)
+        assert float(jax.value_and_grad(penalty)(X0)[0]) == pytest.approx(plain, rel=1e-9, abs=1e-9)
+
+
+def test_times_in_units_of_a_traced_period_are_known_or_an_error():
+    """Read by another period a goal would be that of another sample."""
+
+    def penalty(gain, period):
+        net = rj.MLP.from_layers([([[gain]], [0.0])])
+        plant = rj.SampledPlant(lambda x, u: -0.1 * x + 0.0 * u, 1, 1, period=period)
+        loop, X0 = rj.ClosedLoop(plant, net), rj.Box([1.0], [2.0])
+        return rj.specification_penalty(loop, X0, 4, goal={1.0: rj.Box([0.0], [0.5])})
+
+    plain = float(penalty(-0.4, 0.5))
+    assert plain > 1.0
+    assert float(jax.value_and_grad(penalty, 1)(-0.4, 0.5)[0]) == pytest.approx(plain, rel=1e-3)
+    with pytest.raises(ValueError, match=r"names 1\.0, a time in the plant's units.*name steps"):
+        jax.jit(penalty)(-0.4, 0.5)

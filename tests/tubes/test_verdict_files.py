@@ -106,8 +106,12 @@ def test_cells_are_proved_anew_by_processes_as_they_are_here(tmp_path):
         forged(path, verdict, asked=tighter.asked)
         with pytest.raises(rj.DisagreementError, match="does not bear that out"):
             rj.load(path, recheck=True, executor=pool)
+        loop, verdict = decided("in between samples")
+        verdict.save(path)
+        with pytest.raises(TypeError, match="executor sends the loop to other processes"):
+            rj.load(path, loop, recheck=True, executor=pool)
     with pytest.raises(TypeError, match="executor must be an object with a method submit"):
-        rj.load(path, recheck=True, executor=2)
+        rj.load(path, loop, recheck=True, executor=2)
 
 
 @pytest.mark.parametrize("count", ["2", "0"])

@@ -300,11 +300,13 @@ class Compiled:
     def __call__(self, *given: Any, **static: Any) -> Any:
         """The value, of arguments whose constants are computed."""
         given, static = with_constants(given), with_constants(static)
-        if not is_staged():
-            if is_concrete(given, static):
-                return self._alone(*given, **static)
-            if self._in_reverse and is_concrete(jax.tree.map(_primal, (given, static))):
-                return self._differentiated(given, static)
+        if is_staged():
+            return self._within(*given, **static)
+        if is_concrete(given, static):
+            return self._alone(*given, **static)
+        known = is_concrete(jax.tree.map(_primal, (given, static)))
+        if self._in_reverse and known and not _close_over_traced(given):
+            return self._differentiated(given, static)
         return self._within(*given, **static)
 
     def _differentiated(self, given: tuple[Any, ...], static: dict[str, Any]) -> Any:
@@ -319,20 +321,20 @@ class Compiled:
             for own in (True, False)
         )
 
-        @jax.custom_vjp
-        def value(moving: list[Any]) -> Any:
-            return self._with_pullback(moving, held, form)[0]
+        def forward(moving: list[Any]) -> tuple[Any, Any]:
+            return self._with_pullback[_is_alone(moving)](moving, held, form)
 
-        def slopes(pull: Any, above: Any) -> tuple[list[Any]]:
+        def backward(pull: Any, above: Any) -> tuple[list[Any]]:
             floats = [each for each in jax.tree.leaves(above) if each.dtype != jax.dtypes.float0]
-            return (self._pulled_back(pull, floats),)
+            return (self._pulled_back[_is_alone((pull, floats))](pull, floats),)
 
-        value.defvjp(lambda moving: self._with_pullback(moving, held, form), slopes)
+        value = jax.custom_vjp(lambda moving: forward(moving)[0])
+        value.defvjp(forward, backward)
         return value(moving)
 
     @functools.cached_property
-    def _with_pullback(self) -> Any:
-        """The value, and the pullback of its floats to the leaves that move."""
+    def _with_pullback(self) -> tuple[Any, Any]:
+        """The value, and the pullback of its floats to the leaves that move: within, and alone."""
 
         def with_pullback(
             moving: list[Any], held: list[Any], form: tuple[Any, Any]
@@ -348,15 +350,17 @@ class Compiled:
             _, pull, found = jax.vjp(of, moving, has_aux=True)
             return found, pull
 
-        return jax.jit(
-            with_pullback, static_argnames="form", compiler_options=self._compiler_options
-        )
+        return self._compiled_twice(with_pullback, static_argnames="form")
 
     @functools.cached_property
-    def _pulled_back(self) -> Any:
-        """A pullback, applied to slopes of the floats of a value."""
-        own = self._compiler_options
-        return jax.jit(lambda pull, floats: pull(floats)[0], compiler_options=own)
+    def _pulled_back(self) -> tuple[Any, Any]:
+        """A pullback, applied to slopes of the floats of a value: within, and alone."""
+        return self._compiled_twice(lambda pull, floats: pull(floats)[0])
+
+    def _compiled_twice(self, function: Callable[..., Any], **options: Any) -> tuple[Any, Any]:
+        """A function for code within other code, and for code that is not."""
+        alone = jax.jit(function, compiler_options=self._compiler_options, **options)
+        return jax.jit(function, **options), alone
 
     def lower(self, *given: Any, **static: Any) -> Any:
         """What is compiled for such arguments."""
@@ -365,6 +369,18 @@ class Compiled:
     def _cache_size(self) -> int:
         each: Any = self._within, self._alone
         return sum(one._cache_size() for one in each)
+
+
+def _is_alone(tree: Any) -> bool:
+    """Whether numbers are known, and what is computed of them now is no part of other code."""
+    return is_concrete(tree) and not is_staged()
+
+
+def _close_over_traced(tree: Any) -> bool:
+    """Whether a function in a tree closes over traced numbers, which are no leaves of it."""
+    parts = jax.tree.leaves(tree, is_leaf=lambda part: isinstance(part, Function))
+    functions = (part for part in parts if isinstance(part, Function))
+    return any(each.structure.trace.described is None for each in functions)
 
 
 def _primal(leaf: Any) -> Any:

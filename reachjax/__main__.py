@@ -40,7 +40,7 @@ def _count(word: str) -> int:
 
 
 def _workers(count: int) -> AbstractContextManager[ProcessPoolExecutor | None]:
-    """So many processes, none for one: they begin anew, for JAX's threads cannot be forked."""
+    """An executor of new processes, as JAX's threads cannot be forked; none for one."""
     if count == 1:
         return nullcontext()
     return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"))

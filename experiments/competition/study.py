@@ -137,7 +137,7 @@ def _decided(
 
 
 def rechecked(title: str, settings: Settings) -> Iterator[dict]:
-    """The seconds in which a verdict's file is proved anew, in a process of its own."""
+    """The seconds in which a verdict's file is proved anew, in a new process and its workers."""
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", None)
     loop = loop_of(title, settings)

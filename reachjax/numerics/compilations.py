@@ -173,7 +173,7 @@ def compiler_options() -> dict[str, Any]:
     It runs as fast as without them, and steps of training are compiled in half the time, where
     they are compiled for processors; for other devices there are none, nor where the installed XLA
     knows them no more. `rj.train` uses them, and so do calls on known numbers that are not within
-    transformations of JAX.
+    transformations of JAX, and derivatives of bounds by forms outside of compiled code.
 
     Returns:
         What `jax.jit` takes as its `compiler_options`, outermost: within other code they are an

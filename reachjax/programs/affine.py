@@ -234,15 +234,16 @@ class AffineForms(AbstractNumber):
         return met(self.ends_by_form(start, cut), by_interval)
 
     def uppers(self, start: InitialColumns, cut: bool = False) -> Any:
-        """The upper bounds of `ends`; arguments are the same. Sketches have them at half the price.
+        """The upper bounds of `ends`, where nothing is proved at half the price.
 
-        Where nothing is proved, lower bounds need not be known to keep these above them.
+        Those of a number and of its negative are never those of an empty interval, as of `met`.
         """
-        if is_counted() or not start.curved or start.round or (cut and start.cut is not None):
+        if is_counted():
             return self.ends(start, cut)[1]
-        own = start.count
-        above = self.rows[:, 0] + start.highest(self.rows[:, 2 : 2 + own]) + self.rest(own)
-        return smaller(above + self.off, self.ends_by_interval()[1])
+        center, own = self.rows[:, 0], start.count
+        above = center + start.uppers(self.rows[:, 2 : 2 + own], cut) + self.rest(own) + self.off
+        least, most = self.ends_by_interval()
+        return larger(smaller(above, most), larger(smaller(center, most), least))
 
     def ends_by_form(self, start: InitialColumns, cut: bool = False) -> Ends:
         """Lower and upper bounds `(k,)` by forms alone."""

@@ -128,21 +128,17 @@ class InitialColumns(Replaceable):
         products = mixed * np.where(i == j, 0.25, 1.0)
         return (one * other).sum(axis=1) / 2, products
 
-    def highest(self, rows: Rows) -> Any:
-        """Upper bounds of each row over all columns of a box, products among them; rounded."""
-        return _highest(rows, self.pairs)
-
     def curved_ends(self, rows: Rows) -> Ends:
         """Bounds of each row over all columns, products among them, by the formulas above."""
         n, counted = self.spread.shape[1], is_counted()
         if not self.round and not counted:  # the norm is no better
-            both = self.highest(namespace(rows).concatenate([rows, -rows]))
+            both = _highest(namespace(rows).concatenate([rows, -rows]), self.pairs)
             return -both[len(rows) :], both[: len(rows)]
         error = errors(lambda: gamma(4 * rows.shape[1] + 16) * abs(rows).sum(axis=1))
         rest = abs(rows[:, n:]).sum(axis=1)
         below, above = self.ends(rows[:, :n])
         if not self.round:
-            both = self.highest(namespace(rows).concatenate([rows, -rows]))
+            both = _highest(namespace(rows).concatenate([rows, -rows]), self.pairs)
             above = smaller(above + rest, both[: len(rows)])
             below = larger(below - rest, -both[len(rows) :])
         else:
@@ -164,6 +160,12 @@ class InitialColumns(Replaceable):
             return lower, upper
         products = abs(rows[:, w:]).sum(axis=1) * (1 + gamma(rows.shape[1]))
         return met(self.curved_ends(rows), (lower - products, upper + products))
+
+    def uppers(self, rows: Rows, cut: bool = False) -> Any:
+        """The upper bounds of `bounds`: where nothing is proved a box asks for no lower ones."""
+        if is_counted() or not self.curved or self.round or (cut and self.cut is not None):
+            return self.bounds(rows, cut)[1]
+        return _highest(rows, self.pairs)
 
     def attaining(self, rows: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k n"]:
         """The columns where each row is largest as `bounds` has it, whatever the cut; in numpy."""

@@ -67,7 +67,8 @@ def load(
     Raises:
         FileNotFoundError: there is no such file.
         RuntimeError: JAX's 64-bit floats are off.
-        TypeError: an argument is of another kind.
+        TypeError: an argument is of another kind, or the executor's processes cannot be sent the
+            loop.
         DisagreementError: a recheck does not prove what the file says.
         UnreadableError: the file is none of reachjax, of another version, broken or changed, or a
             loop is needed.

@@ -44,9 +44,9 @@ from reachjax.verdicts.targets import values_of
 from reachjax.verdicts.verdict import Verdict, VerdictStatus
 
 AHEAD = 4
-"""So many cells an executor is given for each of its workers."""
+"""Cells that an executor is given for each of its workers."""
 
-Margins = dict[Key, tuple[float, bool]]
+MarginsByKey = dict[Key, tuple[float, bool]]
 """The least margin of each requirement that is known, and whether it surely holds."""
 
 
@@ -184,7 +184,7 @@ def _cells(X0: AbstractSet, grounds: Grounds) -> list[Node]:
 
 def _of_cells(
     asked: Asked, cells: Sequence[Node], grounds: Grounds, executor: Executor | None
-) -> Generator[Margins, None, None]:
+) -> Generator[MarginsByKey, None, None]:
     """The margins of all cells as they come, by forms in compiled calls of many where that pays."""
     task, jobs = _task(asked), CellJobs[None](executor, AHEAD)
     pays = len(cells) >= TOGETHER and all(cell.is_box for cell in cells)
@@ -208,14 +208,14 @@ def _of_cells(
 
 
 @lenient
-def _of_cell(asked: Asked, part: AbstractSet, climbs: Sequence[Climb]) -> Margins:
+def _of_cell(asked: Asked, part: AbstractSet, climbs: Sequence[Climb]) -> MarginsByKey:
     """The margins over one cell, wherever it runs."""
     with jax.enable_x64(True):
         along = None if climbs else _along_ways(asked, part)
         return _over(asked, part, climbs or (Climb(),)) if along is None else along
 
 
-def _along_ways(asked: Asked, part: AbstractSet) -> Margins | None:
+def _along_ways(asked: Asked, part: AbstractSet) -> MarginsByKey | None:
     """The margins along all ways of decisions, of a smooth loop that jumps; None if none."""
     task = _task(asked)
     outcome = outcome_of(task, part, ENDLESS) if task.follows else None
@@ -227,7 +227,7 @@ def _task(asked: Asked) -> CellTask:
     return CellTask(asked.loop, asked.horizon, asked.start, asked.required, 0)
 
 
-def _margins(asked: Asked, outcome: Outcome) -> Margins:
+def _margins(asked: Asked, outcome: Outcome) -> MarginsByKey:
     """The margins of a cell that is proved."""
     return {
         (item.name, item.time): (float(outcome.margins[item.name][item.time]), True)
@@ -235,9 +235,9 @@ def _margins(asked: Asked, outcome: Outcome) -> Margins:
     }
 
 
-def _over(asked: Asked, part: AbstractSet, climbs: Sequence[Climb]) -> Margins:
+def _over(asked: Asked, part: AbstractSet, climbs: Sequence[Climb]) -> MarginsByKey:
     """The margins over a part of the initial set, by all of the climbs."""
-    loop, found = asked.loop, Margins()
+    loop, found = asked.loop, MarginsByKey()
     around = jax.device_get(boxed(jax.device_put(part), "X0"))
     scenarios = Scenarios.of(loop, part, asked.horizon, asked.start)
     between = any(item.throughout for item in asked.required)

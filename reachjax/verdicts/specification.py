@@ -111,8 +111,8 @@ def _in_units(goal: Mapping[Any, Any], horizon: int, period: float | None) -> It
         if math.isnan(period):
             raise ValueError(
                 f"goal names {when}, a time in the plant's units, but its period is traced, so "
-                "that nobody can say which sample that is: name steps, goal={2: G}, or make the "
-                "plant outside of the function that is compiled"
+                "that nobody can say which sample that is: make the plant outside of the function "
+                "that is compiled, or name a step, goal={2: G}"
             )
         given = when if isinstance(when, tuple) else (when, when)
         if len(given) != 2 or not all(isinstance(each, float | int) for each in given):

@@ -149,11 +149,14 @@ def test_derivatives_outside_of_compiled_code_are_compiled_once_and_apart():
         loop = rj.ClosedLoop(FIELD, turning(weights))
         return rj.volume_penalty(loop, START, STEPS, TEMPLATES["one"])
 
-    alone = unrolled_at_once._with_pullback[1]
-    within, before = unrolled_at_once._within._cache_size(), alone._cache_size()
+    forms = unrolled_at_once
+    alone = forms._with_pullback[1], forms._pulled_back[1]
+    within = forms._within, forms._with_pullback[0], forms._pulled_back[0]
+    before = [[each._cache_size() for each in some] for some in (alone, within)]
     slopes = [jax.grad(penalty)(k * WEIGHTS) for k in (1.0, 1.1)]
-    assert unrolled_at_once._within._cache_size() == within
-    assert alone._cache_size() <= before + 1
+    assert all(each._cache_size() <= k + 1 for each, k in zip(alone, before[0], strict=True))
+    assert [each._cache_size() for each in within] == before[1]
+    np.testing.assert_allclose(jax.jacrev(penalty)(WEIGHTS), slopes[0], rtol=1e-9, atol=1e-12)
     assert not np.allclose(*slopes)
     many = jax.vmap(jax.grad(penalty))(np.stack([WEIGHTS, 1.1 * WEIGHTS]))
     np.testing.assert_allclose(many, np.stack(slopes), rtol=1e-9, atol=1e-12)
@@ -235,5 +238,27 @@ def test_times_in_units_of_a_traced_period_are_known_or_an_error():
     plain = float(penalty(-0.4, 0.5))
     assert plain > 1.0
     assert float(jax.value_and_grad(penalty, 1)(-0.4, 0.5)[0]) == pytest.approx(plain, rel=1e-3)
-    with pytest.raises(ValueError, match=r"names 1\.0, a time in the plant's units.*name steps"):
+    with pytest.raises(ValueError, match=r"names 1\.0, a time in the plant's units.*name a step"):
         jax.jit(penalty)(-0.4, 0.5)
+
+
+@pytest.mark.parametrize("spread", [[0.0, 0.0], [0.1, 0.0]], ids=["point", "flat"])
+def test_sketches_of_flat_sets_are_not_empty(spread):
+    """Bounds of a number by forms and by intervals may miss one another by a rounding."""
+    start = rj.Box([0.1, -0.3], np.add([0.1, -0.3], spread))
+
+    def bounds(weights):
+        loop = rj.ClosedLoop(FIELD, turning(weights))
+        safe = rj.Box([-0.01, -0.01], [0.01, 0.01])
+        asked = {"safe": safe, "avoid": [rj.Box([-1.0, -1.0], [1.0, 1.0])]}
+        return rj.specification_penalty(loop, start, 12, rj.Template.box(2), **asked)
+
+    loop = rj.ClosedLoop(FIELD, turning(WEIGHTS))
+    runs = np.asarray(loop.simulate(start.corners(), 12))
+    for value, slopes in (
+        jax.value_and_grad(bounds)(WEIGHTS),
+        jax.jit(jax.value_and_grad(bounds))(WEIGHTS),
+    ):
+        assert np.isfinite(value)
+        assert np.isfinite(slopes).all()
+        assert float(value) >= np.maximum(0.0, abs(runs).max(axis=0) - 0.01).sum()

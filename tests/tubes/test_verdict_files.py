@@ -5,7 +5,8 @@ import json
 import multiprocessing
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +98,6 @@ def test_cells_are_proved_anew_by_processes_as_they_are_here(tmp_path):
         here, there = rj.load(path, recheck=True), rj.load(path, recheck=True, executor=pool)
         for name, margins in here.margins.items():
             np.testing.assert_array_equal(margins, there.margins[name])
-        assert there.proved
         grounds = verdict.grounds
         forged(path, verdict, grounds=grounds._replace(climbs=grounds.climbs[:-1]))
         with pytest.raises(rj.DisagreementError, match="5 proofs"):
@@ -114,19 +114,34 @@ def test_cells_are_proved_anew_by_processes_as_they_are_here(tmp_path):
         rj.load(path, loop, recheck=True, executor=2)
 
 
-@pytest.mark.parametrize("count", ["2", "0"])
-def test_a_command_takes_processes(count, tmp_path):
-    decided("grid")[1].save(tmp_path / "a.verdict")
+def test_many_cells_are_proved_anew_in_threads(tmp_path):
+    """Some in a batch, as far as that pays, and the others one by one."""
+    loop, path = rectified(), tmp_path / "a.verdict"
+    rj.decide(loop, X0, STEPS, goal=around(loop, 0.1), cells=(6, 7)).save(path)
+    with ThreadPoolExecutor(2) as pool:
+        here, there = rj.load(path, recheck=True), rj.load(path, recheck=True, executor=pool)
+        for name, margins in here.margins.items():
+            np.testing.assert_allclose(margins, there.margins[name], rtol=1e-12)
+        with pytest.raises(ValueError, match="but 41 did not arrive"):
+            rj.load(path, recheck=True, executor=pool, progress=lambda cells: list(cells)[:1])
+        rj.load(path, recheck=True, executor=pool, progress=lambda cells: [*cells, 0])
+
+
+@pytest.mark.parametrize(
+    ("count", "said"),
+    [
+        ("2", "executor sends the loop to other processes"),  # they cannot find a lambda
+        ("0", "must be a whole number from 1 on, but 0 arrived"),
+    ],
+)
+def test_a_command_takes_processes(count, said, tmp_path):
+    decided("in between samples")[1].save(tmp_path / "a.verdict")
     command = [sys.executable, "-m", "reachjax", "recheck", tmp_path / "a.verdict"]
-    done = subprocess.run(
-        [*command, "--processes", count], capture_output=True, text=True, check=False
-    )
-    if count == "0":
-        assert done.returncode == 2
-        assert "must be a whole number from 1 on, but 0 arrived" in done.stderr
-    else:
-        assert done.returncode == 0
-        assert "PROVED" in done.stdout
+    command += ["--loop", "tests.tubes.test_verdict_files:swung", "--processes", count]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
+    assert done.returncode != 0
+    assert said in done.stderr
 
 
 def test_a_recheck_solves_and_searches_nothing(tmp_path, monkeypatch):

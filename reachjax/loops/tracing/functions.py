@@ -367,7 +367,7 @@ class Compiled:
         return self._alone.lower(*with_constants(given), **with_constants(static))
 
     def _cache_size(self) -> int:
-        each: Any = self._within, self._alone
+        each: Any = self._within, self._alone, *self._with_pullback, *self._pulled_back
         return sum(one._cache_size() for one in each)
 
 
@@ -389,7 +389,7 @@ def _primal(leaf: Any) -> Any:
 
 
 def _floats(tree: Any) -> list[Any]:
-    """What of a tree derivatives are taken of."""
+    """The floats of a tree, of which derivatives are taken."""
     kinds = ((leaf, jnp.result_type(leaf)) for leaf in jax.tree.leaves(tree))
     return [leaf for leaf, kind in kinds if jnp.issubdtype(kind, jnp.floating)]
 

@@ -112,7 +112,7 @@ def _in_units(goal: Mapping[Any, Any], horizon: int, period: float | None) -> It
             raise ValueError(
                 f"goal names {when}, a time in the plant's units, but its period is traced, so "
                 "that nobody can say which sample that is: make the plant outside of the function "
-                "that is compiled, or name a step, goal={2: G}"
+                "that is compiled and close over it, or name a step, goal={2: G}"
             )
         given = when if isinstance(when, tuple) else (when, when)
         if len(given) != 2 or not all(isinstance(each, float | int) for each in given):
@@ -323,7 +323,9 @@ def period_of(loop: ClosedLoop) -> float | None:
     plant: Any = loop.plant
     if not plant.continuous:
         return None
-    period = jax.lax.stop_gradient(plant.period)
+    period = plant.period
+    if not is_concrete(period):  # within compiled code a held number that is known is traced
+        period = jax.lax.stop_gradient(period)
     return float(period) if is_concrete(period) else math.nan
 
 

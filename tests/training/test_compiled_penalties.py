@@ -229,15 +229,21 @@ def test_what_is_required_more_than_once_counts_more_than_once():
 def test_times_in_units_of_a_traced_period_are_known_or_an_error():
     """Read by another period a goal would be that of another sample."""
 
+    def plant_of(period):
+        return rj.SampledPlant(lambda x, u: -0.1 * x + 0.0 * u, 1, 1, period=period)
+
+    known = plant_of(0.5)
+
     def penalty(gain, period):
         net = rj.MLP.from_layers([([[gain]], [0.0])])
-        plant = rj.SampledPlant(lambda x, u: -0.1 * x + 0.0 * u, 1, 1, period=period)
+        plant = known if period is None else plant_of(period)
         loop, X0 = rj.ClosedLoop(plant, net), rj.Box([1.0], [2.0])
         return rj.specification_penalty(loop, X0, 4, goal={1.0: rj.Box([0.0], [0.5])})
 
     plain = float(penalty(-0.4, 0.5))
     assert plain > 1.0
     assert float(jax.value_and_grad(penalty, 1)(-0.4, 0.5)[0]) == pytest.approx(plain, rel=1e-3)
+    assert float(jax.jit(lambda gain: penalty(gain, None))(-0.4)) == pytest.approx(plain, rel=1e-3)
     with pytest.raises(ValueError, match=r"names 1\.0, a time in the plant's units.*name a step"):
         jax.jit(penalty)(-0.4, 0.5)
 

@@ -8,6 +8,7 @@ leaves out of a state is part of its radius, which gets a column.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache, reduce
 from typing import NamedTuple
 
@@ -21,6 +22,9 @@ from reachjax.numerics.numbers import split
 from reachjax.numerics.rounding import Ball, gamma, larger, namespace
 from reachjax.programs.affine import AffineForms, joined
 from reachjax.programs.initial import InitialColumns
+
+Parts = int | Sequence[int]
+"""Into how many parts steps are cut: one number, or one for each direction."""
 
 
 class Between(NamedTuple):
@@ -43,27 +47,59 @@ class Between(NamedTuple):
             directions: one row each.
             parts: a power of two, into so many each step is cut.
         """
-        fours = [joined([directions @ point for point in four]) for four in self.points]
-        if parts > 1:
-            cut = np.kron(_cut(parts), np.eye(len(directions)))
-            fours = [cut @ four for four in fours]
-        return joined(fours)
+        return self._through(directions, _cut(parts))
 
     def bounds(
-        self, directions: Float[Array | np.ndarray, "m n_x"], start: InitialColumns, parts: int = 1
+        self,
+        directions: Float[Array | np.ndarray, "m n_x"],
+        start: InitialColumns,
+        parts: Parts = 1,
     ) -> Float[Array | np.ndarray, "p m"]:
         """Upper bounds of directions at all times of each part of a period.
 
         Args:
             directions: one row each.
             start: what the first columns are.
-            parts: as of `values`.
+            parts: as of `values`; or for each direction, with 0 where it is not asked for, of which
+                bounds are infinite. There are as many as the most of them.
         """
-        ends = self.values(directions, parts).uppers(start, True)
-        each = ends.reshape(-1, 4, len(directions))
-        largest = reduce(larger, (each[:, k] for k in range(4)))
+        counts = np.broadcast_to(parts, len(directions))
+        numbers, most = np.unique(counts), int(counts.max(initial=1))
+        places = [np.flatnonzero(counts == count) for count in numbers]
+        given = zip(numbers.tolist(), places, strict=True)
+        found = [self._hulls(directions[rows], start, count, most) for count, rows in given]
+        if len(found) == 1:
+            return found[0]
+        return namespace(*found).concatenate(found, axis=1)[:, np.argsort(np.concatenate(places))]
+
+    def _hulls(
+        self,
+        directions: Float[Array | np.ndarray, "m n_x"],
+        start: InitialColumns,
+        parts: int,
+        most: int,
+    ) -> Float[Array | np.ndarray, "p m"]:
+        """The same of directions of the same parts, each given so often that there are the most."""
+        steps, m = len(self.points), len(directions)
+        if not parts:
+            return np.full((steps * most, m), np.inf)
+        ends = self._through(directions, _points(parts)).uppers(start, True)
+        points = ends.reshape(steps, 3 * parts + 1, m)
+        fours = [points[:, k : k + 3 * parts - 2 : 3].reshape(-1, m) for k in range(4)]
         xp = namespace(ends)
-        return xp.where(xp.isnan(each).any(axis=1), xp.inf, largest)
+        unknown = reduce(xp.logical_or, map(xp.isnan, fours))
+        largest = xp.where(unknown, xp.inf, reduce(larger, fours))
+        return xp.repeat(largest, most // parts, axis=0)
+
+    def _through(
+        self, directions: Float[Array | np.ndarray, "m n_x"], cut: Float[np.ndarray, "p 4"]
+    ) -> AffineForms:
+        """Forms of directions at what a matrix makes of the four points of each step."""
+        fours = [joined([directions @ point for point in four]) for four in self.points]
+        if len(cut) > 4:
+            each = np.kron(cut, np.eye(len(directions)))
+            fours = [each @ four for four in fours]
+        return joined(fours)
 
 
 @lru_cache
@@ -80,6 +116,12 @@ def _cut(parts: int) -> Float[np.ndarray, "p 4"]:
         first[k] = half[0]
         half = (half[:-1] + half[1:]) / 2
     return np.vstack([_cut(parts // 2) @ first, _cut(parts // 2) @ first[::-1, ::-1]])
+
+
+@lru_cache
+def _points(parts: int) -> Float[np.ndarray, "p 4"]:
+    """The same of which each is there once: a part begins where the one before it ends."""
+    return np.vstack([_cut(parts)[:1], np.delete(_cut(parts), np.s_[::4], axis=0)])
 
 
 def flowed_forms(

@@ -24,7 +24,7 @@ from reachjax.numerics.pytrees import unchecked
 from reachjax.numerics.rounding import is_counted, rounding
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.affine_steps import UnitForms, step_columns, step_forms
-from reachjax.programs.flows import Between
+from reachjax.programs.flows import Between, Parts
 from reachjax.programs.followed import NoStatesError, OpenDecision, Way, ways
 from reachjax.programs.initial import InitialColumns, SubboxColumns, constant
 from reachjax.programs.merging import merged_columns
@@ -89,7 +89,7 @@ def unrolled(
     t: int = 0,
     slopes: Float[np.ndarray, "N units"] | None = None,
     known: Sequence[Box] | None = None,
-    between: int = 0,
+    between: Parts = 0,
     most: int = 1,
     wanted: Float[np.ndarray, "N m"] | None = None,
 ) -> Iterator[ByForms]:
@@ -104,7 +104,8 @@ def unrolled(
         slopes: of lines for the units of each step, of which any are sound; None for good ones.
         known: boxes that surely hold the states after each step, where they are known.
         between: into how many parts, a power of two, the steps of a differential equation are cut,
-            in each of which bounds at all times are asked for; 0 if none are.
+            in each of which bounds at all times are asked for; 0 if none are. Or for each
+            direction: where it is 0 for one and not for all, the bounds are infinite.
         most: along how many ways of its decisions a loop that jumps is followed.
         wanted: for each step, bounds of the directions below which nothing is gained; None for
             bounds that are as good as they can be.
@@ -167,7 +168,7 @@ def along_ways(
     t: int = 0,
     slopes: Float[np.ndarray, "N units"] | None = None,
     known: Sequence[Box] | None = None,
-    between: int = 0,
+    between: Parts = 0,
     most: int = 1,
     wanted: Float[np.ndarray, "N m"] | None = None,
 ) -> Iterator[list[ByForms]]:
@@ -178,7 +179,7 @@ def along_ways(
     loop, X0, box, known = map(in_numpy, (loop, X0, box, known))
     with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
         start = InitialColumns.of(X0, box, loop.curved)
-    given = loop, start, len(directions), t, most, between > 0, slopes, known
+    given = loop, start, len(directions), t, most, bool(np.any(between)), slopes, known
     for k, found in enumerate(ways(*given)):
         rows = np.asarray(directions[k])
         enough = np.full(len(rows), -np.inf) if wanted is None else wanted[k]
@@ -195,7 +196,7 @@ def _of_way(
     rows: Float[np.ndarray, "m n_x"],
     start: InitialColumns,
     wanted: Float[np.ndarray, " m"],
-    between: int,
+    between: Parts,
 ) -> ByForms:
     """What one way says of the states after a step.
 
@@ -270,7 +271,7 @@ def unrolled_at_once(
     box: Box,
     directions: Float[Array, "N m n_x"],
     t: int = 0,
-    between: int = 0,
+    between: Parts = 0,
     counted: bool = True,
     columns: int | None = None,
 ) -> ByForms:
@@ -300,7 +301,7 @@ def _at_once(
     box: Box,
     directions: Float[Array, "N m n_x"],
     t: int,
-    between: int,
+    between: Parts,
     columns: int | None,
 ) -> ByForms:
     """Bounds for all steps, as one scan."""
@@ -317,7 +318,7 @@ def _at_once(
     def advance(state: AffineForms, step: tuple[Array, Array]) -> tuple[AffineForms, ByForms]:
         k, rows = step
         place = first + (kept if merges else k * more)
-        spans = [] if between else None
+        spans = [] if np.any(between) else None
         given = loop, state, t + k, start
         state, units, _ = step_forms(*given, place=place, spans=spans, few=few)
         found = _bounds(rows, state, units, start, spans, between)
@@ -336,7 +337,7 @@ def unrolled_from_boxes(
     whole: Bool[Array, "N m"] | None = None,
     t: int = 0,
     columns: int | None = None,
-    between: int = 1,
+    between: Parts = 0,
 ) -> Float[Array, "c N p m"]:
     """Upper bounds of directions after 1, ..., N steps from each of many boxes, in one call.
 
@@ -348,7 +349,7 @@ def unrolled_from_boxes(
         whole: which of them are bounded at all times since the sample before; None for none.
         t: the time of the boxes.
         columns: as of `unrolled_at_once`; None for as many as a dozen steps add.
-        between: into how many parts steps are cut for these.
+        between: as of `unrolled`, of these.
 
     Returns:
         The bounds in each part of a period; of what is bounded at samples the same in all.
@@ -357,9 +358,7 @@ def unrolled_from_boxes(
 
     def one(lower: Float[Array, " n_x"], upper: Float[Array, " n_x"]) -> Float[Array, "N p m"]:
         box = Box(lower, upper)
-        found = unrolled_at_once(
-            loop, box, box, directions, t, 0 if whole is None else between, columns=most
-        )
+        found = unrolled_at_once(loop, box, box, directions, t, between, columns=most)
         offsets = found.offsets[:, None]
         return offsets if whole is None else jnp.where(whole[:, None], found.between, offsets)
 
@@ -372,7 +371,7 @@ def _bounds(
     units: tuple[UnitForms, ...],
     start: InitialColumns,
     spans: Sequence[Between] | None,
-    between: int,
+    between: Parts,
 ) -> ByForms:
     rows = directions @ state
     xp = jnp if isinstance(rows.rows, jax.Array) else np

@@ -22,7 +22,7 @@ from reachjax.numerics.pytrees import Replaceable
 from reachjax.programs.unrolled import unrolled_at_once
 from reachjax.sets import Box
 from reachjax.verdicts.facet_rows import FacetRowsByTime
-from reachjax.verdicts.specification import Requirement, parts_of_periods
+from reachjax.verdicts.specification import Requirement
 
 BETWEEN = 4
 """So many states of a period are simulated where requirements hold at all times."""
@@ -124,7 +124,8 @@ class Certified(Replaceable):
         """The mean over the cells."""
         loop, steps = batch.loop, batch.horizon
         with jax.ensure_compile_time_eval():  # requirements are known numbers
-            rows, directions, whole = FacetRowsByTime.of(batch.required, steps, loop.states)
+            facets = FacetRowsByTime.of(batch.required, steps, loop.states, refuting=False)
+        rows, directions, whole = facets
         limits, units = np.zeros(whole.shape), np.ones(whole.shape)
         inside, outside = np.zeros(whole.shape, bool), dict[tuple[int, int], Any]()
         for each in rows:
@@ -134,14 +135,13 @@ class Certified(Replaceable):
                 inside[here] = True
             else:
                 outside.setdefault(ends, np.zeros((steps + 1, 1), bool))[each.item.time] = True
-        between = parts_of_periods(batch.required)
-        kept = {"counted": False, "columns": COLUMNS_IN_TRAINING}
+        kept = {"between": facets.parts, "counted": False, "columns": COLUMNS_IN_TRAINING}
 
         def of_cell(lower: Array, upper: Array) -> Array:
             box, later = Box(lower, upper), jnp.asarray(directions[1:])
-            found = unrolled_at_once(loop, box, box, later, batch.start, between=between, **kept)
+            found = unrolled_at_once(loop, box, box, later, batch.start, **kept)
             bounds = found.offsets[:, None]
-            if between:
+            if found.between is not None:
                 bounds = jnp.where(whole[1:, None], found.between, bounds)
             first = jnp.maximum(directions[0] * lower, directions[0] * upper).sum(axis=1)
             first = jnp.broadcast_to(first, (1, *bounds.shape[1:]))

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from reachjax.sets.balance import balanced
-from reachjax.verdicts.specification import Requirement
+from reachjax.verdicts.specification import Requirement, parts_of_periods
 
 
 class FacetRows(NamedTuple):
@@ -21,28 +21,28 @@ class FacetRows(NamedTuple):
     Attributes:
         item: the requirement.
         first: the number of its first direction among those of its time.
-        directions: `(2 k, n_x)`, those that prove it, then those that refute it.
-        limits: `(2 k,)`.
+        directions: `(r, n_x)`, `k` that prove it, then those that refute it if they are asked for.
+        limits: `(r,)`.
         units: `(k,)`, what a distance of 1 in the units of the state changes the first by.
     """
 
     item: Requirement
     first: int
-    directions: Float[np.ndarray, "2k n_x"]
-    limits: Float[np.ndarray, " 2k"]
+    directions: Float[np.ndarray, "r n_x"]
+    limits: Float[np.ndarray, " r"]
     units: Float[np.ndarray, " k"]
 
     @classmethod
-    def of(cls, item: Requirement, first: int) -> FacetRows:
-        """The rows of a requirement."""
+    def of(cls, item: Requirement, first: int, refuting: bool = True) -> FacetRows:
+        """The rows of a requirement, those that refute it only if they are asked for."""
         C, d, norms = (np.asarray(part) for part in item.region.facets_in_units(item.inside))
-        facets = (np.asarray(part) for part in item.looser.facets)
-        D, e = balanced(*facets, inner=not item.inside)
         sign = 1.0 if item.inside else -1.0
-        directions, limits = (
-            np.concatenate([sign * proving, -sign * refuting])
-            for proving, refuting in ((C, D), (d, e))
-        )
+        sides = [(sign * C, sign * d)]
+        if refuting:
+            facets = (np.asarray(part) for part in item.looser.facets)
+            D, e = balanced(*facets, inner=not item.inside)
+            sides.append((-sign * D, -sign * e))
+        directions, limits = map(np.concatenate, zip(*sides, strict=True))
         return cls(item, first, directions, limits, norms)
 
     @property
@@ -59,7 +59,7 @@ class FacetRows(NamedTuple):
         """Whether it surely holds, or surely fails, and its margin.
 
         Args:
-            uppers: bounds at its time, or in each part of the period before.
+            uppers: bounds at its time, or in each part of the period before, of all its rows.
         """
         found, k = np.atleast_2d(uppers)[:, self.first : self.end], len(self.units)
         room = (self.limits - found)[:, :k] / self.units
@@ -87,18 +87,31 @@ class FacetRowsByTime(NamedTuple):
     directions: Float[np.ndarray, "h+1 m n_x"]
     whole: Bool[np.ndarray, "h+1 m"]
 
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """Into how many parts steps of a flow are cut for each direction, `(m,)`.
+
+        Zero where it is bounded at samples alone, whatever the time.
+        """
+        most = parts_of_periods(rows.item for rows in self.each)
+        return tuple(np.where(self.whole.any(axis=0), most, 0).tolist())
+
     @classmethod
-    def of(cls, required: Sequence[Requirement], horizon: int, states: int) -> FacetRowsByTime:
+    def of(
+        cls, required: Sequence[Requirement], horizon: int, states: int, refuting: bool = True
+    ) -> FacetRowsByTime:
         """The rows of requirements.
 
         Args:
             required: the requirements.
             horizon: the number of steps.
             states: of the loop.
+            refuting: whether there are those that refute them.
         """
         ends, each = np.zeros(horizon + 1, dtype=int), list[FacetRows]()
-        for item in required:
-            each.append(FacetRows.of(item, int(ends[item.time])))
+        # what is bounded at all times comes first at each, so that others are bounded at none
+        for item in sorted(required, key=lambda item: not item.throughout):
+            each.append(FacetRows.of(item, int(ends[item.time]), refuting))
             ends[item.time] = each[-1].end
         directions = np.zeros((horizon + 1, int(ends.max()), states))
         whole = np.zeros(directions.shape[:2], dtype=bool)

@@ -30,7 +30,7 @@ from reachjax.programs.unrolled import ByForms, along_ways, unrolled, unrolled_f
 from reachjax.sets import AbstractSet, Box
 from reachjax.verdicts.facet_rows import FacetRowsByTime
 from reachjax.verdicts.grounds import Leaves
-from reachjax.verdicts.specification import Requirement, parts_of_periods
+from reachjax.verdicts.specification import Requirement
 
 TOGETHER = 32
 """So many cells are a call: fewer are filled up, so that one shape is compiled."""
@@ -124,10 +124,10 @@ class Sieve:
         # what depends on parameters alone is an argument of what is compiled, and no part of it
         self._loop, self._on_host = jax.device_put(with_constants(loop)), in_numpy(loop)
         self._start = start
-        self._rows, directions, whole = FacetRowsByTime.of(required, horizon, loop.states)
+        self._rows, directions, whole = rows = FacetRowsByTime.of(required, horizon, loop.states)
         self._directions, self._later = directions, jnp.asarray(directions[1:])
         self._whole = jnp.asarray(whole[1:]) if whole.any() else None
-        self._between = parts_of_periods(required)
+        self._parts = rows.parts
 
     def pays(self, cells: Sequence[Ends], budget: Budget) -> bool:
         """Whether the compiled call is there, and faster than what these cells take one by one.
@@ -152,9 +152,9 @@ class Sieve:
         )
 
     @property
-    def _static(self) -> dict[str, int]:
+    def _static(self) -> dict[str, Any]:
         """What the compiled call is compiled for."""
-        return {"t": self._start, "between": max(self._between, 1)}
+        return {"t": self._start, "between": self._parts}
 
     @cached_property
     def _of_subnormals(self) -> bool:
@@ -166,7 +166,7 @@ class Sieve:
         box, began = in_numpy(Box(*cell)), time.perf_counter()
         try:
             given = self._on_host, box, box, self._directions[1:], self._start
-            steps = unrolled(*given, between=self._between)
+            steps = unrolled(*given, between=self._parts)
             if self._loop.plant.continuous:  # a flow costs about the same in each
                 steps = itertools.islice(steps, MEASURED)
             count = len(list(steps))
@@ -210,18 +210,16 @@ class Sieve:
         ends = np.asarray(box.lower)[None], np.asarray(box.upper)[None]
         begun = _at_first(self._directions[0], *ends)[0]
         first = ByForms(begun, np.zeros(0), np.zeros((0, 0)))
-        between = self._between
-        whole = np.asarray(self._whole) if between else np.zeros(self._later.shape[:2], bool)
         given = self._on_host, part, box, self._directions[1:], self._start
-        later = along_ways(*given, between=between, most=most)
+        later = along_ways(*given, between=self._parts, most=most)
         for k, each in enumerate(itertools.chain([[first]], later)):
             still_open |= dict.fromkeys(decision for one in each for decision in one.open)
             uppers = [np.asarray(one.offsets) for one in each]
-            if between and k:
+            if self._whole is not None and k:
                 # without states there is nothing in between them
                 inner = (one.offsets if one.between is None else one.between for one in each)
                 both = zip(map(np.asarray, inner), uppers, strict=True)
-                uppers = [np.where(whole[k - 1], *pair) for pair in both]
+                uppers = [np.where(np.asarray(self._whole[k - 1]), *pair) for pair in both]
             uppers = [upper for upper in uppers if not np.isneginf(upper).all()]  # no states
             for rows in self._rows:
                 if rows.item.time == k:

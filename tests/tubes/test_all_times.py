@@ -10,7 +10,9 @@ import pytest
 import reachjax as rj
 from reachjax.loops.batches import in_between
 from reachjax.loops.units import UnboundedError
-from reachjax.programs.unrolled import unrolled_from_boxes
+from reachjax.programs.unrolled import unrolled, unrolled_from_boxes
+from reachjax.verdicts.facet_rows import FacetRowsByTime
+from reachjax.verdicts.specification import requirements
 
 TURN = 2 * math.pi
 X0 = rj.Box([-0.01, 0.99], [0.01, 1.01])
@@ -160,6 +162,39 @@ def test_bounds_of_each_part_of_a_period_hold_the_states_in_it():
     for number, upper in enumerate(bounds.reshape(2 * parts, -1)):
         assert np.all(values[:, 4 * number : 4 * number + 5] <= upper + 1e-9)
     assert np.all(bounds.min(axis=1) < bounds.max(axis=1) - 0.9)  # the circle has a radius of one
+
+
+@pytest.mark.parametrize("loop", loops(), ids=["function", "matrices"])
+def test_directions_are_bounded_in_parts_of_their_own_or_at_samples_alone(loop):
+    axes = np.tile(np.concatenate([np.eye(2), -np.eye(2)]), (2, 1, 1))
+    every, few, some = (
+        [*unrolled(loop, X0, X0, axes, between=parts)] for parts in (8, 1, (8, 0, 1, 8))
+    )
+    for at_all, whole, mixed in zip(every, few, some, strict=True):
+        expected = np.array(at_all.between)
+        expected[:, 1] = np.inf
+        expected[:, 2] = np.repeat(whole.between, len(expected) // len(whole.between), axis=0)[:, 2]
+        np.testing.assert_allclose(mixed.between, expected, rtol=1e-12)
+        np.testing.assert_array_equal(mixed.offsets, at_all.offsets)
+
+
+def test_only_directions_that_are_meant_in_between_are_bounded_there():
+    away, box = rj.Box([2.0, 2.0], [3.0, 3.0]), rj.Box([-2.0, -2.0], [2.0, 2.0])
+    for goal in (box, {(0.5, 1.0): box}):
+        required = requirements(2, 2, 0.5, goal=goal, avoid=[away])
+        rows, proving = (
+            FacetRowsByTime.of(required, 2, 2, refuting=many) for many in (True, False)
+        )
+        asked = [rows.whole[each.item.time, each.first : each.end] for each in rows.each]
+        for each, whole in zip(rows.each, asked, strict=True):
+            assert np.all(whole == each.item.throughout)
+            if each.item.throughout:
+                assert set(rows.parts[each.first : each.end]) == {8}
+        assert rows.parts.count(0) == (8 if goal is box else 0)
+        assert len(rows.parts) == 2 * len(proving.parts)
+        for most, least in zip(rows.each, proving.each, strict=True):
+            np.testing.assert_array_equal(most.directions[: len(most.units)], least.directions)
+            np.testing.assert_array_equal(most.limits[: len(most.units)], least.limits)
 
 
 def switching(f, **options):

@@ -8,7 +8,6 @@ leaves out of a state is part of its radius, which gets a column.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache, reduce
 from typing import NamedTuple
 
@@ -23,7 +22,7 @@ from reachjax.numerics.rounding import Ball, gamma, larger, namespace
 from reachjax.programs.affine import AffineForms, joined
 from reachjax.programs.initial import InitialColumns
 
-Parts = int | Sequence[int]
+Parts = int | tuple[int, ...]
 """Into how many parts steps are cut: one number, or one for each direction."""
 
 
@@ -61,7 +60,7 @@ class Between(NamedTuple):
             directions: one row each.
             start: what the first columns are.
             parts: as of `values`; or for each direction, with 0 where it is not asked for, of which
-                bounds are infinite. There are as many as the most of them.
+                bounds are infinite. Bounds are of as many parts as the largest number says.
         """
         counts = np.broadcast_to(parts, len(directions))
         numbers, most = np.unique(counts), int(counts.max(initial=1))
@@ -79,7 +78,7 @@ class Between(NamedTuple):
         parts: int,
         most: int,
     ) -> Float[Array | np.ndarray, "p m"]:
-        """The same of directions of the same parts, each given so often that there are the most."""
+        """Upper bounds of directions that are cut alike, each repeated up to the largest number."""
         steps, m = len(self.points), len(directions)
         if not parts:
             return np.full((steps * most, m), np.inf)
@@ -96,7 +95,7 @@ class Between(NamedTuple):
     ) -> AffineForms:
         """Forms of directions at what a matrix makes of the four points of each step."""
         fours = [joined([directions @ point for point in four]) for four in self.points]
-        if len(cut) > 4:
+        if len(cut) > 4:  # else the points are these four, without a product and its rounding
             each = np.kron(cut, np.eye(len(directions)))
             fours = [each @ four for four in fours]
         return joined(fours)
@@ -120,7 +119,10 @@ def _cut(parts: int) -> Float[np.ndarray, "p 4"]:
 
 @lru_cache
 def _points(parts: int) -> Float[np.ndarray, "p 4"]:
-    """The same of which each is there once: a part begins where the one before it ends."""
+    """From the control points of a cubic to those of its equal parts, shared ones once.
+
+    A part begins where the one before it ends.
+    """
     return np.vstack([_cut(parts)[:1], np.delete(_cut(parts), np.s_[::4], axis=0)])
 
 

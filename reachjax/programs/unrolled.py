@@ -42,7 +42,7 @@ class ByForms(NamedTuple):
         drawn: for each step so far the values `(m, d)` of disturbances there; nothing of compiled
             code.
         between: `(p, m)`, upper bounds at all times of each part of the period before, if they are
-            asked for.
+            asked for; infinite for directions of which they are not.
         open: decisions of the step that may go either way, none of compiled code.
         ways: along how many ways of decisions that is so.
         moved: `(n_x,)`, how far each coordinate of the initial set moves what decides between this
@@ -337,7 +337,7 @@ def unrolled_from_boxes(
     whole: Bool[Array, "N m"] | None = None,
     t: int = 0,
     columns: int | None = None,
-    between: Parts = 0,
+    between: Parts = 1,
 ) -> Float[Array, "c N p m"]:
     """Upper bounds of directions after 1, ..., N steps from each of many boxes, in one call.
 
@@ -349,7 +349,7 @@ def unrolled_from_boxes(
         whole: which of them are bounded at all times since the sample before; None for none.
         t: the time of the boxes.
         columns: as of `unrolled_at_once`; None for as many as a dozen steps add.
-        between: as of `unrolled`, of these.
+        between: as of `unrolled`, where some are.
 
     Returns:
         The bounds in each part of a period; of what is bounded at samples the same in all.
@@ -358,7 +358,8 @@ def unrolled_from_boxes(
 
     def one(lower: Float[Array, " n_x"], upper: Float[Array, " n_x"]) -> Float[Array, "N p m"]:
         box = Box(lower, upper)
-        found = unrolled_at_once(loop, box, box, directions, t, between, columns=most)
+        parts = 0 if whole is None else between
+        found = unrolled_at_once(loop, box, box, directions, t, parts, columns=most)
         offsets = found.offsets[:, None]
         return offsets if whole is None else jnp.where(whole[:, None], found.between, offsets)
 

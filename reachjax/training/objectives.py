@@ -109,7 +109,8 @@ class Certified(Replaceable):
 
     Args:
         remainder: weight of how much wider forms are than what is simulated from the corners and
-            the middle of each cell: of that it depends into how many cells a set has to be cut.
+            the middle of each cell, on average over the directions that prove the requirements: of
+            that it depends into how many cells a set has to be cut.
 
     Raises:
         TypeError, ValueError: the weight is no number, or negative.
@@ -124,8 +125,8 @@ class Certified(Replaceable):
         """The mean over the cells."""
         loop, steps = batch.loop, batch.horizon
         with jax.ensure_compile_time_eval():  # requirements are known numbers
-            facets = FacetRowsByTime.of(batch.required, steps, loop.states, refuting=False)
-        rows, directions, whole = facets
+            by_time = FacetRowsByTime.of(batch.required, steps, loop.states, refuting=False)
+        rows, directions, whole = by_time
         limits, units = np.zeros(whole.shape), np.ones(whole.shape)
         inside, outside = np.zeros(whole.shape, bool), dict[tuple[int, int], Any]()
         for each in rows:
@@ -135,7 +136,7 @@ class Certified(Replaceable):
                 inside[here] = True
             else:
                 outside.setdefault(ends, np.zeros((steps + 1, 1), bool))[each.item.time] = True
-        kept = {"between": facets.parts, "counted": False, "columns": COLUMNS_IN_TRAINING}
+        kept = {"between": by_time.parts, "counted": False, "columns": COLUMNS_IN_TRAINING}
 
         def of_cell(lower: Array, upper: Array) -> Array:
             box, later = Box(lower, upper), jnp.asarray(directions[1:])

@@ -58,8 +58,10 @@ class FacetRows(NamedTuple):
     def judged(self, uppers: Float[np.ndarray, "*p m"]) -> tuple[bool, bool, float]:
         """Whether it surely holds, or surely fails, and its margin.
 
+        Without rows that refute it, it never surely fails.
+
         Args:
-            uppers: bounds at its time, or in each part of the period before, of all its rows.
+            uppers: bounds at its time, or in each part of the period before.
         """
         found, k = np.atleast_2d(uppers)[:, self.first : self.end], len(self.units)
         room = (self.limits - found)[:, :k] / self.units
@@ -69,7 +71,8 @@ class FacetRows(NamedTuple):
             holds, fails = under[:, :k].all(), below[:, k:].any()
             margin = room.min(initial=np.inf)
         else:
-            holds, fails = below[:, :k].any(axis=1).all(), under[:, k:].all(axis=1).any()
+            holds, beyond = below[:, :k].any(axis=1).all(), under[:, k:]
+            fails = beyond.shape[1] > 0 and beyond.all(axis=1).any()
             margin = np.fmax.reduce(room, axis=1).min()
         return bool(holds), bool(fails), float(np.nan_to_num(margin, nan=-np.inf))
 
@@ -91,7 +94,7 @@ class FacetRowsByTime(NamedTuple):
     def parts(self) -> tuple[int, ...]:
         """Into how many parts steps of a flow are cut for each direction, `(m,)`.
 
-        Zero where it is bounded at samples alone, whatever the time.
+        Zero where it is bounded at samples alone, at each time.
         """
         most = parts_of_periods(rows.item for rows in self.each)
         return tuple(np.where(self.whole.any(axis=0), most, 0).tolist())
@@ -106,10 +109,10 @@ class FacetRowsByTime(NamedTuple):
             required: the requirements.
             horizon: the number of steps.
             states: of the loop.
-            refuting: whether there are those that refute them.
+            refuting: whether rows that refute them are there too.
         """
         ends, each = np.zeros(horizon + 1, dtype=int), list[FacetRows]()
-        # what is bounded at all times comes first at each, so that others are bounded at none
+        # what is meant in between samples comes first, so that as few numbers as can be are
         for item in sorted(required, key=lambda item: not item.throughout):
             each.append(FacetRows.of(item, int(ends[item.time]), refuting))
             ends[item.time] = each[-1].end

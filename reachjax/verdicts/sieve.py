@@ -124,10 +124,10 @@ class Sieve:
         # what depends on parameters alone is an argument of what is compiled, and no part of it
         self._loop, self._on_host = jax.device_put(with_constants(loop)), in_numpy(loop)
         self._start = start
-        self._rows, directions, whole = rows = FacetRowsByTime.of(required, horizon, loop.states)
-        self._directions, self._later = directions, jnp.asarray(directions[1:])
-        self._whole = jnp.asarray(whole[1:]) if whole.any() else None
-        self._parts = rows.parts
+        by_time = FacetRowsByTime.of(required, horizon, loop.states)
+        self._rows, self._directions, self._parts = by_time.each, by_time.directions, by_time.parts
+        self._later = jnp.asarray(self._directions[1:])
+        self._whole = by_time.whole[1:] if by_time.whole.any() else None
 
     def pays(self, cells: Sequence[Ends], budget: Budget) -> bool:
         """Whether the compiled call is there, and faster than what these cells take one by one.
@@ -179,7 +179,8 @@ class Sieve:
         """The arguments of the compiled call."""
         filled = [*cells, *[cells[-1]] * (TOGETHER - len(cells))]
         lower, upper = (np.stack(ends) for ends in zip(*filled, strict=True))
-        return self._loop, lower, upper, self._later, self._whole
+        whole = None if self._whole is None else jnp.asarray(self._whole)
+        return self._loop, lower, upper, self._later, whole
 
     def sifted(self, cells: Sequence[Ends]) -> list[Outcome]:
         """What is found of each cell, at most `TOGETHER` of them."""
@@ -219,7 +220,7 @@ class Sieve:
                 # without states there is nothing in between them
                 inner = (one.offsets if one.between is None else one.between for one in each)
                 both = zip(map(np.asarray, inner), uppers, strict=True)
-                uppers = [np.where(np.asarray(self._whole[k - 1]), *pair) for pair in both]
+                uppers = [np.where(self._whole[k - 1], *pair) for pair in both]
             uppers = [upper for upper in uppers if not np.isneginf(upper).all()]  # no states
             for rows in self._rows:
                 if rows.item.time == k:

@@ -10,7 +10,7 @@ import pytest
 import reachjax as rj
 from reachjax.loops.batches import in_between
 from reachjax.loops.units import UnboundedError
-from reachjax.programs.unrolled import unrolled, unrolled_from_boxes
+from reachjax.programs.unrolled import unrolled, unrolled_at_once, unrolled_from_boxes
 from reachjax.verdicts.facet_rows import FacetRowsByTime
 from reachjax.verdicts.specification import requirements
 
@@ -178,16 +178,14 @@ def test_directions_are_bounded_in_parts_of_their_own_or_at_samples_alone(loop):
         np.testing.assert_array_equal(mixed.offsets, at_all.offsets)
 
 
-def test_only_directions_that_are_meant_in_between_are_bounded_there():
+def test_as_few_directions_as_can_be_are_bounded_in_between():
     away, box = rj.Box([2.0, 2.0], [3.0, 3.0]), rj.Box([-2.0, -2.0], [2.0, 2.0])
     for goal in (box, {(0.5, 1.0): box}):
         required = requirements(2, 2, 0.5, goal=goal, avoid=[away])
         rows, proving = (
             FacetRowsByTime.of(required, 2, 2, refuting=many) for many in (True, False)
         )
-        asked = [rows.whole[each.item.time, each.first : each.end] for each in rows.each]
-        for each, whole in zip(rows.each, asked, strict=True):
-            assert np.all(whole == each.item.throughout)
+        for each in rows.each:
             if each.item.throughout:
                 assert set(rows.parts[each.first : each.end]) == {8}
         assert rows.parts.count(0) == (8 if goal is box else 0)
@@ -195,6 +193,26 @@ def test_only_directions_that_are_meant_in_between_are_bounded_there():
         for most, least in zip(rows.each, proving.each, strict=True):
             np.testing.assert_array_equal(most.directions[: len(most.units)], least.directions)
             np.testing.assert_array_equal(most.limits[: len(most.units)], least.limits)
+            for bound in (-10.0, 10.0):
+                holds, _, margin = most.judged(np.full(len(rows.parts), bound))
+                uppers = np.full(len(proving.parts), bound)
+                assert least.judged(uppers) == (holds, False, margin)
+
+
+@pytest.mark.costly
+def test_directions_that_are_bounded_in_parts_of_their_own_have_derivatives():
+    rows, asked, (_, turned) = np.tile(np.eye(3)[:, :2] + 0.5, (2, 1, 1)), (8, 0, 8), loops()
+
+    def total(push, parts=asked):
+        net = rj.MLP.from_layers([([[0.0, 0.0]], push)])
+        loop, options = rj.ClosedLoop(turned.plant, net), {"between": parts, "counted": False}
+        found = unrolled_at_once(loop, X0, X0, rows, **options).between
+        return jnp.sum(jnp.where(np.array(asked) > 0, found, 0.0))
+
+    value, slope = jax.value_and_grad(total)(jnp.array([0.1]))
+    np.testing.assert_allclose(value, total(np.array([0.1]), 8), rtol=1e-9)
+    above, below = (total(np.array([push])) for push in (0.101, 0.099))
+    np.testing.assert_allclose(slope, [(above - below) / 0.002], rtol=1e-4)
 
 
 def switching(f, **options):

@@ -1,6 +1,6 @@
 """Figures as the competition asks for: which coordinates over which."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,20 @@ from experiments.competition.instances import Instance
 DRAWN = 300
 """So many trajectories are drawn."""
 
+REGIONS: dict[str, dict[str, Any]] = {
+    "goal": {"facecolor": "tab:green", "alpha": 0.25},
+    "safe": {"edgecolor": "tab:green", "fill": False, "linestyle": "--"},
+    "avoid": {"facecolor": "tab:red", "alpha": 0.25},
+}
+"""How what is required is drawn."""
+
+ORDER = "sampled states", "certified", *REGIONS, "counterexample"
+"""Of names in the legend."""
+
 
 def draw(
     instance: Instance,
+    period: float | None,
     runs: Float[np.ndarray, "c t n"],
     tubes: Sequence[rj.ReachTube],
     verdict: rj.Verdict,
@@ -26,27 +37,28 @@ def draw(
 
     Args:
         instance: the instance.
+        period: of its plant, in its units of time; None in discrete time.
         runs: trajectories at samples.
         tubes: boxes at samples, which together hold all states; none where there are no bounds.
         verdict: what is decided.
         path: of the figure.
     """
     planes = instance.planes
-    figure, (axes,) = report.panels(1, len(planes), (5 * len(planes), 4))
+    figure, (axes,) = report.panels(1, len(planes), (5 * len(planes), 4.4))
     for ax, (one, other) in zip(axes, planes, strict=True):
         x, y = (_along(runs[:DRAWN], k) for k in (one, other))
         for k, X in ((k, X) for tube in tubes for k, X in enumerate(tube.sets)):
             _box(ax, X.bounding_box(), k, (one, other), x, y)
-        ax.plot(x.T, y.T, color="tab:blue", linewidth=0.4, alpha=0.5)
-        if one:
-            _regions(ax, instance, (one, other))
+        lines = ax.plot(x.T, y.T, color="tab:blue", linewidth=0.4, alpha=0.5)
+        lines[0].set_label("sampled states")
         if verdict.counterexample is not None:
             broken = verdict.counterexample.states[None]
-            a, b = (_along(broken, k) for k in (one, other))
-            ax.plot(a.T, b.T, ".-", color="tab:red", linewidth=1, label="counterexample")
-            ax.legend(fontsize="small")
+            a, b = (_along(broken, k)[0] for k in (one, other))
+            ax.plot(a, b, ".-", color="tab:red", linewidth=1, label="counterexample")
+        _regions(ax, instance, period, (one, other))
         ax.set(xlabel=f"$x_{{{one}}}$" if one else "period", ylabel=f"$x_{{{other}}}$")
-        ax.set_title(f"{instance.benchmark} {instance.name}: {verdict.status.name}", fontsize=9)
+    figure.suptitle(f"{instance.benchmark} {instance.name}: {verdict.status.name}", fontsize=10)
+    report.legend_below(figure, ORDER, fontsize="small", ncols=3)
     report.save(figure, path)
 
 
@@ -63,23 +75,46 @@ def _box(ax: Any, box: rj.Box, k: int, plane: tuple[int, int], x: Any, y: Any) -
     (left, right), (low, high) = ends
     if high - low > 100 * max(np.ptp(y), 1e-9) or right - left > 100 * max(np.ptp(x), 1e-9):
         return
-    ax.fill([left, right, right, left], [low, low, high, high], color="gold", alpha=0.5)
-    ax.plot([left, right, right, left, left], [low, low, high, high, low], color="goldenrod", lw=1)
+    around = [left, right, right, left, left], [low, low, high, high, low]
+    ax.fill(*around, color="gold", alpha=0.5, label="certified")
+    ax.plot(*around, color="goldenrod", linewidth=1)
 
 
-def _regions(ax: Any, instance: Instance, plane: tuple[int, int]) -> None:
-    """Goals and sets to be avoided, where they are boxes in the plane."""
-    required = instance.required
-    goal, avoid = required.get("goal"), required.get("avoid", [])
-    goals = [] if goal is None or isinstance(goal, dict) else [goal]
-    avoided = [] if isinstance(avoid, dict) else avoid
-    for regions, colour in ((goals, "tab:green"), (avoided, "tab:red")):
-        for region in regions:
-            ends = _ends(region, plane)
-            if np.isfinite(ends).all():
-                (left, low), (right, high) = ends
-                corners = [left, right, right, left], [low, low, high, high]
-                ax.fill(*corners, color=colour, alpha=0.2)
+def _regions(ax: Any, instance: Instance, period: float | None, plane: tuple[int, int]) -> None:
+    """What is required, where facets along the axes bound it in the plane."""
+    seen = set()
+    for name, region, first, last in timed(instance, period):
+        ends = _ends(region, plane)
+        if not np.isfinite(ends).any():
+            continue
+        if not plane[0]:
+            ends[:, 0] = first - 0.5, last + 0.5
+        elif (name, id(region)) in seen:
+            continue
+        seen.add((name, id(region)))
+        shown = np.array([ax.get_xlim(), ax.get_ylim()]).T
+        (left, low), (right, high) = np.where(np.isfinite(ends), ends, shown)
+        ax.fill([left, right, right, left], [low, low, high, high], label=name, **REGIONS[name])
+
+
+def timed(
+    instance: Instance, period: float | None
+) -> Iterator[tuple[str, rj.PolyhedralSet, float, float]]:
+    """What is required: its name in `rj.decide`, a set, and its first and last period.
+
+    Args:
+        instance: the instance.
+        period: of its plant, in its units of time; None in discrete time.
+    """
+    for name, given in instance.required.items():
+        always = instance.horizon if name == "goal" else 0, instance.horizon
+        for when, regions in given.items() if isinstance(given, Mapping) else [(always, given)]:
+            first, last = when if isinstance(when, tuple) else (when, when)
+            if isinstance(first, float):  # in units of time
+                assert period is not None
+                first, last = first / period, last / period
+            for region in regions if isinstance(regions, Sequence) else [regions]:
+                yield name, region, first, last
 
 
 def _ends(region: rj.PolyhedralSet, plane: tuple[int, int]) -> Float[np.ndarray, "2 2"]:

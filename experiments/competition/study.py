@@ -24,7 +24,7 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -94,7 +94,18 @@ class Settings:
         ]
 
 
-def loop_of(title: str, settings: Settings) -> rj.ClosedLoop:
+class Source(Protocol):
+    """Settings that say where networks are: a folder to read, or where trained ones are kept."""
+
+    @property
+    def path(self) -> Path | None: ...
+    @property
+    def training_steps(self) -> int: ...
+    @property
+    def output(self) -> Path: ...
+
+
+def loop_of(title: str, settings: Source) -> rj.ClosedLoop:
     """The loop of an instance."""
     instance = instances()[title]
     given = settings.path, settings.training_steps, settings.output / "networks"
@@ -176,7 +187,9 @@ def width(
     states = np.concatenate([corners(instance.X0), np.asarray(states)])
     runs = np.asarray(loop.simulate(states, instance.horizon))
     tubes = tubes_of(instance, loop, verdict, settings)
-    figures.draw(instance, runs, tubes, verdict, settings.output / f"{instance.title}.png")
+    period = float(loop.plant.period) if loop.plant.continuous else None
+    path = settings.output / f"{instance.title}.png"
+    figures.draw(instance, period, runs, tubes, verdict, path)
     if not tubes or min(tube.horizon for tube in tubes) < instance.horizon:
         return None
     last = [tube.sets[-1].bounding_box() for tube in tubes]
@@ -264,17 +277,15 @@ def table(rows: list[dict]) -> Table:
     names = ("first", "warm", "recheck", "margin", "cells", "width", "peak")
     shown = [
         (
-            row["benchmark"],
-            row["name"],
+            f"{row['benchmark']} {row['name']}",
             report.coloured(row["verdict"]),
             *(_shown(name, row.get(name)) for name in names),
         )
         for row in rows
     ]
     headings = ("first", "warm", "recheck", "margin", "cells", "width", "GB")
-    return report.table(
-        "ARCH-COMP AINNCS, seconds", ("benchmark", "instance", "verdict"), headings, shown
-    )
+    title = "ARCH-COMP AINNCS, seconds"
+    return report.table(title, ("instance", "verdict"), headings, shown)
 
 
 def _shown(name: str, value: Any) -> str:
@@ -331,11 +342,15 @@ def main(settings: Settings) -> None:
                 known[instance.title] = row
                 report.write(path, settings, machine=machine(), rows=list(known.values()))
             shown.advance(task)
-    if rows:
-        rich.print(table(rows))
-        rich.print(NOTE)
-        write_csv(rows, settings.output / "results.csv")
-        write_markdown(rows, settings.output / "results.md")
+    if not rows:
+        raise ValueError(
+            f"PATH must be a clone of the benchmark repository, but {settings.path} has no "
+            f"network of {', '.join(missing)}"
+        )
+    rich.print(table(rows))
+    rich.print(NOTE)
+    write_csv(rows, settings.output / "results.csv")
+    write_markdown(rows, settings.output / "results.md")
     if missing:
         rich.print(f"without networks in {settings.path}: {', '.join(missing)}")
     rich.print(f"written: results.csv, results.json, figures, verdicts under {settings.output}")

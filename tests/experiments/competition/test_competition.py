@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
-from experiments.competition import fields, study
+from experiments.competition import fields, figures, recheck, study
 from experiments.competition.instances import instances, slow, within
 from experiments.competition.networks import networks
 from experiments.competition.study import Settings
@@ -150,13 +150,35 @@ def test_networks_are_found_by_their_paths_there(tmp_path):
     assert instance.paths(tmp_path) == [folder / "controller_single_pendulum.onnx"]
 
 
+def test_requirements_are_drawn_when_they_are_meant():
+    def spans(title, period):
+        return [(name, *span) for name, _, *span in figures.timed(EVERY[title], period)]
+
+    assert spans("single-pendulum-reach", 0.05) == [("goal", 10, 20)]
+    assert spans("nav-standard", 0.2) == [("avoid", 0, 30), ("goal", 30, 30)]
+    assert spans("airplane-discrete", 0.1) == [("goal", k, k) for k in range(21)]
+    assert spans("vcas-worst-19.5", None) == [("avoid", k, k) for k in range(1, 11)]
+
+
+def test_a_folder_without_any_network_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="clone of the benchmark repository"):
+        study.main(settings(tmp_path / "results", path=tmp_path))
+
+
+def test_a_file_that_is_named_as_no_instance_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="FILE must be named as an instance"):
+        recheck.Settings(tmp_path / "mine.verdict")
+
+
 def settings(tmp_path, **more):
     given = {"only": ("single-pendulum",), "output": tmp_path, "limit": 60.0}
     return Settings(**given | {"training_steps": 500, "simulations": 20} | more)
 
 
 @pytest.mark.costly
-def test_an_instance_has_a_row_a_line_and_a_verdict_that_is_proved_anew(tmp_path, monkeypatch):
+def test_an_instance_has_a_row_a_line_and_a_verdict_that_is_proved_anew(
+    tmp_path, monkeypatch, capsys
+):
     study.main(settings(tmp_path))
     (row,) = json.loads((tmp_path / "results.json").read_text())["rows"]
     assert row["verdict"] in ("PROVED", "REFUTED")
@@ -173,6 +195,10 @@ def test_an_instance_has_a_row_a_line_and_a_verdict_that_is_proved_anew(tmp_path
 
     monkeypatch.setattr(study, "row_of", refuse)
     study.main(settings(tmp_path))  # nothing is left to do
+    (file,) = (tmp_path / "verdicts").glob("*.verdict")
+    capsys.readouterr()
+    recheck.main(recheck.Settings(file, processes=1, training_steps=500))
+    assert row["verdict"] in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -186,7 +186,7 @@ def _of_cells(
     asked: Asked, cells: Sequence[Node], grounds: Grounds, executor: Executor | None
 ) -> Generator[MarginsByKey, None, None]:
     """The margins of all cells as they come, by forms in compiled calls of many where that pays."""
-    task, jobs = _task(asked), CellJobs[None](executor, AHEAD)
+    task, jobs = _task(asked), CellJobs[None](executor if len(cells) > 1 else None, AHEAD)
     pays = len(cells) >= TOGETHER and all(cell.is_box for cell in cells)
     try:
         for first in range(0, len(cells), TOGETHER):

@@ -46,26 +46,59 @@ def _linear(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
     return recorder.mapped(value, matrix, equation.shape)
 
 
+def _summed(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+    (value,) = operands
+    assert isinstance(value, Value)
+    units = np.eye(value.size).reshape(*value.shape, value.size)
+    sums = units.sum(axis=tuple(equation.params["axes"]))
+    return recorder.mapped(value, sums.reshape(-1, value.size), equation.shape)
+
+
 def _contracted(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
     left, right = operands
-    (over_left, over_right), (batch_left, batch_right) = equation.params["dimension_numbers"]
-    if not (isinstance(left, Value) and isinstance(right, Value)):
-        plain, value = (right, left) if isinstance(left, Value) else (left, right)
-        if np.ndim(plain) == 2 and len(value.shape) == 1 and len(over_left) == 1:
-            axis = over_right[0] if isinstance(left, Value) else over_left[0]
-            return recorder.mapped(value, plain if axis == 1 else plain.T, equation.shape)
+    over, batch = equation.params["dimension_numbers"]
+    if isinstance(left, Value) and isinstance(right, Value):
+        return _of_both(recorder, equation, left, right)
+    here = int(isinstance(right, Value))
+    value, plain = operands[here], operands[1 - here]
+    if np.ndim(plain) == 2 and len(value.shape) == 1 and len(over[here]) == 1:
+        matrix = plain if over[1 - here][0] == 1 else plain.T
+        return recorder.mapped(value, matrix, equation.shape)
+    if not on_host(plain):
         return _linear(recorder, equation, operands)
+    places = _arranged(_numbers(value), batch[here], over[here])
+    factors = _arranged(np.asarray(plain), batch[1 - here], over[1 - here])
+    if here:  # the left operand's entries come first
+        places, factors = places[:, None], factors[:, :, None]
+    else:
+        places, factors = places[:, :, None], factors[:, None]
+    places, factors = np.broadcast_arrays(places, factors)
+    matrix = np.zeros((*places.shape[:3], value.size))
+    np.put_along_axis(matrix, places, factors, axis=-1)
+    matrix = matrix.reshape(-1, value.size)
+    if isinstance(plain, Parameter):
+        matrix = Parameter.of(matrix)
+    return recorder.mapped(value, matrix, equation.shape)
 
-    def arranged(value: Value, batch: Sequence[int], over: Sequence[int]) -> np.ndarray:
-        """Numbers of entries as `(batch, free, contracted)`."""
-        index = np.arange(value.size).reshape(value.shape)
-        free = [k for k in range(index.ndim) if k not in (*batch, *over)]
-        sizes = [math.prod(value.shape[k] for k in axes) for axes in (batch, free, over)]
-        return index.transpose(*batch, *free, *over).reshape(sizes)
 
+def _numbers(value: Value) -> np.ndarray:
+    """The place of each entry of a value."""
+    return np.arange(value.size).reshape(value.shape)
+
+
+def _arranged(entries: np.ndarray, batch: Sequence[int], over: Sequence[int]) -> np.ndarray:
+    """Entries of an operand of a contraction as `(batch, free, contracted)`."""
+    free = [k for k in range(entries.ndim) if k not in (*batch, *over)]
+    sizes = [math.prod(entries.shape[k] for k in axes) for axes in (batch, free, over)]
+    return entries.transpose(*batch, *free, *over).reshape(sizes)
+
+
+def _of_both(recorder: Recorder, equation: Equation, left: Value, right: Value) -> Value:
+    """Inner products of what depends on inputs."""
+    (over_left, over_right), (batch_left, batch_right) = equation.params["dimension_numbers"]
     one, other = np.broadcast_arrays(
-        arranged(left, batch_left, over_left)[:, :, None],
-        arranged(right, batch_right, over_right)[:, None],
+        _arranged(_numbers(left), batch_left, over_left)[:, :, None],
+        _arranged(_numbers(right), batch_right, over_right)[:, None],
     )
     if is_binary(recorder, left) or is_binary(recorder, right):
         products = product_of(recorder, recorder.picked(left, one), recorder.picked(right, other))
@@ -129,7 +162,8 @@ def _itself(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
 
 
 RULES: dict[str, Rule] = {
-    **dict.fromkeys(["reduce_sum", "cumsum", "conv_general_dilated", "reduce_window_sum"], _linear),
+    **dict.fromkeys(["cumsum", "conv_general_dilated", "reduce_window_sum"], _linear),
+    "reduce_sum": _summed,
     **dict.fromkeys(
         ["copy", "copy_p", "stop_gradient", "optimization_barrier", "convert_element_type"], _itself
     ),

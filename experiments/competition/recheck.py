@@ -1,6 +1,6 @@
 """A verdict's file of the competition, proved anew by the networks that are read again.
 
-    python -m experiments.competition.recheck results/competition/verdicts/acc-safe-distance.verdict PATH
+    python -m experiments.competition.recheck results/competition/verdicts/nav-robust.verdict PATH
 
 What `python -m reachjax recheck FILE --loop MODULE:NAME` does where the loop is one of one's own.
 """
@@ -41,16 +41,13 @@ class Settings:
         if self.file.stem not in instances():
             raise ValueError(f"FILE must be named as an instance is, but {self.file} arrived")
 
-    @property
-    def output(self) -> Path:
-        """The folder in which the instance was decided, where trained networks are kept."""
-        return self.file.resolve().parent.parent
-
 
 def main(settings: Settings) -> None:
     """Read, prove and print."""
     jax.config.update("jax_enable_x64", True)
-    loop = study.loop_of(settings.file.stem, settings)
+    output = settings.file.resolve().parent.parent  # where trained networks are kept
+    given = settings.path, settings.training_steps, output
+    loop = study.loop_of(settings.file.stem, *given)
     with workers(settings.processes) as executor:
         found = rj.load(settings.file, loop, recheck=True, executor=executor)
     rich.get_console().print(found, markup=False, highlight=False, soft_wrap=True)

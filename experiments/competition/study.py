@@ -24,7 +24,7 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import numpy as np
@@ -84,6 +84,11 @@ class Settings:
             raise ValueError(f"--only must name some of {', '.join(instances())}")
 
     @property
+    def source(self) -> tuple[Path | None, int, Path]:
+        """What says where networks are."""
+        return self.path, self.training_steps, self.output
+
+    @property
     def chosen(self) -> list[Instance]:
         """The instances that are asked for."""
         every = instances().items()
@@ -94,29 +99,17 @@ class Settings:
         ]
 
 
-class Source(Protocol):
-    """Settings that say where networks are: a folder to read, or where trained ones are kept."""
-
-    @property
-    def path(self) -> Path | None: ...
-    @property
-    def training_steps(self) -> int: ...
-    @property
-    def output(self) -> Path: ...
-
-
-def loop_of(title: str, settings: Source) -> rj.ClosedLoop:
-    """The loop of an instance."""
+def loop_of(title: str, path: Path | None, training_steps: int, output: Path) -> rj.ClosedLoop:
+    """The loop of an instance, by settings of these names."""
     instance = instances()[title]
-    given = settings.path, settings.training_steps, settings.output / "networks"
-    return instance.loop(networks(instance, *given))
+    return instance.loop(networks(instance, path, training_steps, output / "networks"))
 
 
 def decided(title: str, settings: Settings) -> Iterator[dict]:
     """What is found of an instance, in a process in which nothing is compiled yet."""
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", None)
-    instance, loop = instances()[title], loop_of(title, settings)
+    instance, loop = instances()[title], loop_of(title, *settings.source)
     yield {}
     with workers(settings.processes) as executor:
         yield from _decided(instance, loop, executor, settings)
@@ -151,7 +144,7 @@ def rechecked(title: str, settings: Settings) -> Iterator[dict]:
     """The seconds in which a verdict's file is proved anew, in a new process and its workers."""
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", None)
-    loop = loop_of(title, settings)
+    loop = loop_of(title, *settings.source)
     yield {}
     path, began = settings.output / "verdicts" / f"{title}.verdict", time.perf_counter()
     with workers(settings.processes) as executor:
@@ -187,7 +180,8 @@ def width(
     states = np.concatenate([corners(instance.X0), np.asarray(states)])
     runs = np.asarray(loop.simulate(states, instance.horizon))
     tubes = tubes_of(instance, loop, verdict, settings)
-    period = float(loop.plant.period) if loop.plant.continuous else None
+    plant: Any = loop.plant
+    period = float(plant.period) if plant.continuous else None
     path = settings.output / f"{instance.title}.png"
     figures.draw(instance, period, runs, tubes, verdict, path)
     if not tubes or min(tube.horizon for tube in tubes) < instance.horizon:

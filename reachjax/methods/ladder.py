@@ -18,6 +18,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
 from reachjax.methods.witnesses import Simulated, in_blocks
 from reachjax.numerics.budget import Budget
+from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.rounding import namespace
 from reachjax.programs.affine import AffineForms
 from reachjax.programs.horizon import Horizon, joined
@@ -458,4 +459,6 @@ def _ends(
             if which[place] < 0 or values[number] < values[which[place]]:
                 which[place] = number
     signs = np.array([[-1.0], [1.0]])
+    if is_concrete(offsets):  # compiles nothing
+        offsets = np.asarray(offsets)
     return namespace(offsets).where(which >= 0, signs * offsets[which], signs * np.inf)

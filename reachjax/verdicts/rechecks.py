@@ -244,7 +244,7 @@ def _over(asked: Asked, part: AbstractSet, climbs: Sequence[Climb]) -> MarginsBy
     for item in asked.required:
         if item.time == 0:
             compared = item.compared_with(jax.device_put(part))
-            found[item.name, 0] = float(compared.margins.min()), item.proved(compared)
+            found[item.name, 0] = compared.least, item.proved(compared)
     for climb in climbs:
         given = loop, part, around, scenarios, asked.start, 1, ENDLESS
         ladder = Ladder(*given, between=between)

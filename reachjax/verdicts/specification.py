@@ -202,6 +202,13 @@ class Compared(NamedTuple):
         """
         return (self.limits - self.attained) / self.units
 
+    @property
+    def least(self) -> float:
+        """The least margin, of known numbers."""
+        attained, limits, units = map(np.asarray, self)
+        with np.errstate(all="ignore"):
+            return float(((limits - attained) / units).min())
+
 
 PARTS = 8
 """Into so many parts the steps of a flow are cut where sets are to be avoided: where states pass a

@@ -15,6 +15,13 @@ A = jnp.array([[2.0, -1.0], [0.5, 3.0]])
 Partial = jax.tree_util.Partial
 
 
+WEIGHTS = np.arange(8.0).reshape(2, 2, 2) - 3.5
+
+
+def cube(x):
+    return jnp.stack([jnp.outer(x, A[0]), jnp.outer(A[1], x)])
+
+
 def counted(x):
     return lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, 0.5 * jnp.sin(c[1])), (0, x))[1]
 
@@ -48,6 +55,14 @@ FUNCTIONS = {
     "limits of some": lambda x: jnp.maximum(x, jnp.array([-jnp.inf, 0.25])),
     "of no entries": lambda x: x * jnp.prod(x[:0]) + jnp.max(x[:0], initial=2.0),
     "powers of no entries": lambda x: x + jnp.cumprod(x[:0] ** jnp.zeros(0)).sum(),
+    **{
+        f"contraction {axes}": lambda x, axes=axes: jnp.einsum(axes, WEIGHTS, cube(x)).ravel()
+        for axes in ("ijk,kji->", "ijk,ijk->k", "ijk,lkj->il", "ijk,lmj->mkil", "ijk,mlj->jimkl")
+    },
+    "contraction from the right": lambda x: jnp.einsum("ijk,kjl->li", cube(x), WEIGHTS).ravel(),
+    "contraction with a vector": lambda x: jnp.dot(x, np.array([2.0, -0.5]))[None],
+    "contraction with a parameter": Partial(lambda p, x: jnp.tensordot(cube(x), p, 2), A),
+    "sums along axes": lambda x: cube(x).sum(axis=(2, 0)),
     "relu of a constant": lambda x: jax.nn.relu(A) @ x,
     "relu of a parameter": Partial(lambda p, x: jax.nn.relu(p) @ x, A),
     "norm": lambda x: jnp.linalg.norm(x)[None],

@@ -74,6 +74,12 @@ def decided(kind):
     return loop, rj.decide(loop, X0, STEPS, **{part: around(loop, room, whole)}, **options)
 
 
+def decided_in_halves():
+    """A verdict of two cells, on a function that other processes cannot find."""
+    loop = swung()
+    return loop, rj.decide(loop, X0, STEPS, safe=around(loop, 0.5, slice(None)), cells=(2, 1))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_proved_is_proved_anew_with_the_same_margins(kind, tmp_path):
     loop, verdict = decided(kind)
@@ -106,12 +112,21 @@ def test_cells_are_proved_anew_by_processes_as_they_are_here(tmp_path):
         forged(path, verdict, asked=tighter.asked)
         with pytest.raises(rj.DisagreementError, match="does not bear that out"):
             rj.load(path, recheck=True, executor=pool)
-        loop, verdict = decided("in between samples")
+        loop, verdict = decided_in_halves()
         verdict.save(path)
         with pytest.raises(TypeError, match="executor sends the loop to other processes"):
             rj.load(path, loop, recheck=True, executor=pool)
     with pytest.raises(TypeError, match="executor must be an object with a method submit"):
         rj.load(path, loop, recheck=True, executor=2)
+
+
+def test_one_cell_is_proved_anew_without_a_process(tmp_path):
+    """Which would take longer to begin than most cells to prove."""
+    loop, verdict = decided("in between samples")
+    verdict.save(tmp_path / "a.verdict")
+    pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+    pool.shutdown()  # it takes nothing any more
+    assert rj.load(tmp_path / "a.verdict", loop, recheck=True, executor=pool).proved
 
 
 def test_many_cells_are_proved_anew_in_threads(tmp_path):
@@ -135,7 +150,7 @@ def test_many_cells_are_proved_anew_in_threads(tmp_path):
     ],
 )
 def test_a_command_takes_processes(count, said, tmp_path):
-    decided("in between samples")[1].save(tmp_path / "a.verdict")
+    decided_in_halves()[1].save(tmp_path / "a.verdict")
     command = [sys.executable, "-m", "reachjax", "recheck", tmp_path / "a.verdict"]
     command += ["--loop", "tests.tubes.test_verdict_files:swung", "--processes", count]
     root = Path(__file__).parents[2]

@@ -14,15 +14,15 @@ from experiments.competition.instances import Instance
 DRAWN = 300
 """So many trajectories are drawn."""
 
-REGIONS: dict[str, dict[str, Any]] = {
+STYLES: dict[str, dict[str, Any]] = {
     "goal": {"facecolor": "tab:green", "alpha": 0.25},
     "safe": {"edgecolor": "tab:green", "fill": False, "linestyle": "--"},
     "avoid": {"facecolor": "tab:red", "alpha": 0.25},
 }
-"""How what is required is drawn."""
+"""How regions are drawn, by what they are for."""
 
-ORDER = "sampled states", "certified", *REGIONS, "counterexample"
-"""Of names in the legend."""
+ORDER = "sampled states", "certified", *STYLES, "counterexample"
+"""The order of names in the legend."""
 
 
 def draw(
@@ -81,36 +81,37 @@ def _box(ax: Any, box: rj.Box, k: int, plane: tuple[int, int], x: Any, y: Any) -
 
 
 def _regions(ax: Any, instance: Instance, period: float | None, plane: tuple[int, int]) -> None:
-    """What is required, where facets along the axes bound it in the plane."""
-    seen = set()
-    for name, region, first, last in timed(instance, period):
-        ends = _ends(region, plane)
-        if not np.isfinite(ends).any():
-            continue
-        if not plane[0]:
-            ends[:, 0] = first - 0.5, last + 0.5
-        elif (name, id(region)) in seen:
+    """What is required, where facets along the axes bound it in the plane.
+
+    A set at one sample is drawn half a period to both sides of it.
+    """
+    seen, shown = set(), np.array([ax.get_xlim(), ax.get_ylim()]).T
+    for name, region, first, last in regions_by_time(instance, period):
+        ends, over_time = _ends(region, plane), not plane[0]
+        if not np.isfinite(ends).any() or (not over_time and (name, id(region)) in seen):
             continue
         seen.add((name, id(region)))
-        shown = np.array([ax.get_xlim(), ax.get_ylim()]).T
+        if over_time:
+            ends[:, 0] = (first - 0.5, last + 0.5) if first == last else (first, last)
         (left, low), (right, high) = np.where(np.isfinite(ends), ends, shown)
-        ax.fill([left, right, right, left], [low, low, high, high], label=name, **REGIONS[name])
+        ax.fill([left, right, right, left], [low, low, high, high], label=name, **STYLES[name])
 
 
-def timed(
+def regions_by_time(
     instance: Instance, period: float | None
 ) -> Iterator[tuple[str, rj.PolyhedralSet, float, float]]:
-    """What is required: its name in `rj.decide`, a set, and its first and last period.
+    """Each region that is required: its name in `rj.decide`, the set, its first and last period.
 
     Args:
         instance: the instance.
         period: of its plant, in its units of time; None in discrete time.
     """
     for name, given in instance.required.items():
-        always = instance.horizon if name == "goal" else 0, instance.horizon
-        for when, regions in given.items() if isinstance(given, Mapping) else [(always, given)]:
+        for when, regions in given.items() if isinstance(given, Mapping) else [(None, given)]:
             first, last = when if isinstance(when, tuple) else (when, when)
-            if isinstance(first, float):  # in units of time
+            if when is None:
+                first, last = instance.horizon if name == "goal" else 0, instance.horizon
+            elif isinstance(when, tuple | float):  # in units of time
                 assert period is not None
                 first, last = first / period, last / period
             for region in regions if isinstance(regions, Sequence) else [regions]:
@@ -126,5 +127,6 @@ def _ends(region: rj.PolyhedralSet, plane: tuple[int, int]) -> Float[np.ndarray,
         for place, k in enumerate(plane):
             if len(there) == 1 and there[0] == k - 1:
                 side = int(row[k - 1] > 0)
-                found[side, place] = end / row[k - 1]
+                tighter = (max, min)[side]
+                found[side, place] = tighter(found[side, place], end / row[k - 1])
     return found

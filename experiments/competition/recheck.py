@@ -1,11 +1,12 @@
 """A verdict's file of the competition, proved anew by the networks that are read again.
 
-    python -m experiments.competition.recheck results/competition/verdicts/nav-robust.verdict PATH
+    python -m experiments.competition.recheck results/competition/verdicts/nav-robust.verdict
 
-What `python -m reachjax recheck FILE --loop MODULE:NAME` does where the loop is one of one's own.
+For a loop of one's own there is `python -m reachjax recheck FILE --loop MODULE:NAME`.
 """
 
 import dataclasses
+import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,26 +29,39 @@ class Settings:
     """Prove a verdict of the competition anew, from its file and its networks."""
 
     file: tyro.conf.Positional[Path]
-    """A verdict, named as its instance is."""
+    """A verdict, in the folder in which it was written."""
     path: tyro.conf.Positional[Path | None] = None
-    """The clone of the benchmark repository that it was decided with; none for trained networks."""
+    """The clone of the benchmark repository, if it is no longer where it was."""
     processes: int = dataclasses.field(default_factory=lambda: os.cpu_count() or 1)
     """That cells are proved in; 1 for none besides."""
-    training_steps: int = 2000
-    """Steps of Adam, where networks were trained."""
 
     def __post_init__(self):
-        require_options(self, processes=1, training_steps=1)
-        if self.file.stem not in instances():
-            raise ValueError(f"FILE must be named as an instance is, but {self.file} arrived")
+        require_options(self, processes=1)
+        named = self.file.suffix == ".verdict" and self.file.stem in instances()
+        if not named or not self.file.is_file():
+            raise ValueError(
+                f"FILE must be a verdict that is named as an instance is, but {self.file} arrived"
+            )
+
+    @property
+    def of_study(self) -> study.Settings:
+        """The settings by which it was decided."""
+        output = self.file.resolve().parent.parent
+        kept = output / "results.json"
+        if not kept.is_file():
+            raise ValueError(
+                f"FILE must stand where it was written, but there is no {kept}, which says of what "
+                "networks it is"
+            )
+        given = json.loads(kept.read_text())["settings"]
+        path = self.path or (given["path"] and Path(given["path"]))
+        return study.Settings(path, training_steps=given["training_steps"], output=output)
 
 
 def main(settings: Settings) -> None:
     """Read, prove and print."""
     jax.config.update("jax_enable_x64", True)
-    output = settings.file.resolve().parent.parent  # where trained networks are kept
-    given = settings.path, settings.training_steps, output
-    loop = study.loop_of(settings.file.stem, *given)
+    loop = study.loop_of(settings.file.stem, settings.of_study)
     with workers(settings.processes) as executor:
         found = rj.load(settings.file, loop, recheck=True, executor=executor)
     rich.get_console().print(found, markup=False, highlight=False, soft_wrap=True)

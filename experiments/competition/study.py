@@ -84,11 +84,6 @@ class Settings:
             raise ValueError(f"--only must name some of {', '.join(instances())}")
 
     @property
-    def source(self) -> tuple[Path | None, int, Path]:
-        """What says where networks are."""
-        return self.path, self.training_steps, self.output
-
-    @property
     def chosen(self) -> list[Instance]:
         """The instances that are asked for."""
         every = instances().items()
@@ -99,17 +94,18 @@ class Settings:
         ]
 
 
-def loop_of(title: str, path: Path | None, training_steps: int, output: Path) -> rj.ClosedLoop:
-    """The loop of an instance, by settings of these names."""
+def loop_of(title: str, settings: Settings) -> rj.ClosedLoop:
+    """The loop of an instance."""
     instance = instances()[title]
-    return instance.loop(networks(instance, path, training_steps, output / "networks"))
+    given = settings.path, settings.training_steps, settings.output / "networks"
+    return instance.loop(networks(instance, *given))
 
 
 def decided(title: str, settings: Settings) -> Iterator[dict]:
     """What is found of an instance, in a process in which nothing is compiled yet."""
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", None)
-    instance, loop = instances()[title], loop_of(title, *settings.source)
+    instance, loop = instances()[title], loop_of(title, settings)
     yield {}
     with workers(settings.processes) as executor:
         yield from _decided(instance, loop, executor, settings)
@@ -144,7 +140,7 @@ def rechecked(title: str, settings: Settings) -> Iterator[dict]:
     """The seconds in which a verdict's file is proved anew, in a new process and its workers."""
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_compilation_cache_dir", None)
-    loop = loop_of(title, *settings.source)
+    loop = loop_of(title, settings)
     yield {}
     path, began = settings.output / "verdicts" / f"{title}.verdict", time.perf_counter()
     with workers(settings.processes) as executor:

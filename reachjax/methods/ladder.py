@@ -459,6 +459,6 @@ def _ends(
             if which[place] < 0 or values[number] < values[which[place]]:
                 which[place] = number
     signs = np.array([[-1.0], [1.0]])
-    if is_concrete(offsets):  # compiles nothing
-        offsets = np.asarray(offsets)
+    if is_concrete(offsets):  # numpy compiles nothing
+        offsets = values
     return namespace(offsets).where(which >= 0, signs * offsets[which], signs * np.inf)

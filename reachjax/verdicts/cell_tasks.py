@@ -205,7 +205,7 @@ def bounded(
     """
     if item.time == 0:
         compared = item.compared_with(jax.device_put(part))
-        return item.proved(compared), compared.least, None
+        return item.proved(compared), compared.least_margin, None
     forms, units = values_of(item, ladder)
     bounds = np.array([rows.ends(ladder.horizon.start)[1].min() for rows in forms])
     branches = None

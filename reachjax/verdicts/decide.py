@@ -404,7 +404,7 @@ class _Decision:
         for item in list(self._findings.open.values()):
             if item.time == 0:
                 compared = item.compared_with(self._X0)
-                self._findings.prove(item, compared.least, item.proved(compared))
+                self._findings.prove(item, compared.least_margin, item.proved(compared))
 
     def climb(
         self,

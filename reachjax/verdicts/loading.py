@@ -62,7 +62,7 @@ def load(
         progress: wraps the iteration over steps, or over cells of a verdict, that are rechecked,
             such as `tqdm.tqdm`.
         executor: rechecks the cells of a verdict, as that of `decide`. None: one after the other,
-            here, as the steps of a tube always are.
+            here, as a single cell and the steps of a tube always are.
 
     Raises:
         FileNotFoundError: there is no such file.

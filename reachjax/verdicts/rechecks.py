@@ -58,7 +58,7 @@ def rechecked(
     Args:
         verdict: with what was asked, whose parts have the kinds that they should have.
         progress: wraps the iteration over cells.
-        executor: runs the cells; None: here.
+        executor: runs the cells, where there are several; None: here.
 
     Raises:
         DisagreementError: it says what is not proved.
@@ -186,7 +186,9 @@ def _of_cells(
     asked: Asked, cells: Sequence[Node], grounds: Grounds, executor: Executor | None
 ) -> Generator[MarginsByKey, None, None]:
     """The margins of all cells as they come, by forms in compiled calls of many where that pays."""
-    task, jobs = _task(asked), CellJobs[None](executor if len(cells) > 1 else None, AHEAD)
+    if len(cells) == 1:  # a process takes longer to begin than most cells to prove
+        executor = None
+    task, jobs = _task(asked), CellJobs[None](executor, AHEAD)
     pays = len(cells) >= TOGETHER and all(cell.is_box for cell in cells)
     try:
         for first in range(0, len(cells), TOGETHER):
@@ -244,7 +246,7 @@ def _over(asked: Asked, part: AbstractSet, climbs: Sequence[Climb]) -> MarginsBy
     for item in asked.required:
         if item.time == 0:
             compared = item.compared_with(jax.device_put(part))
-            found[item.name, 0] = compared.least, item.proved(compared)
+            found[item.name, 0] = compared.least_margin, item.proved(compared)
     for climb in climbs:
         given = loop, part, around, scenarios, asked.start, 1, ENDLESS
         ladder = Ladder(*given, between=between)

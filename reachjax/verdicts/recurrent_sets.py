@@ -61,7 +61,7 @@ def within(sets: Sequence[AbstractSet], region: PolyhedralSet) -> tuple[bool, fl
     """Whether sets surely are in another one, and by which margin."""
     inside = Requirement("goal", 0, region, True)
     compared = [inside.compared_with(each) for each in sets]
-    margin = min(each.least for each in compared)
+    margin = min(each.least_margin for each in compared)
     return all(map(inside.proved, compared)), margin
 
 

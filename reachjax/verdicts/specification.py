@@ -203,11 +203,11 @@ class Compared(NamedTuple):
         return (self.limits - self.attained) / self.units
 
     @property
-    def least(self) -> float:
-        """The least margin, of known numbers."""
-        attained, limits, units = map(np.asarray, self)
+    def least_margin(self) -> float:
+        """The least of the margins, whose numbers must be known: its sign proves nothing."""
+        known = Compared(*map(np.asarray, self))
         with np.errstate(all="ignore"):
-            return float(((limits - attained) / units).min())
+            return float(known.margins.min())
 
 
 PARTS = 8

@@ -119,7 +119,7 @@ def _decided(
     findings.simulate(runs)
     for item in required:
         compared = item.compared(tube)
-        findings.prove(item, compared.least, item.proved(compared))
+        findings.prove(item, compared.least_margin, item.proved(compared))
     begun = Scenarios.of(tube.loop, tube.sets[0], tube.horizon, tube.start)
     require_unbroken(tube.loop, begun, tube.start, runs, findings.claims)
     return findings.verdict(ends)

@@ -15,11 +15,13 @@ A = jnp.array([[2.0, -1.0], [0.5, 3.0]])
 Partial = jax.tree_util.Partial
 
 
-WEIGHTS = np.arange(8.0).reshape(2, 2, 2) - 3.5
+WEIGHTS = np.arange(24.0).reshape(2, 3, 4) - 11.5
+SIDES = np.array([[1.0, -2.0], [0.5, 3.0], [-1.0, 0.25]])
 
 
 def cube(x):
-    return jnp.stack([jnp.outer(x, A[0]), jnp.outer(A[1], x)])
+    """Entries `(2, 3, 4)` that depend on `x`."""
+    return jnp.einsum("i,ji,k->ijk", x, SIDES, WEIGHTS[0, 0])
 
 
 def counted(x):
@@ -57,11 +59,14 @@ FUNCTIONS = {
     "powers of no entries": lambda x: x + jnp.cumprod(x[:0] ** jnp.zeros(0)).sum(),
     **{
         f"contraction {axes}": lambda x, axes=axes: jnp.einsum(axes, WEIGHTS, cube(x)).ravel()
-        for axes in ("ijk,kji->", "ijk,ijk->k", "ijk,lkj->il", "ijk,lmj->mkil", "ijk,mlj->jimkl")
+        for axes in ("ijk,ijk->", "ijk,ijl->kl", "ijk,ljk->il", "ijk,ljm->mkil", "ijk,iml->ijmkl")
     },
-    "contraction from the right": lambda x: jnp.einsum("ijk,kjl->li", cube(x), WEIGHTS).ravel(),
+    "contraction from the right": lambda x: jnp.einsum("ijk,ljk->il", cube(x), WEIGHTS).ravel(),
+    "batches from the right": lambda x: jnp.einsum("ijk,ilk->ijl", cube(x), WEIGHTS).ravel(),
     "contraction with a vector": lambda x: jnp.dot(x, np.array([2.0, -0.5]))[None],
-    "contraction with a parameter": Partial(lambda p, x: jnp.tensordot(cube(x), p, 2), A),
+    "contraction with a parameter": Partial(
+        lambda p, x: jnp.tensordot(cube(x), p, [1, 0]).ravel(), SIDES
+    ),
     "sums along axes": lambda x: cube(x).sum(axis=(2, 0)),
     "relu of a constant": lambda x: jax.nn.relu(A) @ x,
     "relu of a parameter": Partial(lambda p, x: jax.nn.relu(p) @ x, A),

@@ -121,7 +121,7 @@ def test_cells_are_proved_anew_by_processes_as_they_are_here(tmp_path):
 
 
 def test_one_cell_is_proved_anew_without_a_process(tmp_path):
-    """Which would take longer to begin than most cells to prove."""
+    """A process takes longer to begin than most cells to prove."""
     loop, verdict = decided("in between samples")
     verdict.save(tmp_path / "a.verdict")
     pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))

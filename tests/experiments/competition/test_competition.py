@@ -152,7 +152,7 @@ def test_networks_are_found_by_their_paths_there(tmp_path):
 
 def test_requirements_are_drawn_when_they_are_meant():
     def spans(title, period):
-        return [(name, *span) for name, _, *span in figures.timed(EVERY[title], period)]
+        return [(name, *span) for name, _, *span in figures.regions_by_time(EVERY[title], period)]
 
     assert spans("single-pendulum-reach", 0.05) == [("goal", 10, 20)]
     assert spans("nav-standard", 0.2) == [("avoid", 0, 30), ("goal", 30, 30)]
@@ -165,9 +165,24 @@ def test_a_folder_without_any_network_is_an_error(tmp_path):
         study.main(settings(tmp_path / "results", path=tmp_path))
 
 
-def test_a_file_that_is_named_as_no_instance_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match="FILE must be named as an instance"):
-        recheck.Settings(tmp_path / "mine.verdict")
+@pytest.mark.parametrize("name", ["mine.verdict", "nav-robust.json", "nav-robust.verdict"])
+def test_a_file_that_is_no_verdict_of_an_instance_is_an_error(tmp_path, name):
+    if name != "nav-robust.verdict":  # which is missing
+        (tmp_path / name).touch()
+    with pytest.raises(ValueError, match="FILE must be a verdict that is named as an instance"):
+        recheck.Settings(tmp_path / name)
+
+
+def test_a_verdict_is_rechecked_where_it_was_written(tmp_path):
+    (tmp_path / "nav-robust.verdict").touch()
+    with pytest.raises(ValueError, match="FILE must stand where it was written"):
+        recheck.main(recheck.Settings(tmp_path / "nav-robust.verdict"))
+
+
+def test_of_facets_along_an_axis_the_tightest_one_is_drawn():
+    region = rj.Polytope([[1.0, 0], [1, 0], [-1, 0], [-2, 0], [0, 1], [1, 1]], [5.0, 1, 4, 4, 3, 0])
+    found = figures._ends(region, (1, 2))
+    np.testing.assert_array_equal(found, [[-2, -np.inf], [1, 3]])
 
 
 def settings(tmp_path, **more):
@@ -197,7 +212,7 @@ def test_an_instance_has_a_row_a_line_and_a_verdict_that_is_proved_anew(
     study.main(settings(tmp_path))  # nothing is left to do
     (file,) = (tmp_path / "verdicts").glob("*.verdict")
     capsys.readouterr()
-    recheck.main(recheck.Settings(file, processes=1, training_steps=500))
+    recheck.main(recheck.Settings(file, processes=1))
     assert row["verdict"] in capsys.readouterr().out
 
 

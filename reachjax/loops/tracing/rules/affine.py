@@ -46,43 +46,44 @@ def _linear(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
     return recorder.mapped(value, matrix, equation.shape)
 
 
-def _summed(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+def _sum_along_axes(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
     (value,) = operands
     assert isinstance(value, Value)
     units = np.eye(value.size).reshape(*value.shape, value.size)
     sums = units.sum(axis=tuple(equation.params["axes"]))
-    return recorder.mapped(value, sums.reshape(-1, value.size), equation.shape)
+    matrix = sums.reshape(math.prod(equation.shape), value.size)
+    return recorder.mapped(value, matrix, equation.shape)
 
 
-def _contracted(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
+def _contraction(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Value:
     left, right = operands
     over, batch = equation.params["dimension_numbers"]
     if isinstance(left, Value) and isinstance(right, Value):
-        return _of_both(recorder, equation, left, right)
-    here = int(isinstance(right, Value))
-    value, plain = operands[here], operands[1 - here]
-    if np.ndim(plain) == 2 and len(value.shape) == 1 and len(over[here]) == 1:
-        matrix = plain if over[1 - here][0] == 1 else plain.T
+        return _inner_products(recorder, equation, left, right)
+    one, other = (0, 1) if isinstance(left, Value) else (1, 0)
+    value, plain = operands[one], operands[other]
+    if np.ndim(plain) == 2 and len(value.shape) == 1 and len(over[one]) == 1:
+        matrix = plain if over[other][0] == 1 else plain.T
         return recorder.mapped(value, matrix, equation.shape)
     if not on_host(plain):
         return _linear(recorder, equation, operands)
-    places = _arranged(_numbers(value), batch[here], over[here])
-    factors = _arranged(np.asarray(plain), batch[1 - here], over[1 - here])
-    if here:  # the left operand's entries come first
-        places, factors = places[:, None], factors[:, :, None]
+    columns = _arranged(_entry_numbers(value), batch[one], over[one])
+    factors = _arranged(np.asarray(plain), batch[other], over[other])
+    if value is left:  # the free axes of the left operand come first
+        columns, factors = columns[:, :, None], factors[:, None]
     else:
-        places, factors = places[:, :, None], factors[:, None]
-    places, factors = np.broadcast_arrays(places, factors)
-    matrix = np.zeros((*places.shape[:3], value.size))
-    np.put_along_axis(matrix, places, factors, axis=-1)
-    matrix = matrix.reshape(-1, value.size)
+        columns, factors = columns[:, None], factors[:, :, None]
+    columns, factors = np.broadcast_arrays(columns, factors)
+    matrix = np.zeros((*columns.shape[:3], value.size))
+    np.put_along_axis(matrix, columns, factors, axis=-1)
+    matrix = matrix.reshape(math.prod(equation.shape), value.size)
     if isinstance(plain, Parameter):
         matrix = Parameter.of(matrix)
     return recorder.mapped(value, matrix, equation.shape)
 
 
-def _numbers(value: Value) -> np.ndarray:
-    """The place of each entry of a value."""
+def _entry_numbers(value: Value) -> np.ndarray:
+    """The number of each entry of a value, in the shape of its array."""
     return np.arange(value.size).reshape(value.shape)
 
 
@@ -93,12 +94,12 @@ def _arranged(entries: np.ndarray, batch: Sequence[int], over: Sequence[int]) ->
     return entries.transpose(*batch, *free, *over).reshape(sizes)
 
 
-def _of_both(recorder: Recorder, equation: Equation, left: Value, right: Value) -> Value:
-    """Inner products of what depends on inputs."""
+def _inner_products(recorder: Recorder, equation: Equation, left: Value, right: Value) -> Value:
+    """A contraction of two values that depend on inputs."""
     (over_left, over_right), (batch_left, batch_right) = equation.params["dimension_numbers"]
     one, other = np.broadcast_arrays(
-        _arranged(_numbers(left), batch_left, over_left)[:, :, None],
-        _arranged(_numbers(right), batch_right, over_right)[:, None],
+        _arranged(_entry_numbers(left), batch_left, over_left)[:, :, None],
+        _arranged(_entry_numbers(right), batch_right, over_right)[:, None],
     )
     if is_binary(recorder, left) or is_binary(recorder, right):
         products = product_of(recorder, recorder.picked(left, one), recorder.picked(right, other))
@@ -163,11 +164,11 @@ def _itself(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
 
 RULES: dict[str, Rule] = {
     **dict.fromkeys(["cumsum", "conv_general_dilated", "reduce_window_sum"], _linear),
-    "reduce_sum": _summed,
+    "reduce_sum": _sum_along_axes,
     **dict.fromkeys(
         ["copy", "copy_p", "stop_gradient", "optimization_barrier", "convert_element_type"], _itself
     ),
-    "dot_general": _contracted,
+    "dot_general": _contraction,
     "add": _sum,
     "add_any": _sum,
     "sub": _difference,

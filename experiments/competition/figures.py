@@ -108,10 +108,11 @@ def regions_by_time(
     """
     for name, given in instance.required.items():
         for when, regions in given.items() if isinstance(given, Mapping) else [(None, given)]:
-            first, last = when if isinstance(when, tuple) else (when, when)
             if when is None:
                 first, last = instance.horizon if name == "goal" else 0, instance.horizon
-            elif isinstance(when, tuple | float):  # in units of time
+            else:
+                first, last = when if isinstance(when, tuple) else (when, when)
+            if isinstance(when, tuple | float):  # in units of time
                 assert period is not None
                 first, last = first / period, last / period
             for region in regions if isinstance(regions, Sequence) else [regions]:

@@ -95,6 +95,24 @@ def test_functions_of_users_are_as_in_plain_jax(strict):
         rj.NonlinearPlant(lambda x, u: (jnp.ones((2, 2)) * x).sum(0), 2, 1)
 
 
+def test_products_have_64_bits_whatever_those_of_users_have():
+    """Or nothing would be proved by them: XLA rounds what it multiplies as it is told to."""
+
+    def found():
+        compiled = jax.jit(lambda X0: rj.reach(LOOP, X0, 2, OCTAGON, rj.LinearBounds()).sets[-1].b)
+        states = np.full((40, 2), 0.3)
+        return compiled(BOX), LOOP.simulate(states, 2)
+
+    exact = jax.tree.leaves(found())
+    with jax.default_matmul_precision("BF16_BF16_F32"):
+        assert float((jnp.ones((2, 2)) @ jnp.full((2, 2), 1 / 3))[0, 0]) != 2 / 3
+        for one, other in zip(exact, jax.tree.leaves(found()), strict=True):
+            np.testing.assert_array_equal(one, other)
+        net = rj.Network(lambda x: jnp.full((1, 2), 1 / 3) @ x, 2, 1)
+        with pytest.raises(TypeError, match="rounds the numbers that it multiplies"):
+            rj.reach(LOOP.replace(controller=net), BOX, 1, OCTAGON, rj.LinearBounds())
+
+
 def test_only_sets_that_are_empty_or_unbounded_cannot_be_used(monkeypatch):
     def failing(*_):
         raise ValueError("out of ink")

@@ -3,7 +3,8 @@
 With `jax_numpy_rank_promotion="raise"` or `jax_numpy_dtype_promotion="strict"` JAX refuses what
 mathematics writes every day: a vector beside a matrix, a whole number beside a real one. They are
 meant for the code of those who set them. So whatever is public opens a scope with JAX's own rules;
-the flags stay as they are for everybody else.
+the flags stay as they are for everybody else. So does `jax_default_matmul_precision`, which may
+have products of 64-bit floats computed in a few bits: bounds would be none.
 """
 
 from __future__ import annotations
@@ -24,15 +25,23 @@ LOOKED_UP = "parts", "intervals", "alone", "summary", "is_disturbed", "curved", 
 STAGES = "measured", "projected", "pushed", "moved"
 """Stages of a step, which runs them in the scope that it opened."""
 
+EXACT = "highest"
+"""The precision of products in which 64-bit floats are not rounded before they are multiplied."""
+
 PLAIN = {*COUNTS, *LOOKED_UP, *STAGES}
 
 Called = TypeVar("Called", bound=Callable[..., Any])
 
 
 def _as_usual() -> bool:
-    """Whether vectors and matrices, and numbers of all kinds, may stand beside one another."""
-    ranks, kinds = jax.config.jax_numpy_rank_promotion, jax.config.jax_numpy_dtype_promotion  # type: ignore[attr-defined]
-    return ranks != "raise" and kinds == "standard"
+    """Whether arrays and numbers of all kinds may stand beside one another, and products are exact.
+
+    As exact as 64-bit floats are.
+    """
+    config: Any = jax.config
+    ranks, kinds = config.jax_numpy_rank_promotion, config.jax_numpy_dtype_promotion
+    products = config.jax_default_matmul_precision
+    return ranks != "raise" and kinds == "standard" and products in (None, EXACT)
 
 
 def lenient(function: Called) -> Called:
@@ -49,7 +58,11 @@ def lenient(function: Called) -> Called:
     def called(*given: Any, **named: Any) -> Any:
         if _as_usual():
             return function(*given, **named)
-        with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        with (
+            jax.numpy_rank_promotion("allow"),
+            jax.numpy_dtype_promotion("standard"),
+            jax.default_matmul_precision(EXACT),
+        ):
             return function(*given, **named)
 
     return called  # type: ignore[return-value]

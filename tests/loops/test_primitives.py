@@ -151,6 +151,16 @@ REFUSED = {
         lambda x: jnp.dot(A, x, preferred_element_type=jnp.float32),
         "'dot_general'.* rounds to float32",
     ),
+    "products of rounded numbers": (
+        lambda x: jnp.einsum(
+            "ij,kj->ik", WEIGHTS[0, :, :2], x[None], precision=lax.DotAlgorithmPreset.BF16_BF16_F32
+        )[:, 0],
+        "'dot_general'.* rounds the numbers that it multiplies",
+    ),
+    "products by an algorithm": (
+        lambda x: jnp.dot(A, x, precision=lax.DotAlgorithm(np.float32, np.float32, np.float32)),
+        "'dot_general'.* rounds the numbers that it multiplies",
+    ),
     "numbers drawn": (
         lambda x: x + jax.random.normal(jax.random.key(0), (2,)),
         r"'random_seed' \(in .*draws random numbers",

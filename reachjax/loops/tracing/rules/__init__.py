@@ -11,6 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from reachjax.loops.tracing.recording import Recorder
 from reachjax.loops.tracing.rules import (
@@ -98,6 +99,11 @@ def _recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand
             if jnp.issubdtype(equation.kind, jnp.floating)
             else "it computes in complex numbers: compute with their real and imaginary parts"
         )
+    if equation.name == "dot_general" and _rounds(equation.params["precision"]):
+        raise UnsupportedError(
+            "its precision, or jax.default_matmul_precision, rounds the numbers that it "
+            "multiplies: take jax.lax.Precision.HIGHEST"
+        )
     first, *others = operands
     if all(map(is_plain, operands)):  # it was found on the way that nothing depends on inputs
         return equation.evaluate(*operands)
@@ -130,6 +136,19 @@ def _recorded(recorder: Recorder, equation: Equation, operands: Sequence[Operand
             *(np.zeros(each.shape) if isinstance(each, Value) else each for each in operands)
         )
     return rule(recorder, equation, operands)
+
+
+def _rounds(precision: Any) -> bool:
+    """Whether products of 64-bit floats are computed in fewer bits."""
+    if isinstance(precision, lax.DotAlgorithmPreset):
+        return precision not in (
+            lax.DotAlgorithmPreset.DEFAULT,
+            lax.DotAlgorithmPreset.F64_F64_F64,
+        )
+    if not isinstance(precision, lax.DotAlgorithm):  # of others, 64-bit floats stay what they are
+        return False
+    kinds = precision.lhs_precision_type, precision.rhs_precision_type, precision.accumulation_type
+    return any(jnp.dtype(kind) != jnp.float64 for kind in kinds)
 
 
 def _moved(recorder: Recorder, equation: Equation, operand: Any, others: Sequence[Any]) -> Any:

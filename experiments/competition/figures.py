@@ -21,7 +21,7 @@ STYLES: dict[str, dict[str, Any]] = {
 }
 """How regions are drawn, by what they are for."""
 
-ORDER = "sampled states", "certified", *STYLES, "counterexample"
+ORDER = "sampled states", "certified at samples", *STYLES, "counterexample"
 """The order of names in the legend."""
 
 
@@ -76,7 +76,7 @@ def _box(ax: Any, box: rj.Box, k: int, plane: tuple[int, int], x: Any, y: Any) -
     if high - low > 100 * max(np.ptp(y), 1e-9) or right - left > 100 * max(np.ptp(x), 1e-9):
         return
     around = [left, right, right, left, left], [low, low, high, high, low]
-    ax.fill(*around, color="gold", alpha=0.5, label="certified")
+    ax.fill(*around, color="gold", alpha=0.5, label="certified at samples")
     ax.plot(*around, color="goldenrod", linewidth=1)
 
 

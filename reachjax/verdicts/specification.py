@@ -205,9 +205,9 @@ class Compared(NamedTuple):
     @property
     def least_margin(self) -> float:
         """The least of the margins, whose numbers must be known: its sign proves nothing."""
-        known = Compared(*map(np.asarray, self))
+        numbers: Any = map(np.asarray, self)
         with np.errstate(all="ignore"):
-            return float(known.margins.min())
+            return float(Compared(*numbers).margins.min())
 
 
 PARTS = 8

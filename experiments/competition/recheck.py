@@ -6,7 +6,6 @@ For a loop of one's own there is `python -m reachjax recheck FILE --loop MODULE:
 """
 
 import dataclasses
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,25 +36,26 @@ class Settings:
 
     def __post_init__(self):
         require_options(self, processes=1)
-        named = self.file.suffix == ".verdict" and self.file.stem in instances()
-        if not named or not self.file.is_file():
+        if self.file.suffix != ".verdict" or self.file.stem not in instances():
             raise ValueError(
                 f"FILE must be a verdict that is named as an instance is, but {self.file} arrived"
             )
+        if not self.file.is_file():
+            raise ValueError(f"FILE must be there, but there is no {self.file}")
 
     @property
     def of_study(self) -> study.Settings:
         """The settings by which it was decided."""
         output = self.file.resolve().parent.parent
-        kept = output / "results.json"
-        if not kept.is_file():
+        rows = {row["title"]: row for row in study.stored(output / "results.json")}
+        row = rows.get(self.file.stem)
+        if row is None:
             raise ValueError(
-                f"FILE must stand where it was written, but there is no {kept}, which says of what "
-                "networks it is"
+                f"FILE must stand where it was written, but no results.json in {output} says of "
+                "what networks it is"
             )
-        given = json.loads(kept.read_text())["settings"]
-        path = self.path or (given["path"] and Path(given["path"]))
-        return study.Settings(path, training_steps=given["training_steps"], output=output)
+        path = self.path or (row["path"] and Path(row["path"]))
+        return study.Settings(path, training_steps=row["training_steps"], output=output)
 
 
 def main(settings: Settings) -> None:

@@ -80,8 +80,12 @@ class Settings:
         require_options(self, "limit", processes=1, simulations=1, training_steps=1)
         if self.path is not None and not self.path.is_dir():
             raise ValueError(f"PATH must be a folder, but {self.path} arrived")
-        if not self.chosen:
-            raise ValueError(f"--only must name some of {', '.join(instances())}")
+        for word in self.only:
+            if not any(word.lower() in title for title in instances()):
+                raise ValueError(
+                    f"--only must name some of {', '.join(instances())}, but {word} arrived (PATH "
+                    "comes before the options)"
+                )
 
     @property
     def chosen(self) -> list[Instance]:
@@ -224,6 +228,8 @@ def row_of(instance: Instance, settings: Settings) -> dict:
     title = instance.title
     row: dict[str, Any] = {"title": title, "benchmark": instance.benchmark, "name": instance.name}
     row |= {"verdict": "UNKNOWN", "limit": settings.limit, "note": instance.note}
+    row |= {"path": settings.path and settings.path.resolve()}
+    row |= {"training_steps": settings.training_steps}
     patience = 1.3 * settings.limit + AGAIN
     (settings.output / "verdicts" / f"{title}.verdict").unlink(missing_ok=True)
     try:
@@ -275,6 +281,8 @@ def table(rows: list[dict]) -> Table:
     ]
     headings = ("first", "warm", "recheck", "margin", "cells", "width", "GB")
     title = "ARCH-COMP AINNCS, seconds"
+    if any(row["path"] is None for row in rows):
+        title += ", networks trained here"
     return report.table(title, ("instance", "verdict"), headings, shown)
 
 
@@ -314,7 +322,7 @@ def main(settings: Settings) -> None:
     """Decide, print, and write the table, figures, verdicts and counterexamples."""
     configure_jax(settings.output)
     path = settings.output / "results.json"
-    known = {row["title"]: row for row in _stored(path)}
+    known = {row["title"]: row for row in stored(path)}
     rows, missing = [], []
     with bar() as shown:
         task = shown.add_task("", total=len(settings.chosen))
@@ -339,8 +347,12 @@ def main(settings: Settings) -> None:
         )
     rich.print(table(rows))
     rich.print(NOTE)
-    write_csv(rows, settings.output / "results.csv")
-    write_markdown(rows, settings.output / "results.md")
+    for row in rows:
+        if "stopped" in row:
+            rich.print(f"{row['title']}: {row['stopped']}")
+    every = [known[title] for title in instances() if title in known]
+    write_csv(every, settings.output / "results.csv")
+    write_markdown(every, settings.output / "results.md")
     if missing:
         rich.print(f"without networks in {settings.path}: {', '.join(missing)}")
     rich.print(f"written: results.csv, results.json, figures, verdicts under {settings.output}")
@@ -355,7 +367,8 @@ def machine() -> dict[str, Any]:
     }
 
 
-def _stored(path: Path) -> list[dict]:
+def stored(path: Path) -> list[dict]:
+    """The rows of a file of results; none where there is no such file."""
     try:
         return json.loads(path.read_text())["rows"]
     except (OSError, ValueError, KeyError):

@@ -165,11 +165,16 @@ def test_a_folder_without_any_network_is_an_error(tmp_path):
         study.main(settings(tmp_path / "results", path=tmp_path))
 
 
-@pytest.mark.parametrize("name", ["mine.verdict", "nav-robust.json", "nav-robust.verdict"])
-def test_a_file_that_is_no_verdict_of_an_instance_is_an_error(tmp_path, name):
-    if name != "nav-robust.verdict":  # which is missing
-        (tmp_path / name).touch()
-    with pytest.raises(ValueError, match="FILE must be a verdict that is named as an instance"):
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("mine.verdict", "FILE must be a verdict that is named as an instance"),
+        ("nav-robust.json", "FILE must be a verdict that is named as an instance"),
+        ("nav-robust.verdict", "FILE must be there"),
+    ],
+)
+def test_a_file_that_is_no_verdict_of_an_instance_is_an_error(tmp_path, name, said):
+    with pytest.raises(ValueError, match=said):
         recheck.Settings(tmp_path / name)
 
 
@@ -218,7 +223,12 @@ def test_an_instance_has_a_row_a_line_and_a_verdict_that_is_proved_anew(
 
 @pytest.mark.parametrize(
     ("more", "named"),
-    [({"limit": 0.0}, "--limit"), ({"only": ("nothing",)}, "--only"), ({"path": 3}, "PATH")],
+    [
+        ({"limit": 0.0}, "--limit"),
+        ({"only": ("nothing",)}, "--only"),
+        ({"only": ("nav", "folder")}, "but folder arrived"),
+        ({"path": 3}, "PATH"),
+    ],
 )
 def test_options_that_cannot_be_are_named(tmp_path, more, named):
     if named == "PATH":

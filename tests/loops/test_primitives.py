@@ -161,6 +161,16 @@ REFUSED = {
         lambda x: jnp.dot(A, x, precision=lax.DotAlgorithm(np.float32, np.float32, np.float32)),
         "'dot_general'.* rounds the numbers that it multiplies",
     ),
+    "products summed imprecisely": (
+        lambda x: jnp.dot(
+            A,
+            x,
+            precision=lax.DotAlgorithm(
+                np.float64, np.float64, np.float64, allow_imprecise_accumulation=True
+            ),
+        ),
+        "'dot_general'.* rounds the numbers that it multiplies",
+    ),
     "numbers drawn": (
         lambda x: x + jax.random.normal(jax.random.key(0), (2,)),
         r"'random_seed' \(in .*draws random numbers",

@@ -148,7 +148,8 @@ def _rounds(precision: Any) -> bool:
     if not isinstance(precision, lax.DotAlgorithm):  # of others, 64-bit floats stay what they are
         return False
     kinds = precision.lhs_precision_type, precision.rhs_precision_type, precision.accumulation_type
-    return any(jnp.dtype(kind) != jnp.float64 for kind in kinds)
+    imprecise = precision.allow_imprecise_accumulation
+    return imprecise or any(jnp.dtype(kind) != jnp.float64 for kind in kinds)
 
 
 def _moved(recorder: Recorder, equation: Equation, operand: Any, others: Sequence[Any]) -> Any:

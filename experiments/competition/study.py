@@ -335,7 +335,8 @@ def main(settings: Settings) -> None:
             else:
                 row = known.get(instance.title, {})
                 if row.get("key") != key:
-                    row = row_of(instance, settings) | {"key": key, "commit": version()}
+                    row = row_of(instance, settings) | {"commit": version()}
+                    row |= {} if "stopped" in row else {"key": key}  # what failed is tried again
                 rows.append(row)
                 known[instance.title] = row
                 report.write(path, settings, machine=machine(), rows=list(known.values()))

@@ -95,3 +95,24 @@ def test_what_jumps_is_what_onnxruntime_computes_also_at_ties(name, tmp_path):
         np.testing.assert_allclose(net(jnp.asarray(x, float)), expected, rtol=1e-6, atol=1e-6)
         low, high = interval(net, x.astype(float), x.astype(float))
         assert np.all((low <= expected + 1e-6) & (expected - 1e-6 <= high))
+
+
+OF_OTHER_KINDS = {
+    "a mean of whole numbers": ("ReduceMean", [node("ReduceMean", "i", "p", axes=[1])]),
+    "a root of whole numbers": ("Pow", [node("Pow", "i k", "p")]),
+    "half of rectified whole numbers": (
+        "Relu", [node("Relu", "i", "s"), node("Div", "s two", "p")],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OF_OTHER_KINDS)
+def test_results_of_another_kind_than_the_standard_tells_are_refused(name, tmp_path):
+    """The standard cuts these off to whole numbers."""
+    culprit, nodes = OF_OTHER_KINDS[name]
+    nodes = [CLIPPED, node("Cast", "c", "i", to=7), *nodes, node("Cast", "p", to=1)]
+    used = {each for one in nodes for each in one.input}
+    held = {key: each for key, each in HELD.items() if key in used}
+    path = saved(tmp_path / "net.onnx", nodes, held, opset=17)
+    with pytest.raises(ValueError, match=rf"\({culprit}\) is of INT64 by ONNX's rules"):
+        rj.Network.from_onnx(path)

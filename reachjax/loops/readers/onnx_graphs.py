@@ -382,3 +382,8 @@ def _require_told(
                 f"{told} computes in {kind_name(kind)} what depends on the input: only numbers of "
                 "32 and 64 bits, and truth values, are known"
             )
+        elif value.dtype.kind != KINDS[kind].kind:
+            raise ValueError(
+                f"{told} is of {kind_name(kind)} by ONNX's rules, and what is known of it here is "
+                f"of {value.dtype}: cast its operands to FLOAT before"
+            )

@@ -195,6 +195,22 @@ def settings(tmp_path, **more):
     return Settings(**given | {"training_steps": 500, "simulations": 20} | more)
 
 
+def test_an_instance_whose_process_failed_is_tried_again(tmp_path, monkeypatch):
+    calls = []
+
+    def failed(instance, settings):
+        calls.append(instance.title)
+        row = {"title": instance.title, "benchmark": instance.benchmark, "name": instance.name}
+        return row | {"verdict": "UNKNOWN", "limit": 60.0, "path": None, "stopped": "exit code 1"}
+
+    monkeypatch.setattr(study, "row_of", failed)
+    study.main(settings(tmp_path))
+    study.main(settings(tmp_path))
+    assert calls == ["single-pendulum-reach"] * 2
+    (row,) = study.stored(tmp_path / "results.json")
+    assert row["stopped"] == "exit code 1"
+
+
 @pytest.mark.costly
 def test_an_instance_has_a_row_a_line_and_a_verdict_that_is_proved_anew(
     tmp_path, monkeypatch, capsys

@@ -65,7 +65,8 @@ PLANT = "a plant such as reachjax.AffinePlant"
 
 NETWORK = (
     "a network such as reachjax.MLP, which MLP.from_flax makes of a flax network, and "
-    "MLP.from_layers of the pairs (W, b) of any other"
+    "MLP.from_layers of the pairs (W, b) of any other, or reachjax.Network(f, inputs, outputs) of "
+    "a function"
 )
 
 

@@ -31,6 +31,9 @@ AMONG = 32
 """So many are looked at where loops jump: where numbers that are compared are equal, as at the
 corners of a set of choices, rounding decides, and others are examined before."""
 
+CLEAR = 0.1
+"""A violation is clear if it is at least this part of the largest."""
+
 TOLERATED = 16
 """A simulated state may be beside the enclosure of its step by so many widths of that: rounding of
 compiled code is within it, but for what libraries of functions leave out."""
@@ -68,8 +71,12 @@ def suspects(loop: ClosedLoop, item: Requirement, rooms: np.ndarray, runs: Runs)
 def counterexample(
     loop: ClosedLoop, X0: AbstractSet, found: Iterable[Suspect], start: int
 ) -> Counterexample | None:
-    """The worst suspect whose scenario surely is one and breaks its requirement; None if none."""
-    ordered = sorted(found, key=lambda suspect: suspect.room)
+    """A suspect whose scenario surely is one and breaks its requirement; None if there is none.
+
+    The earliest of those that are clear, then the worst of the others: what is enclosed is as short
+    as it can be.
+    """
+    ordered = _clear_ones_first([*found])
     if not ordered:
         return None
     scenarios = Scenarios.of(loop, X0, len(ordered[0].states) - 1, start)
@@ -107,6 +114,17 @@ def counterexample(
             more = {"disturbances": w, "noises": v, "instant": instant, "decision": closest}
             return Counterexample(*parts, **more, **enclosed)
     return None
+
+
+def _clear_ones_first(found: list[Suspect]) -> list[Suspect]:
+    """Suspects that are beside what is required nearly as far as the worst, the earliest first."""
+    clear = CLEAR * min((suspect.room for suspect in found), default=0.0)
+
+    def order(suspect: Suspect) -> tuple[bool, int, float]:
+        unclear = suspect.room > clear
+        return unclear, 0 if unclear else suspect.item.time, suspect.room
+
+    return sorted(found, key=order)
 
 
 def _moved_inwards(

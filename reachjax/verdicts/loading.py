@@ -30,7 +30,7 @@ from reachjax.verdicts.verdict import KeptVerdict, Verdict
 
 MISSING = (
     "was written without its loop, whose functions cannot be stored: give the loop again, "
-    "load(path, loop=...)"
+    "load(path, loop=...), or --loop MODULE:NAME of python -m reachjax recheck"
 )
 
 

@@ -78,7 +78,7 @@ class LinearCertificate(AbstractProof):
         directions = np.broadcast_to(self.directions, (self.k, *self.directions.shape))
         box = self.X0.bounding_box()
         last = _last(self.loop, self.X0, box, directions, self.start, chosen)
-        return _numbers(last, len(self.directions))
+        return numbers(last, len(self.directions))
 
 
 def _last(
@@ -98,7 +98,17 @@ def _last(
     return last
 
 
-def _numbers(found: ByForms | None, facets: int) -> Float[np.ndarray, " f"]:
+def over_cell(
+    loop: ClosedLoop, cell: Cell, found: ByForms | None, facets: int
+) -> Float[np.ndarray, " f"]:
+    """The offsets that forms over a cell prove of it, or those over what it is a part of."""
+    source = cell.source
+    if found is not None and source is not None:
+        found = found.over_part(subbox_columns(loop, source.part, source.box, cell.box))
+    return numbers(found, facets)
+
+
+def numbers(found: ByForms | None, facets: int) -> Float[np.ndarray, " f"]:
     """The offsets that forms prove; infinite where they overflow or a unit has no bounds."""
     if found is None:
         return np.full(facets, np.inf)
@@ -187,14 +197,10 @@ class CellCertificate(AbstractProof):
     ) -> Float[np.ndarray, " f"]:
         """What forms over a cell prove, or those over what it is a part of, which are kept."""
         source = cell.source or cell
-        given = self.loop, source.part, source.box, directions, self.start
-        if cell.source is None:
-            return _numbers(_last(*given, most=self.ways), directions.shape[1])
+        known = sources.get(id(source))
         if id(source) not in sources:
-            sources[id(source)] = _last(*given, most=self.ways)
-        known = sources[id(source)]
-        if known is not None and known.forms is not None:
-            known = known.over_part(subbox_columns(self.loop, source.part, source.box, cell.box))
-        elif known is not None:  # of what is cut by a ball, nothing is said of parts
-            known = None
-        return _numbers(known, directions.shape[1])
+            given = self.loop, source.part, source.box, directions, self.start
+            known = _last(*given, most=self.ways)
+        if cell.source is not None:
+            sources[id(source)] = known
+        return over_cell(self.loop, cell, known, directions.shape[1])

@@ -6,7 +6,7 @@ products of facts, ellipsoids. Each step rests on the sets that are proved by th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.loops.scenarios import Scenarios
+from reachjax.loops.units import UnboundedError
 from reachjax.methods.ladder import Ladder
 from reachjax.methods.recursion import goals_of
 from reachjax.methods.steps import Setting, Step, boxed
@@ -33,9 +34,9 @@ from reachjax.programs.relaxations import (
 from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.programs.windows import Window
 from reachjax.proofs.branches import BranchCertificate
-from reachjax.proofs.by_forms import CellCertificate, LinearCertificate
+from reachjax.proofs.by_forms import CellCertificate, LinearCertificate, numbers, over_cell
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
-from reachjax.sets import AbstractSet, AbstractTemplate, Polytope
+from reachjax.sets import AbstractSet, AbstractTemplate, Box, Polytope
 from reachjax.sets.cells import from_tree
 from reachjax.solvers import Auto
 from reachjax.tubes.reach import ReachTube
@@ -68,16 +69,14 @@ Again = tuple[AbstractProof, Float[np.ndarray, " f"]]
 
 
 class _Unrolled(NamedTuple):
-    """Forms over parts of the initial set, step after step.
+    """Forms over a part of the initial set, step after step.
 
     Attributes:
-        key: what they were made with.
-        parts: the steps of each part, so many of which were taken.
-        taken: how many.
+        steps: those that are left.
+        taken: how many were taken.
     """
 
-    key: Any
-    parts: list[Iterator[ByForms]]
+    steps: Iterator[ByForms]
     taken: int = 0
 
 
@@ -118,7 +117,7 @@ class Repeat:
         self._tube, self._sets = tube, sets
         self._within: dict[tuple[int, ...], Repeat] = {}
         self.again = list[AbstractProof]()
-        self._forms = _Unrolled(None, [])
+        self._forms: dict[Any, _Unrolled] = {}
         self._windows: dict[Origin, Window] = {}
 
     def of(self, k: int, proof: AbstractProof) -> Again:
@@ -139,7 +138,8 @@ class Repeat:
             if cut is None or not cut.needs_programs:  # its slopes hold on intervals without them
                 own["X0"] = own["X0"].closed_form(self._box)
             (found,) = self._by_forms(k, ("slopes", last.k), [(own["X0"], self._box)], slopes)
-            return proof.replace(**own, slopes=jax.device_put(slopes[:k])), found
+            proof = proof.replace(**own, slopes=jax.device_put(slopes[:k]))
+            return proof, numbers(found, len(own["directions"]))
         if isinstance(proof, CellCertificate):
             return self._by_cells(k, proof.replace(**own))
         if isinstance(proof, BranchCertificate):
@@ -164,31 +164,45 @@ class Repeat:
         self,
         k: int,
         key: Any,
-        parts: Any,
+        parts: Sequence[tuple[AbstractSet, Box]],
         slopes: Float[np.ndarray, "k units"] | None = None,
         most: int = 1,
-    ) -> Float[np.ndarray, "c f"]:
-        """The bounds over each of these parts of the initial set."""
-        tube, forms = self._tube, self._forms
-        if forms.key != key or forms.taken >= k:
-            steps = range(1, tube.horizon + 1 if slopes is None else len(slopes) + 1)
-            directions = np.stack([np.asarray(self._directions(j)) for j in steps])
-            given: Any = directions, tube.start, slopes
-            forms = _Unrolled(
-                key, [unrolled(tube.loop, *part, *given, most=most) for part in parts]
-            )
-        found = list[np.ndarray]()
-        for _ in range(forms.taken, k):
-            found = [np.asarray(next(each).offsets) for each in forms.parts]
-        self._forms = forms._replace(taken=k)
-        return np.where(np.isnan(found), np.inf, found)
+    ) -> list[ByForms | None]:
+        """The forms over each of these parts of the initial set; None where a unit has no bounds.
+
+        They go on from the step before of those parts that were asked for then.
+        """
+        tube, before, self._forms = self._tube, self._forms, {}
+        steps = range(1, tube.horizon + 1 if slopes is None else len(slopes) + 1)
+        directions = np.stack([np.asarray(self._directions(j)) for j in steps])
+        found = list[ByForms | None]()
+        for part, box in parts:
+            name = key, np.asarray(box.lower).tobytes(), np.asarray(box.upper).tobytes()
+            forms = before.get(name)
+            if forms is None or forms.taken >= k:
+                given: Any = part, box, directions, tube.start, slopes
+                forms = _Unrolled(unrolled(tube.loop, *given, most=most))
+            last = None
+            for _ in range(forms.taken, k):
+                last = _next(forms.steps)
+            self._forms[name] = forms._replace(taken=k)
+            found.append(last)
+        return found
 
     def _by_cells(self, k: int, proof: CellCertificate) -> Again:
         """The proof over cells, each by forms and by what else is said of it."""
         axes = np.asarray(proof.axes).tolist()
         cells = from_tree(self._tube.sets[0], axes)
-        parts = ((cell.part, cell.box) for cell in cells)
-        found = self._by_forms(k, (proof.ways, *axes), parts, most=proof.ways)
+        wholes = {id(cell.source or cell): cell.source or cell for cell in cells}
+        parts = [(whole.part, whole.box) for whole in wholes.values()]
+        forms = self._by_forms(k, proof.ways, parts, most=proof.ways)
+        known, given = dict(zip(wholes, forms, strict=True)), len(proof.directions)
+        found = np.stack(
+            [
+                over_cell(self._tube.loop, cell, known[id(cell.source or cell)], given)
+                for cell in cells
+            ]
+        )
         if not proof.proofs:
             return proof, found.max(axis=0)
         if len(proof.proofs) != len(cells):
@@ -292,6 +306,14 @@ class Repeat:
         self._windows[key] = window
         program = window.program(directions, LinearBounds())
         return program.replace(products=holding(said.products, window.layout))
+
+
+def _next(steps: Iterator[ByForms]) -> ByForms | None:
+    """What forms say of the next step; None from the first one on where a unit has no bounds."""
+    try:
+        return next(steps, None)
+    except UnboundedError:
+        return None
 
 
 def holding(products: Products, layout: FactLayout) -> Products:

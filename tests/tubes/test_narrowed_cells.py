@@ -11,6 +11,7 @@ import reachjax as rj
 from reachjax.methods import cells
 from reachjax.programs.unrolled import subbox_columns, unrolled
 from reachjax.sets.cells import from_tree
+from reachjax.tubes import repeats
 
 STEPS = 2
 LOWER, UPPER = np.array([-0.5, -0.3]), np.array([0.7, 0.6])
@@ -70,6 +71,31 @@ def test_proofs_are_rechecked_from_files_too(loop, tube, tmp_path):
         proof = each.proof(STEPS)
         assert inherited(proof)
         assert (proof.recheck() == proof.bounds).all()
+
+
+def test_a_tube_is_proved_anew_by_as_many_forms_as_it_rests_on(loop, tube, tmp_path, monkeypatch):
+    begun = []
+
+    def counted(*given, **options):
+        begun.append(given[2])
+        return unrolled(*given, **options)
+
+    monkeypatch.setattr(repeats, "unrolled", counted)
+    tube.save(tmp_path / "tube.npz")
+    again = rj.load(tmp_path / "tube.npz", loop=loop, recheck=True)
+    for k in range(1, STEPS + 1):
+        assert (again.sets[k].b == tube.sets[k].b).all()
+        assert (again.proof(k).bounds == tube.proof(k).bounds).all()
+    proofs = [tube.proof(k) for k in range(1, STEPS + 1)]
+    wholes = [
+        {
+            np.asarray((cell.source or cell).box.lower).tobytes()
+            for cell in from_tree(proof.X0, axes)
+        }
+        for proof in proofs
+        for axes in [np.asarray(proof.axes).tolist()]
+    ]
+    assert len(begun) <= sum(map(len, wholes)) < sum(proof.cells for proof in proofs)
 
 
 def test_forms_over_a_part_hold_there_and_are_no_larger(loop):

@@ -20,10 +20,18 @@ import jax
 
 
 def _loop(name: str) -> Any:
-    """What a module calls so, or what its function of that name gives."""
+    """What a module calls so, or what its function of that name gives.
+
+    Raises:
+        ValueError: it is no name of a module and one in it.
+    """
     module, _, path = name.partition(":")
+    if not module or not path:
+        raise ValueError(
+            f"--loop must be MODULE:NAME, such as plants:make_loop, but {name} arrived"
+        )
     found: Any = importlib.import_module(module)
-    for part in path.split(".") if path else ():
+    for part in path.split("."):
         found = getattr(found, part)
     return found() if callable(found) else found
 
@@ -71,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (OSError, ValueError, TypeError, ImportError, AttributeError) as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
         return 1
-    print(found)  # noqa: T201
+    print(f"{given.file}, rechecked from what it is about alone:\n{found}")  # noqa: T201
     return 0
 
 

@@ -79,9 +79,9 @@ def plot_set(
             "such as coordinates=(0, 1)"
         )
     i, j = _two_of(region.dimension, (0, 1) if coordinates is None else coordinates)
+    ax = _axes(ax)
     from matplotlib.patches import Polygon
 
-    ax = _axes(ax)
     ax.add_patch(Polygon(region.outline(i, j), closed=True, **{**SET, **style}))
     ax.autoscale_view()
     return ax
@@ -151,10 +151,10 @@ def draw_boxes(
     """
     dimension = next(len(box.lower) for *_, boxes in groups.values() for box in boxes)
     i, j = _two_of(dimension, coordinates)
+    ax, handles = _axes(ax), []
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Patch, Rectangle
 
-    ax, handles = _axes(ax), []
     for name, (color, edge, boxes) in groups.items():
         if not boxes:
             continue
@@ -177,10 +177,19 @@ def _name_axes(ax: Axes, i: int, j: int) -> None:
 
 
 def _axes(ax: Axes | None) -> Axes:
+    """The axes that are given, else those of a new figure.
+
+    Raises:
+        ImportError: matplotlib is missing.
+    """
     if ax is not None:
         return ax
-    import matplotlib.pyplot as plt
-
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError:
+        raise ImportError(
+            "a figure needs the package matplotlib: pip install 'reachjax[plot]'"
+        ) from None
     return plt.subplots()[1]
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -13,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.numerics.checks import described
 from reachjax.numerics.compilations import compiler_options
 from reachjax.sets import PolyhedralSet
 from reachjax.training.objectives import TrainingBatch
@@ -146,6 +149,25 @@ def _advanced(
     updates, state = program.optimizer.update(slopes, state, weights)
     moved: Any = optax.apply_updates(weights, updates)
     return moved, state, *losses
+
+
+def require_loss(task_loss: TaskLoss) -> None:
+    """Raise an error for what cannot be called with a loop and initial states.
+
+    Raises:
+        TypeError: it is that.
+    """
+    expected = "task_loss must be a function of a loop and initial states"
+    if not callable(task_loss):
+        raise TypeError(f"{expected}, but {described(task_loss)} arrived")
+    with contextlib.suppress(ValueError):  # of what has no signature nothing is known
+        signature = inspect.signature(task_loss)
+        try:
+            signature.bind(None, None)
+        except TypeError as error:
+            raise TypeError(
+                f"{expected}, but one of {signature} arrived, which takes no two of them: {error}"
+            ) from error
 
 
 def _one_number(name: str, value: Any) -> Array:

@@ -32,7 +32,6 @@ from reachjax.methods.propagation import Progress, known_numbers, require_kinds
 from reachjax.numerics.archives import writable
 from reachjax.numerics.budget import Budget, Interrupted
 from reachjax.numerics.checks import (
-    described,
     real_number,
     require_bar,
     require_double_precision,
@@ -57,6 +56,7 @@ from reachjax.training.steps import (
     compiled_loss,
     compiled_step,
     hashable,
+    require_loss,
     under,
     weights_of,
 )
@@ -231,11 +231,7 @@ def train(
         "the loop's number of states is", "the dimension of X0 is", (loop.states, X0.dimension)
     )
     loop.check_horizon(horizon, start)
-    if not callable(task_loss):
-        raise TypeError(
-            "task_loss must be a function of a loop and initial states, but "
-            f"{described(task_loss)} arrived"
-        )
+    require_loss(task_loss)
     if not stages or not all(isinstance(stage, Stage) for stage in stages):
         raise TypeError(
             f"stages must be some of type Stage, such as Stage(Certified()), but {stages} arrived"

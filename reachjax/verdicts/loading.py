@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from concurrent.futures import Executor
 
 from reachjax.loops import ClosedLoop
@@ -90,22 +91,35 @@ def load(
         require_kind("loop", loop, ClosedLoop, "a ClosedLoop")
     found = existing_file("path", path)
     kept = read(found, owned(loop), MISSING)
+    if loop is not None and isinstance(kept, Kept):
+        _require_own(kept, path, [loop])
     try:
         require_kind("it", kept, Kept, "something with the seal of its loop")
         tube = _verdict(kept) if isinstance(kept.tube, KeptVerdict) else tube_of(kept)
     except Exception as error:  # whoever wrote it may have written anything
         message = f"{path} must hold a tube or a verdict, but something else arrived: {error}"
         raise UnreadableError(message) from error
-    if loop is not None and not all(map(kept.is_of, (loop, *_loops(tube)))):
-        raise ValueError(
-            f"loop must be that of the tube in {path}, with the same equations and numbers, but "
-            "another one arrived (or another version of JAX, which writes its equations otherwise)"
-        )
+    if loop is not None:
+        _require_own(kept, path, _loops(tube))
     if not recheck:
         return tube
     if isinstance(tube, Verdict):
         return rechecked_verdict(tube, progress, executor)
     return rechecked_tube(tube, progress)
+
+
+def _require_own(kept: Kept, path: str | os.PathLike[str], loops: Sequence[ClosedLoop]) -> None:
+    """Raise an error for loops that are not the one whose seal a file has.
+
+    Raises:
+        ValueError: one is another.
+    """
+    if not all(map(kept.is_of, loops)):
+        raise ValueError(
+            f"loop must be that of the tube or verdict in {path}, with the same equations and "
+            "numbers, but another one arrived (or another version of JAX, which writes its "
+            "equations otherwise)"
+        )
 
 
 def _loops(tube: ReachTube | PartitionedTube | Verdict) -> list[ClosedLoop]:

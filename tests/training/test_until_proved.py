@@ -238,6 +238,7 @@ def test_a_history_is_told_and_drawn():
     ("wrong", "error", "match"),
     [
         ({"task_loss": 3.0}, TypeError, "task_loss must be a function"),
+        ({"task_loss": lambda loop: 0.0}, TypeError, r"one of \(loop\) arrived.* too many"),
         ({"task_loss": lambda loop, states: states}, ValueError, "task_loss must give one number"),
         ({"stages": (rj.Certified(),)}, TypeError, "stages must be some of type Stage"),
         ({"X0": rj.Polytope([[1.0], [-1.0]], [2.0, -1.0])}, TypeError, "X0 must be a Box"),

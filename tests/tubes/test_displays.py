@@ -88,6 +88,12 @@ def test_without_pandas_the_error_says_what_to_install(tube, monkeypatch):
         tube.to_dataframe()
 
 
+def test_without_matplotlib_the_error_says_what_to_install(tube, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(ImportError, match=r"pip install 'reachjax\[plot\]'"):
+        tube.plot()
+
+
 def test_a_plot_is_that_of_the_function(tube, parts):
     for each in (tube, parts):
         ax = Figure().subplots()

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.__main__ import main
 from reachjax.tubes.rechecks import ROUNDING
 from reachjax.tubes.saving import keep
 from reachjax.verdicts import rechecks
@@ -406,3 +407,27 @@ def test_a_bar_must_pass_on_all_cells(tmp_path):
     verdict.save(tmp_path / "a.verdict")
     with pytest.raises(ValueError, match="progress must pass on each cell, but 1 did not arrive"):
         rj.load(tmp_path / "a.verdict", recheck=True, progress=lambda cells: list(cells)[1:])
+
+
+def test_of_a_loop_with_other_states_the_loop_is_what_is_wrong(tmp_path):
+    one, two = (
+        rj.ClosedLoop(
+            rj.NonlinearPlant(lambda x, u: 0.5 * x + u[0], n, 1),
+            rj.Network(lambda x: 0 * x[:1], n, 1),
+        )
+        for n in (1, 2)
+    )
+    rj.decide(one, rj.Box([1.0], [2.0]), 1, goal=rj.Box([0.0], [1.0])).save(
+        tmp_path / "one.verdict"
+    )
+    with pytest.raises(ValueError, match="loop must be that of the tube or verdict in"):
+        rj.load(tmp_path / "one.verdict", two)
+
+
+@pytest.mark.parametrize("name", ["plants.make_loop", "plants:", ":make_loop"])
+def test_a_loop_is_named_by_its_module_and_its_name(name, capsys):
+    assert main(["recheck", "one.verdict", "--loop", name]) == 1
+    assert (
+        f"--loop must be MODULE:NAME, such as plants:make_loop, but {name}"
+        in capsys.readouterr().err
+    )

@@ -104,8 +104,9 @@ class Function:
                 f"place of np.sin ({str(error).splitlines()[0]})"
             ) from error
         except (TypeError, ValueError, IndexError) as error:
+            hint = ", of which one of size 1 has its number at [0]" if 1 in inputs else ""
             raise ValueError(
-                f"{name} cannot be called with vectors of sizes {list(inputs)}: {error}"
+                f"{name} cannot be called with vectors of sizes {list(inputs)}{hint}: {error}"
             ) from error
         made = cls(parameters, Structure(trace, inputs, outputs))
         made._check(name)
@@ -117,7 +118,10 @@ class Function:
         shapes = [tuple(each.shape) for each in results]
         if shapes != [(outputs,)]:
             arrived = shapes[0] if len(shapes) == 1 else shapes
-            raise ValueError(f"{name} must return shape ({outputs},), but {arrived} arrived")
+            raise ValueError(
+                f"{name} must return one array of shape ({outputs},), as jnp.array([...]) makes of "
+                f"numbers, but {arrived} arrived"
+            )
         (kind,) = (each.dtype for each in results)
         if not jnp.issubdtype(kind, jnp.floating) and not jnp.issubdtype(kind, jnp.integer):
             raise ValueError(f"{name} must return real numbers, but {kind} arrived")

@@ -20,6 +20,9 @@ COLOURS = {"PROVED": "green", "REFUTED": "red", "UNKNOWN": "yellow"}
 WITHIN = 1.02
 """Errors up to so many times that of plain training are called as good."""
 
+POINT = 20.0
+"""The least size of a scattered point in a legend, in square points."""
+
 
 def table(title: str, left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence]) -> Table:
     """A table in the style of all experiments.
@@ -59,14 +62,22 @@ def panels(rows: int, columns: int, size: tuple[float, float], **options: Any):
 
 
 def legend_below(figure, order: Sequence[str] = (), **options: Any) -> None:
-    """One legend for all panels, each name once; in the given order if there is one."""
+    """One legend for all panels, each name once; in the given order if there is one.
+
+    Points of a scatter plot are at least `POINT` in size there, however small they are drawn.
+    """
+    from matplotlib.collections import PathCollection
+
     found = {}
     for ax in figure.axes:
         for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):
             found.setdefault(name, handle)
     names = [name for name in order or found if name in found]
     options = {"loc": "outside lower center", "ncols": len(names), "frameon": False} | options
-    figure.legend([found[name] for name in names], names, **options)
+    legend = figure.legend([found[name] for name in names], names, **options)
+    for handle in legend.legend_handles:
+        if isinstance(handle, PathCollection):
+            handle.set_sizes(np.maximum(handle.get_sizes(), POINT))
 
 
 def draw_tube(

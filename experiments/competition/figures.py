@@ -21,7 +21,10 @@ STYLES: dict[str, dict[str, Any]] = {
 }
 """How regions are drawn, by what they are for."""
 
-ORDER = "sampled states", "certified at samples", *STYLES, "counterexample"
+CERTIFIED = "certified at samples"
+"""The name of certified boxes and intervals in the legend."""
+
+ORDER = "sampled states", CERTIFIED, *STYLES, "counterexample"
 """The order of names in the legend."""
 
 
@@ -47,14 +50,18 @@ def draw(
     figure, (axes,) = report.panels(1, len(planes), (5 * len(planes), 4.4))
     for ax, (one, other) in zip(axes, planes, strict=True):
         x, y = (_along(runs[:DRAWN], k) for k in (one, other))
-        for k, X in ((k, X) for tube in tubes for k, X in enumerate(tube.sets)):
-            _box(ax, X.bounding_box(), k, (one, other), x, y)
+        if one:
+            for box in (X.bounding_box() for tube in tubes for X in tube.sets):
+                _box(ax, box, (one, other), x, y)
+        else:
+            _intervals(ax, tubes, other, y)
         lines = ax.plot(x.T, y.T, color="tab:blue", linewidth=0.4, alpha=0.5)
         lines[0].set_label("sampled states")
         if verdict.counterexample is not None:
             broken = verdict.counterexample.states[None]
             a, b = (_along(broken, k)[0] for k in (one, other))
-            ax.plot(a, b, ".-", color="tab:red", linewidth=1, label="counterexample")
+            style = {"color": "tab:red", "linewidth": 1, "zorder": 4}
+            ax.plot(a, b, ".-", label="counterexample", **style)
         _regions(ax, instance, period, (one, other))
         ax.set(xlabel=f"$x_{{{one}}}$" if one else "period", ylabel=f"$x_{{{other}}}$")
     figure.suptitle(f"{instance.benchmark} {instance.name}: {verdict.status.name}", fontsize=10)
@@ -69,15 +76,50 @@ def _along(runs: Float[np.ndarray, "c t n"], k: int) -> Float[np.ndarray, "c t"]
     return np.broadcast_to(np.arange(runs.shape[1], dtype=float), runs.shape[:2])
 
 
-def _box(ax: Any, box: rj.Box, k: int, plane: tuple[int, int], x: Any, y: Any) -> None:
+def _box(ax: Any, box: rj.Box, plane: tuple[int, int], x: Any, y: Any) -> None:
     """A box in the plane, if it is no hundred times as large as what is sampled."""
-    ends = [(k, k) if not j else (float(box.lower[j - 1]), float(box.upper[j - 1])) for j in plane]
-    (left, right), (low, high) = ends
-    if high - low > 100 * max(np.ptp(y), 1e-9) or right - left > 100 * max(np.ptp(x), 1e-9):
+    (left, right), (low, high) = ((float(box.lower[j - 1]), float(box.upper[j - 1])) for j in plane)
+    if _far(right - left, x) or _far(high - low, y):
         return
     around = [left, right, right, left, left], [low, low, high, high, low]
-    ax.fill(*around, color="gold", alpha=0.5, label="certified at samples")
+    ax.fill(*around, color="gold", alpha=0.5, label=CERTIFIED)
     ax.plot(*around, color="goldenrod", linewidth=1)
+
+
+def _intervals(ax: Any, tubes: Sequence[rj.ReachTube], k: int, y: Any) -> None:
+    """Intervals of a coordinate over time, above the trajectories, if they are not far larger."""
+    found: dict[int, list[tuple[float, float]]] = {}
+    for step, X in ((step, X) for tube in tubes for step, X in enumerate(tube.sets)):
+        box = X.bounding_box()
+        low, high = float(box.lower[k - 1]), float(box.upper[k - 1])
+        if not _far(high - low, y):
+            found.setdefault(step, []).append((low, high))
+    rows = [(step, *ends) for step, each in found.items() for ends in joined(each)]
+    if rows:
+        steps, low, high = np.array(rows).T
+        style: dict[str, Any] = {"color": "darkorange", "capsize": 3, "zorder": 3}
+        ax.errorbar(steps, low, [0 * low, high - low], fmt="none", label=CERTIFIED, **style)
+
+
+def joined(intervals: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The union of intervals, as intervals that are apart.
+
+    Example:
+        >>> joined([(2.0, 3.0), (0.0, 1.0), (0.5, 1.5)])
+        [(0.0, 1.5), (2.0, 3.0)]
+    """
+    found: list[tuple[float, float]] = []
+    for low, high in sorted(intervals):
+        if found and low <= found[-1][1]:
+            found[-1] = found[-1][0], max(high, found[-1][1])
+        else:
+            found.append((low, high))
+    return found
+
+
+def _far(width: float, sampled: Float[np.ndarray, "..."]) -> bool:
+    """Whether it is a hundred times as wide as what is sampled."""
+    return width > 100 * max(np.ptp(sampled), 1e-9)
 
 
 def _regions(ax: Any, instance: Instance, period: float | None, plane: tuple[int, int]) -> None:

@@ -64,7 +64,7 @@ class Settings:
     path: tyro.conf.Positional[Path | None] = None
     """A clone of the public benchmark repository; none to train networks of the same shapes."""
     only: tuple[str, ...] = ()
-    """Instances whose titles contain one of these; all without any."""
+    """Instances whose titles contain one of these, with hyphens or spaces; all without any."""
     limit: float = 120.0
     """Seconds that a decision may take."""
     processes: int = dataclasses.field(default_factory=lambda: os.cpu_count() or 1)
@@ -81,7 +81,7 @@ class Settings:
         if self.path is not None and not self.path.is_dir():
             raise ValueError(f"PATH must be a folder, but {self.path} arrived")
         for word in self.only:
-            if not any(word.lower() in title for title in instances()):
+            if not any(is_named(title, word) for title in instances()):
                 raise ValueError(
                     f"--only must name some of {', '.join(instances())}, but {word} arrived (PATH "
                     "comes before the options)"
@@ -94,8 +94,18 @@ class Settings:
         return [
             instance
             for title, instance in every
-            if not self.only or any(word.lower() in title for word in self.only)
+            if not self.only or any(is_named(title, word) for word in self.only)
         ]
+
+
+def is_named(title: str, word: str) -> bool:
+    """Whether a word of `--only` names an instance.
+
+    Example:
+        >>> is_named("single-pendulum-reach", "Single Pendulum")
+        True
+    """
+    return word.lower().replace(" ", "-") in title
 
 
 def loop_of(title: str, settings: Settings) -> rj.ClosedLoop:

@@ -177,16 +177,18 @@ def main(settings: Settings) -> None:
         results[name] = {"seconds": seconds, "widths": worst}
         shown = (0, 1) if n == 2 else (2, 3)
         few = states[:2000, :, shown]
-        ax.scatter(*few.reshape(-1, 2).T, s=0.3, color="tab:blue", rasterized=True)
-        for box in (each.bounding_box() for each in tube.sets):
+        points: dict[str, Any] = {"s": 0.3, "color": "tab:blue", "rasterized": True}
+        ax.scatter(*few.reshape(-1, 2).T, label="simulated", **points)
+        for k, box in enumerate(each.bounding_box() for each in tube.sets):
             (left, bottom), (right, top) = (
                 np.asarray(end)[list(shown)] for end in (box.lower, box.upper)
             )
-            ax.plot(
-                [left, right, right, left, left], [bottom, bottom, top, top, bottom], "k", lw=0.8
-            )
+            around = [left, right, right, left, left], [bottom, bottom, top, top, bottom]
+            colour, label = ("tab:red", "certified") if k else ("black", "initial set")
+            ax.plot(*around, color=colour, lw=0.8, label=label, zorder=2 if k else 3)
         ax.set(title=name, xlabel=f"$x_{shown[0] + 1}$", ylabel=f"$x_{shown[1] + 1}$")
-    figure.savefig(settings.output / "actions.png", dpi=150)
+    report.legend_below(figure)
+    report.save(figure, settings.output / "actions.png")
     np.savez_compressed(settings.output / "actions.npz", **kept)
     report.write(settings.output / "actions.json", settings, results=results)
 

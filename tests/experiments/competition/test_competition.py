@@ -253,6 +253,12 @@ def test_options_that_cannot_be_are_named(tmp_path, more, named):
         settings(tmp_path, **more)
 
 
+@pytest.mark.parametrize("word", ["Single Pendulum", "single-pendulum", "SINGLE-PENDULUM reach"])
+def test_an_instance_is_named_as_its_benchmark_or_as_its_title(tmp_path, word):
+    (instance,) = settings(tmp_path, only=(word,)).chosen
+    assert instance.title == "single-pendulum-reach"
+
+
 def test_corners_leave_flat_coordinates_alone():
     box = rj.Box([0.0, 1.0, 2.0], [1.0, 1.0, 3.0])
     assert sorted(map(tuple, study.corners(box))) == [

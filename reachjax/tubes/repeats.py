@@ -240,7 +240,8 @@ class Repeat:
             step = len(self.again) + 1
             proof, bounds = self.of(step, self._tube.proof(step))
             self.again.append(proof)
-            self._sets.append(Polytope(self._directions(step), bounds))
+            claimed = np.fmax(bounds, np.asarray(proof.bounds))  # the set that later ones rest on
+            self._sets.append(Polytope(self._directions(step), claimed))
         return np.asarray(self._sets[k].facets[1])
 
     @cached_property

@@ -19,15 +19,11 @@ def same(one, other):
 
 
 def alike(one, other):
-    """Whether two trees are the same, up to the rounding of a proof that is made again.
-
-    What its programs are made of rests on bounds of units by linear programs of their own, whose
-    dual variables are as good as where a solver stopped, which depends on the last bit.
-    """
+    """Whether two trees are the same, up to the rounding of a proof that is made again."""
     if jax.tree.structure(one) != jax.tree.structure(other):
         return False
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return all(np.allclose(*pair, rtol=1e-8, atol=1e-12, equal_nan=True) for pair in pairs)
+    return all(np.allclose(*pair, rtol=1e-12, atol=1e-15, equal_nan=True) for pair in pairs)
 
 
 def is_proof(node):

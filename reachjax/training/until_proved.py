@@ -167,8 +167,9 @@ def train(
     Its loss is that of the task plus a weight times an objective, which is zero where nothing is
     missed. Stages make it sharper: simulated trajectories, then affine forms over few cells of the
     initial set, then over many. Between epochs `decide` looks whether all is proved, and says where
-    it is not. A controller that is proved is led back to the given one as far as that lowers the
-    task's loss and it stays proved, and is trained on while that goes on.
+    it is not. A controller that is proved after some epochs is led back to the given one as far as
+    that lowers the task's loss and it stays proved, and is trained on while that goes on; one that
+    is proved as it was given is not trained.
 
     Args:
         loop: the closed loop, whose controller is where training begins: an `MLP`, or a `Network`

@@ -83,6 +83,7 @@ def test_a_tube_is_proved_anew_by_as_many_forms_as_it_rests_on(loop, tube, tmp_p
     monkeypatch.setattr(repeats, "unrolled", counted)
     tube.save(tmp_path / "tube.npz")
     again = rj.load(tmp_path / "tube.npz", loop=loop, recheck=True)
+    assert isinstance(again, rj.ReachTube)
     for k in range(1, STEPS + 1):
         assert (again.sets[k].b == tube.sets[k].b).all()
         assert (again.proof(k).bounds == tube.proof(k).bounds).all()

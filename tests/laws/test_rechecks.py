@@ -25,7 +25,14 @@ def least(proof):
         part, facets = SOLVED_TO, len(getattr(proof, "solver_offsets", ()))
         by_intervals = interval_offsets(jax.device_get(proof.program))[:facets]
         bounds = np.r_[np.fmin(bounds[:facets], by_intervals), bounds[facets:]]
+    elif any(isinstance(each, rj.AbstractCertificate) for each in parts_of(proof)):
+        part = SOLVED_TO  # over cells
     return bounds - part * np.maximum(1.0, abs(bounds))
+
+
+def parts_of(proof):
+    """The proofs over cells that a proof is made of."""
+    return [each for own in getattr(proof, "proofs", ()) for each in own]
 
 
 @each()

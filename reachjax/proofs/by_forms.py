@@ -196,7 +196,7 @@ class CellCertificate(AbstractProof):
         sources: dict[int, ByForms | None],
     ) -> Float[np.ndarray, " f"]:
         """What forms over a cell prove, or those over what it is a part of, which are kept."""
-        source = cell.source or cell
+        source = cell.whole
         known = sources.get(id(source))
         if id(source) not in sources:
             given = self.loop, source.part, source.box, directions, self.start

@@ -41,6 +41,11 @@ class Cell(NamedTuple):
     part: AbstractSet
     source: Cell | None = None
 
+    @property
+    def whole(self) -> Cell:
+        """The cell whose bounds are its own: its source, or itself."""
+        return self.source or self
+
 
 def grid(X: AbstractSet, counts: Sequence[int]) -> list[Cell]:
     """Equal parts of the box around a set, those that it reaches.

@@ -193,15 +193,12 @@ class Repeat:
         """The proof over cells, each by forms and by what else is said of it."""
         axes = np.asarray(proof.axes).tolist()
         cells = from_tree(self._tube.sets[0], axes)
-        wholes = {id(cell.source or cell): cell.source or cell for cell in cells}
+        wholes = {id(cell.whole): cell.whole for cell in cells}
         parts = [(whole.part, whole.box) for whole in wholes.values()]
         forms = self._by_forms(k, proof.ways, parts, most=proof.ways)
         known, given = dict(zip(wholes, forms, strict=True)), len(proof.directions)
         found = np.stack(
-            [
-                over_cell(self._tube.loop, cell, known[id(cell.source or cell)], given)
-                for cell in cells
-            ]
+            [over_cell(self._tube.loop, cell, known[id(cell.whole)], given) for cell in cells]
         )
         if not proof.proofs:
             return proof, found.max(axis=0)

@@ -26,7 +26,7 @@ def least(proof):
         by_intervals = interval_offsets(jax.device_get(proof.program))[:facets]
         bounds = np.r_[np.fmin(bounds[:facets], by_intervals), bounds[facets:]]
     elif any(isinstance(each, rj.AbstractCertificate) for each in parts_of(proof)):
-        part = SOLVED_TO  # over cells
+        part = SOLVED_TO  # bounds of cells are such bounds
     return bounds - part * np.maximum(1.0, abs(bounds))
 
 

@@ -89,10 +89,7 @@ def test_a_tube_is_proved_anew_by_as_many_forms_as_it_rests_on(loop, tube, tmp_p
         assert (again.proof(k).bounds == tube.proof(k).bounds).all()
     proofs = [tube.proof(k) for k in range(1, STEPS + 1)]
     wholes = [
-        {
-            np.asarray((cell.source or cell).box.lower).tobytes()
-            for cell in from_tree(proof.X0, axes)
-        }
+        {np.asarray(cell.whole.box.lower).tobytes() for cell in from_tree(proof.X0, axes)}
         for proof in proofs
         for axes in [np.asarray(proof.axes).tolist()]
     ]

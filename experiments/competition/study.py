@@ -34,7 +34,7 @@ from rich.table import Table
 
 import reachjax as rj
 from experiments import report
-from experiments.benchmark.rivals.processes import Stopped, from_process, workers
+from experiments.benchmark.rivals.processes import Stopped, TookTooLong, from_process, workers
 from experiments.command import bar, configure_jax, require_options
 from experiments.competition import figures
 from experiments.competition.instances import Instance, instances
@@ -246,7 +246,7 @@ def row_of(instance: Instance, settings: Settings) -> dict:
         for found in from_process(decided, title, settings, patience=patience):
             row |= found
     except Stopped as stopped:
-        row["stopped"] = str(stopped)
+        row["stopped"], row["failed"] = str(stopped), not isinstance(stopped, TookTooLong)
     if (settings.output / "verdicts" / f"{title}.verdict").exists():
         try:
             for found in from_process(rechecked, title, settings, patience=patience):
@@ -346,7 +346,7 @@ def main(settings: Settings) -> None:
                 row = known.get(instance.title, {})
                 if row.get("key") != key:
                     row = row_of(instance, settings) | {"commit": version()}
-                    row |= {} if "stopped" in row else {"key": key}  # what failed is tried again
+                    row |= {} if row.get("failed") else {"key": key}  # what failed is tried again
                 rows.append(row)
                 known[instance.title] = row
                 report.write(path, settings, machine=machine(), rows=list(known.values()))

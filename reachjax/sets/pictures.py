@@ -186,10 +186,10 @@ def _axes(ax: Axes | None) -> Axes:
         return ax
     try:
         import matplotlib.pyplot as plt
-    except ImportError:
+    except ImportError as error:
         raise ImportError(
-            "a figure needs the package matplotlib: pip install 'reachjax[plot]'"
-        ) from None
+            f"a figure needs the package matplotlib: pip install 'reachjax[plot]' ({error})"
+        ) from error
     return plt.subplots()[1]
 
 

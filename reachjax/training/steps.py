@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import inspect
@@ -160,14 +159,14 @@ def require_loss(task_loss: TaskLoss) -> None:
     expected = "task_loss must be a function of a loop and initial states"
     if not callable(task_loss):
         raise TypeError(f"{expected}, but {described(task_loss)} arrived")
-    with contextlib.suppress(ValueError):  # of what has no signature nothing is known
+    try:
         signature = inspect.signature(task_loss)
-        try:
-            signature.bind(None, None)
-        except TypeError as error:
-            raise TypeError(
-                f"{expected}, but one of {signature} arrived, which takes no two of them: {error}"
-            ) from error
+    except (TypeError, ValueError):  # of what has no signature nothing is known
+        return
+    try:
+        signature.bind(None, None)
+    except TypeError as error:
+        raise TypeError(f"{expected}, but one of {signature} arrived: {error}") from error
 
 
 def _one_number(name: str, value: Any) -> Array:

@@ -68,16 +68,27 @@ Again = tuple[AbstractProof, Float[np.ndarray, " f"]]
 """A proof with all that it rests on made again, and the bounds that it proves."""
 
 
-class _Unrolled(NamedTuple):
-    """Forms over a part of the initial set, step after step.
+class _Unrolled:
+    """Forms over a part of the initial set, made step after step, of which the last is kept.
+
+    Args:
+        steps: what they say of the first step, the second, and so on.
 
     Attributes:
-        steps: those that are left.
-        taken: how many were taken.
+        taken: how many steps were made.
     """
 
-    steps: Iterator[ByForms]
-    taken: int = 0
+    def __init__(self, steps: Iterator[ByForms]):
+        self._steps, self.taken = steps, 0
+        self._last: ByForms | None = None
+
+    def at(self, k: int) -> ByForms | None:
+        """What they say of the step `k`, which is not before those made; None without bounds."""
+        assert k >= self.taken
+        while self.taken < k:
+            self._last = _next(self._steps)
+            self.taken += 1
+        return self._last
 
 
 class _CellTube(NamedTuple):
@@ -170,7 +181,7 @@ class Repeat:
     ) -> list[ByForms | None]:
         """The forms over each of these parts of the initial set; None where a unit has no bounds.
 
-        They go on from the step before of those parts that were asked for then.
+        Forms of parts that were asked for at the step before go on from there.
         """
         tube, before, self._forms = self._tube, self._forms, {}
         steps = range(1, tube.horizon + 1 if slopes is None else len(slopes) + 1)
@@ -179,14 +190,11 @@ class Repeat:
         for part, box in parts:
             name = key, np.asarray(box.lower).tobytes(), np.asarray(box.upper).tobytes()
             forms = before.get(name)
-            if forms is None or forms.taken >= k:
+            if forms is None or forms.taken > k:
                 given: Any = part, box, directions, tube.start, slopes
-                forms = _Unrolled(unrolled(tube.loop, *given, most=most))
-            last = None
-            for _ in range(forms.taken, k):
-                last = _next(forms.steps)
-            self._forms[name] = forms._replace(taken=k)
-            found.append(last)
+                forms = before[name] = _Unrolled(unrolled(tube.loop, *given, most=most))
+            self._forms[name] = forms
+            found.append(forms.at(k))
         return found
 
     def _by_cells(self, k: int, proof: CellCertificate) -> Again:
@@ -232,13 +240,20 @@ class Repeat:
         return self._within[key]
 
     def until(self, k: int) -> Float[np.ndarray, " f"]:
-        """The bounds of the step `k` of a cell, whose proofs so far are made again."""
+        """The bounds of the step `k` of a cell, whose proofs so far are made again.
+
+        Each step rests on sets as large as the proofs say, or larger where these say too little:
+        smaller ones would make other programs of later steps.
+
+        Raises:
+            Exception: of any kind: a proof does not fit the tube, or proves nothing.
+        """
         while len(self.again) < k:
             step = len(self.again) + 1
             proof, bounds = self.of(step, self._tube.proof(step))
-            self.again.append(proof)
-            claimed = np.fmax(bounds, np.asarray(proof.bounds))  # the set that later ones rest on
-            self._sets.append(Polytope(self._directions(step), claimed))
+            rested = np.maximum(bounds, np.asarray(proof.bounds))  # NaN where one of them is
+            self._sets.append(Polytope(self._directions(step), rested))
+            self.again.append(proof.replace(bounds=rested))
         return np.asarray(self._sets[k].facets[1])
 
     @cached_property

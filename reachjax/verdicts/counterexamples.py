@@ -32,7 +32,7 @@ AMONG = 32
 corners of a set of choices, rounding decides, and others are examined before."""
 
 CLEAR = 0.1
-"""A violation is clear if it is at least this part of the largest."""
+"""A violation is clear if it is at least this part of the largest one of its requirement."""
 
 TOLERATED = 16
 """A simulated state may be beside the enclosure of its step by so many widths of that: rounding of
@@ -73,8 +73,8 @@ def counterexample(
 ) -> Counterexample | None:
     """A suspect whose scenario surely is one and breaks its requirement; None if there is none.
 
-    The earliest of those that are clear, then the worst of the others: what is enclosed is as short
-    as it can be.
+    The earliest of those that are clear, then the worst of the others: of an early one few periods
+    are enclosed.
     """
     ordered = _clear_ones_first([*found])
     if not ordered:
@@ -117,11 +117,13 @@ def counterexample(
 
 
 def _clear_ones_first(found: list[Suspect]) -> list[Suspect]:
-    """Suspects that are beside what is required nearly as far as the worst, the earliest first."""
-    clear = CLEAR * min((suspect.room for suspect in found), default=0.0)
+    """Suspects nearly as far beside a requirement as its worst, the earliest first; then others."""
+    worst = dict[str, float]()
+    for room, item, *_ in found:
+        worst[item.name] = min(room, worst.get(item.name, 0.0))
 
     def order(suspect: Suspect) -> tuple[bool, int, float]:
-        unclear = suspect.room > clear
+        unclear = suspect.room > CLEAR * worst[suspect.item.name]
         return unclear, 0 if unclear else suspect.item.time, suspect.room
 
     return sorted(found, key=order)

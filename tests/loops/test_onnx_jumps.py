@@ -50,6 +50,10 @@ GRAPHS = {
         *WINNER, node("Gather", "row a", "i"), node("Div", "i minus", "q"),
         node("Add", "q a", "r"), node("Cast", "r", to=1),
     ],
+    "half of rectified whole numbers": [
+        CLIPPED, node("Cast", "c", "i", to=6), node("Relu", "i", "r"), node("Cast", "r", "s", to=7),
+        node("Div", "s two", "h"), node("Cast", "h", to=1),
+    ],
     "a comparison as a number": [node("Greater", "x k", "g"), node("Cast", "g", to=1)],
     "one of two": [node("Less", "x k", "g"), node("Neg", "x", "n"), node("Where", "g x n")],
     "one of two numbers": [node("Greater", "x k", "g"), node("Where", "g k high")],
@@ -100,10 +104,7 @@ def test_what_jumps_is_what_onnxruntime_computes_also_at_ties(name, tmp_path):
 OF_OTHER_KINDS = {
     "a mean of whole numbers": ("ReduceMean", [node("ReduceMean", "i", "p", axes=[1])]),
     "a root of whole numbers": ("Pow", [node("Pow", "i k", "p")]),
-    "half of rectified whole numbers": (
-        "Relu", [node("Relu", "i", "s"), node("Div", "s two", "p")],
-    ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", OF_OTHER_KINDS)

@@ -142,3 +142,17 @@ def test_where_forms_have_no_bounds_boxes_go_on_and_say_nothing_false():
     assert first.lower[0] <= 0.0 <= first.upper[0] < 1e-150
     assert not last.lower[0] > 0.0
     assert not last.upper[0] < 0.0
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_the_earliest_clear_violation_is_shown_whatever_the_units_of_another_one(scale):
+    """A state that grows by one at each step is beside the limit of 2.5 by a tenth of 27.5 at six.
+
+    The second state is in other units: how far it is beside its own limit says nothing of that.
+    """
+    plant = rj.AffinePlant(np.eye(2), np.zeros((2, 1)), [1.0, 1.0 / scale])
+    loop = rj.ClosedLoop(plant, rj.MLP.from_layers([([[0.0, 0.0]], [0.0])]))
+    start = rj.Box([0.0, 0.0], [1e-3, 1e-3 / scale])
+    safe, avoid = rj.Polytope([[1.0, 0.0]], [2.5]), rj.Polytope([[0.0, -1.0]], [-25.5 / scale])
+    example = rj.decide(loop, start, 30, safe=safe, avoid=[avoid]).counterexample
+    assert (example.requirement, example.time) == ("safe", 6)

@@ -18,6 +18,10 @@ class Stopped(Exception):  # noqa: N818
     """A process took too long, or ended by itself before it was done."""
 
 
+class TookTooLong(Stopped):
+    """A process was ended, as it had taken too long."""
+
+
 def from_process(
     function: Callable[..., Iterator[Any]], *arguments: Any, patience: float
 ) -> Iterator[Any]:
@@ -29,7 +33,8 @@ def from_process(
         patience: seconds between two results, after which the process is ended.
 
     Raises:
-        Stopped: it was, or it failed; what it yielded until then has arrived.
+        TookTooLong: it was.
+        Stopped: it failed; what it yielded until then has arrived.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -52,7 +57,7 @@ def from_process(
     finally:
         process.kill()
         process.join()
-    raise Stopped(f"it took more than {patience} seconds")
+    raise TookTooLong(f"it took more than {patience} seconds")
 
 
 def workers(count: int) -> AbstractContextManager[ProcessPoolExecutor | None]:

@@ -385,5 +385,5 @@ def _require_told(
         elif value.dtype.kind != KINDS[kind].kind:
             raise ValueError(
                 f"{told} is of {kind_name(kind)} by ONNX's rules, and what is known of it here is "
-                f"of {value.dtype}: cast its operands to FLOAT before"
+                f"of {value.dtype}: where whole numbers are not meant, cast its operands to FLOAT"
             )

@@ -337,7 +337,7 @@ OPERATORS: dict[str, Operator] = {
     "RMSNormalization": Operator(moving.rms_normalised, NORMALISED),
     "Range": Operator(moving.ranged, known=(0, 1, 2)),
     "Reciprocal": Operator(lambda attributes, x: 1.0 / x),
-    "Relu": Operator(lambda attributes, x: over(x).maximum(x, 0.0)),
+    "Relu": Operator(lambda attributes, x: over(x).maximum(x, np.zeros((), x.dtype))),
     "Reshape": Operator(moving.reshaped, ("allowzero",), known=(1,)),
     "Selu": Operator(
         lambda a, x: a["gamma"] * _elu(a, x),

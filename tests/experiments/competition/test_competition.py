@@ -195,20 +195,28 @@ def settings(tmp_path, **more):
     return Settings(**given | {"training_steps": 500, "simulations": 20} | more)
 
 
-def test_an_instance_whose_process_failed_is_tried_again(tmp_path, monkeypatch):
+@pytest.mark.parametrize("failed", [True, False])
+def test_an_instance_is_tried_again_if_its_process_failed(failed, tmp_path, monkeypatch):
+    """What took too long would do so again."""
     calls = []
 
-    def failed(instance, settings):
+    def stopped(instance, settings):
         calls.append(instance.title)
         row = {"title": instance.title, "benchmark": instance.benchmark, "name": instance.name}
-        return row | {"verdict": "UNKNOWN", "limit": 60.0, "path": None, "stopped": "exit code 1"}
+        return row | {
+            "verdict": "UNKNOWN",
+            "limit": 60.0,
+            "path": None,
+            "stopped": "so",
+            "failed": failed,
+        }
 
-    monkeypatch.setattr(study, "row_of", failed)
+    monkeypatch.setattr(study, "row_of", stopped)
     study.main(settings(tmp_path))
     study.main(settings(tmp_path))
-    assert calls == ["single-pendulum-reach"] * 2
+    assert calls == ["single-pendulum-reach"] * (1 + failed)
     (row,) = study.stored(tmp_path / "results.json")
-    assert row["stopped"] == "exit code 1"
+    assert row["stopped"] == "so"
 
 
 @pytest.mark.costly

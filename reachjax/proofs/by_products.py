@@ -77,7 +77,8 @@ class EllipsoidCertificate(AbstractCertificate):
     ) -> Float[np.ndarray, " 1"]:
         """What `|A x + b| / s` surely does not exceed, by these or other multipliers.
 
-        Sound for any multipliers; for the certificate's own it is 1 at most.
+        Sound for any multipliers; for the certificate's own it is 1 at most. Infinite unless `s` is
+        positive and finite.
 
         Raises:
             ValueError: the multipliers contain NaN or infinity, or have another shape.
@@ -93,6 +94,8 @@ class EllipsoidCertificate(AbstractCertificate):
         """
         proposed = self._proposed(multipliers)
         program, form, level = jax.device_get((self.program, self.form, self.level))
+        if not 0 < level < np.inf:
+            return np.array([np.inf])
         return np.array([sound_level(program, proposed, form) / level])
 
 

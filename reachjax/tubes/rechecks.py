@@ -216,7 +216,8 @@ def _require_witnesses(tube: ReachTube) -> None:
     for (k, facet, said, _), run, within in zip(claims, runs, inside, strict=True):
         with np.errstate(all="ignore"):  # what overflows attains nothing
             value, size = _value(tube.sets[k], facet, run[: k + 1])
-        if not within or not abs(value - said) <= ROUNDING * size:
+        attained = np.isfinite(size) and abs(value - said) <= ROUNDING * size
+        if not (within and attained):
             found = "it does not begin in the initial set" if not within else f"{value:.12g}"
             raise DisagreementError(
                 f"the witness of step {k} for facet {facet} is said to attain {said:.12g}, but "

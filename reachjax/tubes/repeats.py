@@ -35,6 +35,7 @@ from reachjax.programs.unrolled import ByForms, unrolled
 from reachjax.programs.windows import Window
 from reachjax.proofs.branches import BranchCertificate
 from reachjax.proofs.by_forms import CellCertificate, LinearCertificate, numbers, over_cell
+from reachjax.proofs.by_products import Certificate, EllipsoidCertificate, MixedCertificate
 from reachjax.proofs.certificates import AbstractCertificate, AbstractProof
 from reachjax.sets import AbstractSet, AbstractTemplate, Box, Polytope
 from reachjax.sets.cells import from_tree
@@ -137,6 +138,15 @@ class Repeat:
         Raises:
             Exception: of any kind: it does not fit the tube.
         """
+        again, found = self._again(k, proof)
+        facets, ball = self._tube.template.at(k).parts
+        asked = ((0 if facets is None else len(facets.directions)) + (ball is not None),)
+        if np.shape(proof.bounds) != asked or found.shape != asked:
+            counts = np.shape(proof.bounds), found.shape
+            raise ValueError(f"{counts[1]} numbers are proved and {counts[0]} said, not {asked}")
+        return again, found
+
+    def _again(self, k: int, proof: AbstractProof) -> Again:
         tube = self._tube
         own: dict[str, Any] = {"loop": tube.loop, "X0": tube.sets[0], "k": k, "start": tube.start}
         own["directions"] = self._directions(k)
@@ -155,13 +165,20 @@ class Repeat:
             return self._by_cells(k, proof.replace(**own))
         if isinstance(proof, BranchCertificate):
             proof = self._branches(k, proof)
-        elif isinstance(proof, AbstractCertificate):
+        elif type(proof) is self._by_products(k):
             goals = goals_of(tube.template.at(k), self._step(k - 1, LocalBounds()))
             rows = [goal.rows(tube.loop.states) for goal in goals]
             proof = proof.replace(program=self._program(k, jnp.concatenate(rows), proof.program))
         else:
-            raise TypeError(f"{type(proof).__name__} proves no set of a tube")
+            raise TypeError(f"{type(proof).__name__} proves no set of this template")
         return proof, np.asarray(proof.recheck())
+
+    def _by_products(self, k: int) -> type[AbstractCertificate]:
+        """The kind of certificate that programs give of the parts of the set after `k` steps."""
+        facets, ball = self._tube.template.at(k).parts
+        if ball is None:
+            return Certificate
+        return EllipsoidCertificate if facets is None else MixedCertificate
 
     def _directions(self, k: int) -> Any:
         """The directions of the facets of the set after `k` steps; None of ellipsoids."""
@@ -188,7 +205,8 @@ class Repeat:
         directions = np.stack([np.asarray(self._directions(j)) for j in steps])
         found = list[ByForms | None]()
         for part, box in parts:
-            name = key, np.asarray(box.lower).tobytes(), np.asarray(box.upper).tobytes()
+            numbers_of, kind = jax.tree.flatten((part, box))
+            name = key, kind, *(np.asarray(each).tobytes() for each in numbers_of)
             forms = before.get(name)
             if forms is None or forms.taken > k:
                 given: Any = part, box, directions, tube.start, slopes
@@ -215,9 +233,11 @@ class Repeat:
         again = list(proof.proofs)
         for number, cell in enumerate(cells):
             if again[number]:
-                own = self._over(k, number, axes, cell.part)
+                own, count = self._over(k, number, axes, cell.part), len(again[number])
+                if count > k:
+                    raise ValueError(f"a cell has {count} proofs after {k} steps")
                 found[number] = np.fmin(found[number], own.until(k))
-                again[number] = tuple(own.again[k - len(again[number]) : k])
+                again[number] = tuple(own.again[k - count : k])
         return proof.replace(proofs=tuple(again)), found.max(axis=0)
 
     def _over(self, k: int, number: int, axes: list[int], part: AbstractSet) -> Repeat:

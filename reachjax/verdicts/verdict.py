@@ -434,7 +434,8 @@ class WinningSet:
     Attributes:
         domain: the initial states that were asked about.
         cells: they cover it.
-        seal: a hash of the question: of the loop, the domain, and what is required of it when.
+        seal: a hash of the question, that is of the loop, the domain, and what is required of it
+            when, and of the cells.
     """
 
     domain: Box

@@ -172,15 +172,22 @@ def winning_set(
         )
         for number, item in enumerate(required)
     }
-    seal = seal_of(loop, domain, asked, start=start)
+
+    def found_of(cells: tuple[DecidedCell, ...]) -> WinningSet:
+        numbers = [[cell.lower, cell.upper, [cell.margin]] for cell in cells]
+        codes = [[*VerdictStatus].index(cell.status) for cell in cells]
+        said = [np.array([np.concatenate(each) for each in numbers]), np.array(codes, int)]
+        return WinningSet(domain, cells, seal_of(loop, domain, asked, said, start=start))
+
     ends = np.asarray(domain.lower), np.asarray(domain.upper)
     given = [DecidedCell(*ends, VerdictStatus.UNKNOWN, np.nan)]
     if known is not None:
         require_kind("known", known, WinningSet, "a WinningSet, as winning_set(...) returns it")
-        if not np.array_equal(known.seal, seal):
+        if not np.array_equal(known.seal, found_of(known.cells).seal):
             raise ValueError(
-                "known must be of the same loop, domain, start, horizon and requirements, but of "
-                "another question arrived: what was proved of that says nothing of this one"
+                "known must be of the same loop, domain, start, horizon and requirements, with the "
+                "cells that were found, but others arrived: what was proved of another question "
+                "says nothing of this one"
             )
         given = list(known.cells)
     roots = [Node(cell.lower, cell.upper, found=cell) for cell in given]
@@ -189,13 +196,13 @@ def winning_set(
         search.run(executor, progress)
         require_unbroken_cells(loop, domain, horizon, start, required, search.cells)
     except KeyboardInterrupt:
-        found = WinningSet(domain, search.cells, seal)
+        found = found_of(search.cells)
         message = (
             f"interrupted with {len(found.cells)} cells: this exception's `found` is the winning "
             "set so far, and winning_set(..., known=found) goes on"
         )
         raise Interrupted(message, found) from None
-    return WinningSet(domain, search.cells, seal)
+    return found_of(search.cells)
 
 
 class _Winning(AbstractSearch):

@@ -1,5 +1,6 @@
 """Winning sets: what is proved wins, what is refuted loses, and cells cover the domain."""
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -141,6 +142,15 @@ def test_it_is_shown(loop):
     assert len(ax.get_legend().get_texts()) == 3
     plt.close(ax.figure)
     assert found.contains([[100.0, 0.0]]).tolist() == [False]
+
+
+def test_cells_that_were_not_found_are_not_known(loop):
+    few = rj.winning_set(loop, DOMAIN, HORIZON, cells=20, **WANTED)
+    proved = tuple(cell._replace(status=PROVED) for cell in few.cells)
+    for cells in (proved, few.cells[1:], ()):
+        changed = dataclasses.replace(few, cells=cells)
+        with pytest.raises(ValueError, match="the cells that were found, but others arrived"):
+            rj.winning_set(loop, DOMAIN, HORIZON, cells=40, known=changed, **WANTED)
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,10 @@ def own_plant(gain: float = 1.0) -> Any:
         def steps(self):
             return None
 
+        @property
+        def clock(self):
+            return False
+
         def propagate(self, x, u, t=0, unit=None, w=None):
             return gain * (self.A @ x) + self.B @ u
 

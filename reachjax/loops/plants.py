@@ -63,8 +63,8 @@ class AbstractPlant(Replaceable, abc.ABC):
 
     @property
     def clock(self) -> bool:
-        """Whether it is a function of the time, whatever that is; not here."""
-        return False
+        """Whether `propagate` may depend on `t`: it may, unless a plant says that it does not."""
+        return True
 
     @property
     @abc.abstractmethod
@@ -196,6 +196,11 @@ class AffinePlant(AbstractPlant):
         """The number of times a time-varying plant is given for; `None` when time-invariant."""
         return next((array.shape[0] for array in self._varying().values()), None)
 
+    @property
+    def clock(self) -> bool:
+        """False: at each time its matrices are those that it is given."""
+        return False
+
     def at(self, t: int | jax.Array) -> tuple[Array, Array, Array]:
         """`(A_t, B_t, c_t)`.
 
@@ -317,6 +322,11 @@ class NonlinearPlant(AbstractPlant):
     def steps(self) -> int | None:
         """No number of steps: the function is one of any time, if it knows it."""
         return None
+
+    @property
+    def clock(self) -> bool:
+        """False: the function has no time among its arguments."""
+        return False
 
     def propagate(
         self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None

@@ -47,6 +47,11 @@ class AbstractSampledPlant(AbstractPlant):
     period: Float[Array | np.ndarray, ""]
 
     @property
+    def clock(self) -> bool:
+        """Whether its equation has the time among its arguments; not here."""
+        return False
+
+    @property
     @abc.abstractmethod
     def flow(self) -> AbstractFlow:
         """Its flow over one period."""

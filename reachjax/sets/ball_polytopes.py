@@ -21,11 +21,11 @@ ENTRIES = {3: 2, 4: 1, 5: 1}
 SLACK = 1e-6
 """The part of its size that a polytope is smaller or larger by, on account of rounding."""
 
-THIN = 1e10
+THIN = 1e9
 """Beyond this ratio of the squares of its axes, rounding of an ellipsoid is no longer covered."""
 
 FAR = 1e8
-"""Beyond this distance from zero, in half-axes, rounding is no longer covered either."""
+"""Nor where what a distance from zero, in half-axes, is added up of is larger than this."""
 
 
 @lru_cache
@@ -85,7 +85,9 @@ def _checked(ellipsoid: Ellipsoid, name: str) -> int:
             f"{name} is an ellipsoid of dimension {n}, and up to {max(ENTRIES)} can be decided: "
             "give a Polytope within or around it"
         )
-    away = np.linalg.norm(np.asarray(ellipsoid.normal_form.A) @ np.asarray(ellipsoid.center))
+    away = np.linalg.norm(
+        abs(np.asarray(ellipsoid.normal_form.A)) @ abs(np.asarray(ellipsoid.center))
+    )
     if np.linalg.cond(shape) > THIN or away > FAR:
         raise ValueError(
             f"{name} is too thin, or too small for its distance from zero, for an ellipsoid to be "

@@ -34,6 +34,12 @@ POINTS = np.concatenate([-SIZES[::-1], [0.0], SIZES])
 SCALES = 10.0 ** np.array([-3, 0, 1, 2, 3, 6])
 """Sizes of the inputs on which networks are compared, for the same reason."""
 
+ROUNDED = 4e-6
+"""By this part of what a layer adds up 32-bit floats may round it: some sixty roundings."""
+
+LEAST = 1e-30
+"""What is smaller than this is lost in 32-bit floats."""
+
 
 def read_activation(activation: Any) -> Any:
     """The activation object that computes what a flax function does; objects are left as they are.
@@ -190,15 +196,17 @@ def _require_same_outputs(source: Callable, pairs: list[tuple[Any, Any]], activa
     sizes = np.repeat(SCALES, 8)[:, None]
     points = (draws.reshape(-1, inputs) * sizes).astype(np.float32)
     try:
-        expected = np.asarray(source(jnp.asarray(points)), dtype=float)
+        with jax.default_matmul_precision("highest"):
+            expected = np.asarray(source(jnp.asarray(points)), dtype=float)
     except Exception as error:
         raise ValueError(f"source cannot be evaluated, so it cannot be read: {error}") from error
-    z: Any = points.astype(float)
+    z, near = points.astype(float), np.zeros_like(points, float)
     for k, (W, b) in enumerate(pairs):
-        z = z @ np.asarray(W, float).T + np.asarray(b, float)
+        weights, shift = np.asarray(W, float).T, np.asarray(b, float)
+        near = near @ abs(weights) + ROUNDED * (abs(z) @ abs(weights) + abs(shift))
+        z = z @ weights + shift
         z = np.asarray(activation(jnp.asarray(z))) if k < len(pairs) - 1 else z
-    near = 1e-4 * np.maximum(sizes, 1.0)  # what rounding of 32-bit floats may differ by
-    if expected.shape != z.shape or not np.allclose(z, expected, rtol=1e-3, atol=near):
+    if expected.shape != z.shape or not (abs(z - expected) <= near + LEAST).all():
         raise ValueError(
             "source computes something else than its linear layers in the order in which they "
             f"were found, with {activation} between them; {ADVICE}"

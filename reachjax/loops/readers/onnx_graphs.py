@@ -16,7 +16,7 @@ from jaxtyping import Array
 from reachjax.loops.readers.arrays import require_finite
 from reachjax.loops.readers.kinds import BOOL, KINDS, REAL, WHOLE, kind_name, real
 from reachjax.loops.readers.onnx_files import FileNode, NetworkFile, read_file
-from reachjax.loops.readers.operators import OPERATORS, SIZES
+from reachjax.loops.readers.operators import JUMPS, OPERATORS, SIZES
 from reachjax.numerics.pytrees import pytree, static
 
 NETWORK = 32 * float(np.finfo(np.float32).eps)
@@ -338,7 +338,8 @@ def _built(file: NetworkFile) -> tuple[Graph, int]:
 def _constants(file: NetworkFile) -> set[str]:
     """Names of numbers that are no weights, since something needs them known or rounds them.
 
-    What of weights alone becomes another kind than a float of 32 or 64 bits is computed once.
+    What of weights alone becomes another kind than a float of 32 or 64 bits is computed once, and
+    so is what jumps where these are rounded.
     """
     moving = {name for name, _ in file.given}
     makers: dict[str, FileNode] = {}
@@ -348,7 +349,9 @@ def _constants(file: NetworkFile) -> set[str]:
         operator = OPERATORS[node.operator]
         if node.operator not in SIZES and any(name in moving for name in node.inputs):
             moving.update(node.outputs)
-        elif any(file.kinds.get(name) not in REAL for name in node.outputs if name):
+        elif node.operator in JUMPS or any(
+            file.kinds.get(name) not in REAL for name in node.outputs if name
+        ):
             left += [] if node.operator in SIZES else node.inputs
         left += [node.inputs[k] for k in operator.known + operator.fixed if k < len(node.inputs)]
     found: set[str] = set()

@@ -180,6 +180,8 @@ def _winner(name: str) -> Compute:
 
 def _one_hot(attributes: Attributes, places: Any, depth: Any, values: Any) -> Any:
     """One value at a place, counted from the end if it is negative, and another one elsewhere."""
+    if places.dtype.kind == "f":
+        raise ValueError("its places must be whole numbers: cast them to INT64 before")
     count, xp = int(np.ravel(depth)[0]), over(places)
     places = xp.where(places < 0, places + count, places)
     off, on = np.ravel(values)
@@ -358,6 +360,9 @@ OPERATORS: dict[str, Operator] = {
     "Unsqueeze": Operator(moving.unsqueezed, ("axes",), known=(1,)),
     "Where": Operator(_entrywise("where"), fixed=(1, 2)),
 }
+
+JUMPS = ("Ceil", "Floor", "Hardmax", "Mod", "Round", "Shrink", "Sign", "ThresholdedRelu")
+"""Operators whose results jump where their operands are rounded."""
 
 SIZES = ("Shape", "Size")
 """Operators whose results are known, whatever their operands are."""

@@ -60,7 +60,8 @@ class Recording(Interpreter):
         recorder, name = self._recorder, equation.primitive.name
         if name in PASSED:
             return [*operands]
-        key = name, tuple(map(_identity, operands)), str(equation.params)
+        kinds = [str(each.aval.dtype) for each in (*equation.invars, *equation.outvars)]
+        key = name, tuple(map(_identity, operands)), str(equation.params), *kinds
         if key not in recorder.known:
             recorder.line = line_of(equation) or recorder.line
             found = recorded(recorder, Equation(equation), operands)

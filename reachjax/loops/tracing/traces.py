@@ -26,6 +26,9 @@ Sizes = tuple[int, ...]
 SIZE = 32
 """Bytes of a description: two computations never have one."""
 
+PRECISION = r"b?float\d+| at 0x[0-9a-f]+"
+"""What names a precision in the parameters of an equation, and addresses of objects."""
+
 
 class UpdatedError(Exception):
     """A function changes variables of its own when it is called: it is another one afterwards."""
@@ -132,12 +135,15 @@ class Trace:
             return called(own, *vectors)
 
         names, whole = [each.name for each in kinds], of([None] * len(kinds))
-        made = called
         if any(names):
             own = jax.make_jaxpr(called)(of(names), *vectors)
             varies = [number >= len(kinds) for number in range(len(own.jaxpr.invars))]
-            made = brought_back if rounds_plain(own, varies) else called
-        return _owned(jax.make_jaxpr(made)(whole, *vectors))
+            if rounds_plain(own, varies) or _narrows(own):
+                return _owned(jax.make_jaxpr(brought_back)(whole, *vectors))
+        found = jax.make_jaxpr(called)(whole, *vectors)
+        if any(names) and [*_steps(own)] != [*_steps(found)]:  # it asks for a parameter's precision
+            found = jax.make_jaxpr(brought_back)(whole, *vectors)
+        return _owned(found)
 
     def function(self, parameters: Sequence[Any]) -> Callable:
         """The function with these parameters, as it is now."""
@@ -231,6 +237,39 @@ def equations(jaxpr: Any) -> Iterator[Any]:
         for value in equation.params.values():
             for inner in subjaxprs(value):
                 yield from equations(inner)
+
+
+def _narrows(closed: core.ClosedJaxpr) -> bool:
+    """Whether it brings floats to fewer bits."""
+    return any(
+        _bits(each.invars[0]) > _bits(each.outvars[0]) > 0
+        for each in equations(closed)
+        if each.primitive.name == "convert_element_type"
+    )
+
+
+def _bits(atom: Any) -> int:
+    """The bits of a float; 0 of what is none."""
+    kind = atom.aval.dtype
+    return jnp.finfo(kind).bits if jnp.issubdtype(kind, jnp.floating) else 0
+
+
+def _steps(closed: core.ClosedJaxpr) -> Iterator[Any]:
+    """What a jaxpr does, whatever the precision of its floats is."""
+    for each in _constants(closed):
+        yield np.asarray(each, float).tobytes() if jnp.isdtype(each.dtype, "numeric") else None
+    for equation in equations(closed):
+        if equation.primitive.name == "convert_element_type":
+            continue
+        yield equation.primitive.name
+        yield [v.val.tolist() if hasattr(v.val, "tolist") else v.val for v in _literals(equation)]
+        for name, value in sorted(equation.params.items()):
+            if name not in NAMES and not any(True for _ in subjaxprs(value)):
+                yield name, re.sub(PRECISION, "float", str(value))
+
+
+def _literals(equation: Any) -> list[Any]:
+    return [each for each in equation.invars if isinstance(each, core.Literal)]
 
 
 def _owned(value: Any) -> Any:

@@ -55,15 +55,24 @@ PIVOTS = (
 MOVES = ("dot_general", "transpose", "reshape", "broadcast_in_dim", "squeeze", "reduce_sum", "jit")
 """Primitives of products of a matrix and a vector that JAX's own solvers are made of."""
 
+APPROXIMATE = ("while", "scan", "cond")
+"""Primitives of solvers that end before the solution is found."""
+
 
 def _solved(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
-    """`custom_linear_solve`: what `jnp.linalg.solve` and `inv` are, with any solver."""
+    """`custom_linear_solve`, as `jnp.linalg.solve` and `inv` are: two triangles are solved."""
     counts, bodies = equation.params["const_lengths"], equation.params["jaxprs"]
     given, right = operands[: counts.matvec], operands[sum(counts) :]
     made = [each.primitive.name for each in equations(bodies.matvec)]
     if len(given) != 1 or len(right) != 1 or made.count("dot_general") != 1 or {*made} - {*MOVES}:
         raise UnsupportedError(
             "its product with a vector is not that of one matrix: use jnp.linalg.solve(A, b)"
+        )
+    by = [each.primitive.name for each in equations(bodies.solve)]
+    if by.count("triangular_solve") != 2 or {*by} & {*APPROXIMATE}:
+        raise UnsupportedError(
+            "its solver is not known to be exact, as those by iterations are not: use "
+            "jnp.linalg.solve(A, b)"
         )
     matrix, b = (entries(recorder, each) for each in (given[0], right[0]))
     if not b.size:

@@ -1,0 +1,137 @@
+"""Functions and files that look like others: they are read as they are, or refused."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from jax.scipy.sparse.linalg import cg
+from jax.tree_util import Partial
+
+import reachjax as rj
+from tests.loops.onnx_models import node, run, saved
+from tests.loops.traced import interval
+
+STILL = rj.MLP.from_layers([([[0.0]], [0.0])])
+BRAIN = jnp.array([[1.0, 0.3], [-0.7, 0.1]], jnp.bfloat16)
+SINGLE = jnp.array([0.1, 0.7], jnp.float32)
+
+
+def quotients(x):
+    """A quotient of counts, of reals and of whole numbers: the second is cut off."""
+    a, b = jnp.sum(x > 0), 1 + jnp.sum(x > 1)
+    return jnp.stack([a.astype(float) / b.astype(float), jax.lax.div(a, b).astype(float)])
+
+
+def square_of_eight_bits(x):
+    a = 12 * jnp.sum(x > 0, dtype=jnp.int8)
+    return jnp.stack([a.astype(float) * a.astype(float), (a * a).astype(float)])
+
+
+def one_iteration(x):
+    """A step towards the solution of equations, which is not it."""
+    return cg(jnp.diag(1 + x**2), jnp.ones(2), maxiter=1)[0]
+
+
+REFUSED = {
+    "a quotient of whole numbers beside one of reals": quotients,
+    "a product that wraps beside one of reals": square_of_eight_bits,
+    "a solver by iterations": one_iteration,
+    "an input in a parameter's sixteen bits": Partial(lambda w, x: x.astype(w.dtype) @ w, BRAIN),
+    "an input among zeros of a parameter's bits": Partial(
+        lambda w, x: jnp.zeros(2, w.dtype).at[:2].set(x) * w, SINGLE
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_not_read_exactly_is_refused(name):
+    with pytest.raises(TypeError):
+        rj.Network(REFUSED[name], 2, 2)
+
+
+def by_precision(w, x):
+    return 2 * x + w if w.dtype == jnp.float32 else x + w
+
+
+def least_difference(w, x):
+    return x + w + jnp.finfo(w.dtype).eps
+
+
+def powers(w, x):
+    return x ** (3 if w.dtype == jnp.float32 else 2) + w
+
+
+@pytest.mark.parametrize("function", [by_precision, least_difference, powers])
+def test_a_function_that_asks_for_a_parameters_precision_is_what_it_computes(function):
+    net = rj.Network(Partial(function, SINGLE), 2, 2)
+    x = np.array([0.3, -0.4])
+    expected = np.asarray(function(SINGLE, x), float)
+    low, high = interval(net, x, x)
+    assert (low <= expected).all()
+    assert (expected <= high).all()
+    np.testing.assert_allclose(net(x), expected, rtol=1e-15)
+
+
+class Gentle(nnx.Module):
+    """Two layers of small gain, with what is computed of their outputs."""
+
+    def __init__(self, activation, gain, end=lambda y: y):
+        self.first = nnx.Linear(2, 8, rngs=nnx.Rngs(0))
+        self.second = nnx.Linear(8, 1, rngs=nnx.Rngs(1))
+        for layer in (self.first, self.second):
+            layer.kernel[...] = gain * layer.kernel[...]
+        self.activation, self.end = activation, end
+
+    def __call__(self, x):
+        return self.end(self.second(self.activation(self.first(x))))
+
+
+@pytest.mark.parametrize(
+    ("activation", "gain", "end"),
+    [
+        (jnp.tanh, 3e-3, lambda y: y),
+        (lambda z: nnx.leaky_relu(z, 1e-4), 1.0, lambda y: y),
+        (nnx.relu, 1.0, lambda y: 1.0005 * y),
+        (nnx.relu, 1.0, lambda y: y + 1e-4),
+    ],
+)
+def test_a_module_is_not_read_as_one_that_is_nearly_the_same(activation, gain, end):
+    rj.MLP.from_flax(Gentle(nnx.relu, gain))
+    with pytest.raises(ValueError, match="computes something else"):
+        rj.MLP.from_flax(Gentle(activation, gain, end))
+
+
+@pytest.mark.parametrize("jump", ["Round", "Floor", "Ceil"])
+def test_weights_that_are_rounded_are_rounded_in_the_files_precision(jump, tmp_path):
+    nodes = [node("Div", "w s", "d"), node(jump, "d", "r"), node("Mul", "r s", "q")]
+    nodes += [node("MatMul", "x q")]
+    w = np.array([[0.35], [0.7], [-0.35]], np.float32)
+    path = saved(tmp_path / "net.onnx", nodes, {"w": w, "s": np.float32(0.1)})
+    net, x = rj.Network.from_onnx(path), np.array([0.3, -0.4, 1.0], np.float32)
+    np.testing.assert_allclose(net(jnp.asarray(x, float)), run(path, x=x[None]), rtol=1e-6)
+
+
+def test_one_hot_at_places_that_are_no_whole_numbers_is_refused(tmp_path):
+    held = {"depth": np.int64(4), "values": np.array([0.0, 1.0], np.float32)}
+    path = saved(tmp_path / "net.onnx", [node("OneHot", "x depth values")], held)
+    with pytest.raises(ValueError, match="cast them to INT64"):
+        rj.Network.from_onnx(path)
+
+
+def test_nothing_is_said_for_ever_of_a_plant_that_may_depend_on_the_time():
+    @jax.tree_util.register_dataclass
+    @dataclasses.dataclass(frozen=True)
+    class Late(rj.AbstractPlant):
+        rate: jax.Array
+        states, inputs, steps = 1, 1, None
+
+        def propagate(self, x, u, t=0, unit=None, w=None):
+            return self.rate * x + 0.0 * u + jnp.where(t >= 600, 10.0, 0.0)
+
+    X0 = rj.Box([-1.0], [1.0])
+    tube = rj.reach(rj.ClosedLoop(Late(jnp.array(0.5)), STILL), X0, 3, rj.Template.box(1))
+    with pytest.raises(ValueError, match="time"):
+        rj.verify(tube, safe=X0, forever=True)

@@ -126,7 +126,18 @@ def test_nothing_is_said_for_ever_of_a_plant_that_may_depend_on_the_time():
     @dataclasses.dataclass(frozen=True)
     class Late(rj.AbstractPlant):
         rate: jax.Array
-        states, inputs, steps = 1, 1, None
+
+        @property
+        def states(self):
+            return 1
+
+        @property
+        def inputs(self):
+            return 1
+
+        @property
+        def steps(self):
+            return None
 
         def propagate(self, x, u, t=0, unit=None, w=None):
             return self.rate * x + 0.0 * u + jnp.where(t >= 600, 10.0, 0.0)

@@ -303,9 +303,10 @@ class ClosedLoop(Replaceable, AbstractSealed):
     def equations(self) -> str:
         """What JAX traces of a step in which a class of a user has a part; nothing of others.
 
-        The name of such a class does not say what it computes.
+        The name of such a class does not say what it computes. Of a user's set of disturbances or
+        noise it is the box around it.
         """
-        if not written_elsewhere((self.plant, self.controller)):
+        if not written_elsewhere(self):
             return ""
 
         def step(loop: ClosedLoop, x: Array, t: Array, w: Array | None, v: Array | None) -> Any:
@@ -316,7 +317,11 @@ class ClosedLoop(Replaceable, AbstractSealed):
 
         x, t = jax.ShapeDtypeStruct((self.states,), float), jax.ShapeDtypeStruct((), int)
         draws = map(drawn_from, (self.disturbance, self.noise))
-        return str(description(jax.make_jaxpr(step)(self, x, t, *draws)))
+        traced = str(description(jax.make_jaxpr(step)(self, x, t, *draws)))
+        own = [each for each in (self.disturbance, self.noise) if written_elsewhere(each)]
+        boxes = [each.bounding_box() for each in own if each is not None]
+        ends = [np.asarray(end).tobytes().hex() for box in boxes for end in (box.lower, box.upper)]
+        return traced + "".join(ends)
 
     def simulate(
         self,

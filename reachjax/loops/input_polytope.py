@@ -35,6 +35,9 @@ class InputPolytope(Replaceable):
     normals: Normals = static()
     offsets: Float[Array, " r"]
 
+    def __post_init__(self):
+        self._check()
+
     @classmethod
     def of(cls, polytope: Polytope) -> InputPolytope:
         """The inputs of a polytope; a facet that is there more than once is kept once.
@@ -58,9 +61,7 @@ class InputPolytope(Replaceable):
             order = np.argsort(np.argsort(first))
             offsets = jax.ops.segment_min(offsets, order[group.reshape(-1)], len(first))
             C = C[np.sort(first)]
-        kept = cls(tuple(map(tuple, C.tolist())), offsets)
-        kept._check()
-        return kept
+        return cls(tuple(map(tuple, C.tolist())), offsets)
 
     @property
     def dimension(self) -> int:

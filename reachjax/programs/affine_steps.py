@@ -391,7 +391,7 @@ def _bilinear(
     one, other = y.every[:half], y.every[half:]
     lost = start.mixed_norms(one, other) + S * r_other + S_other * r + R * R_other
     lost = lost + errors(lambda: gamma(w + 8) * (S * R_other + S_other * R))
-    lost = lost * (1 + gamma(size + 16))
+    lost = lost * (1 + gamma((w + 1) * size + 16))  # compiled, all is one sum
     better = lost <= gap
     slope = select(xp.concatenate([better, better]), unit.derivative(center), planes)
     offset = folded(select(better, -(center[:half] * center[half:]), offset), count)

@@ -31,7 +31,15 @@ from reachjax.numerics.checks import (
     within_time_axis,
 )
 from reachjax.numerics.pytrees import Replaceable, converted, pytree
-from reachjax.numerics.rounding import TINY, exponents, gamma, lengths, raised, shifted
+from reachjax.numerics.rounding import (
+    TINY,
+    exponents,
+    gamma,
+    holds_subnormals,
+    lengths,
+    raised,
+    shifted,
+)
 from reachjax.sets import outlines, supports
 from reachjax.sets.balance import balanced
 from reachjax.sets.unusable import UnusableSetError
@@ -487,7 +495,10 @@ class Box(PolyhedralSet):
     def support(self, directions: Float[ArrayLike, "m n"]) -> Float[Array, " m"]:
         """`max a . x` over the box, attained at a corner; rounded up."""
         self._single()
-        return _support(self.lower, self.upper, self._directions(directions))
+        rows = self._directions(directions)
+        if is_concrete((self, rows)) and holds_subnormals((self, rows)):
+            return jnp.asarray(_support_in_numpy(*map(np.asarray, (self.lower, self.upper, rows))))
+        return _support(self.lower, self.upper, rows)
 
     def surely_contains(self, point: Float[ArrayLike, " n"]) -> bool:
         """Whether a point lies in the box: comparisons are exact."""
@@ -501,7 +512,8 @@ class Box(PolyhedralSet):
 
     def cut(self, box: Box) -> Box:
         """The points that lie in another box as well."""
-        return Box(jnp.maximum(self.lower, box.lower), jnp.minimum(self.upper, box.upper))
+        xp = np if is_concrete((self, box)) else jnp  # numpy knows subnormal numbers
+        return Box(xp.maximum(self.lower, box.lower), xp.minimum(self.upper, box.upper))
 
     def brought_inside(self, point: Vector, middle: Vector, scale: Matrix) -> Vector:
         """The closest point, which surely is in the box."""
@@ -576,6 +588,17 @@ def _support(
     inexact = jnp.any(rounded, axis=1) | (jnp.sum(terms != 0, axis=1) > 1)
     rounding = gamma(len(lower)) * jnp.sum(abs(terms), axis=1) + len(lower) * TINY
     return raised(jnp.sum(terms, axis=1) + jnp.where(inexact, rounding, 0.0), by)
+
+
+def _support_in_numpy(
+    lower: Float[np.ndarray, " n"], upper: Float[np.ndarray, " n"], directions: np.ndarray
+) -> Float[np.ndarray, " m"]:
+    """The same of numbers that XLA takes for zero."""
+    with np.errstate(all="ignore"):
+        terms = directions * np.where(directions > 0, upper, lower)
+        rounding = gamma(len(lower) + 2) * abs(terms).sum(axis=1) + 2 * len(lower) * TINY
+        found = terms.sum(axis=1) + rounding
+    return np.where(np.isnan(found), np.inf, found)
 
 
 def _normalised(numbers: Float[Array, "*batch n"]) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from reachjax.numerics.checks import whole_number
+from reachjax.numerics.checks import is_concrete, whole_number
 from reachjax.sets.base import AbstractSet, Box
 from reachjax.sets.intersection import Intersection
 from reachjax.sets.polytope import Polytope
@@ -87,9 +87,12 @@ def grid_ends(
     index = np.stack(np.meshgrid(*map(np.arange, numbers), indexing="ij"), axis=-1)
     index, many = index.reshape(-1, len(numbers)), np.asarray(numbers)
 
+    xp = np if is_concrete(box) else jnp  # numpy knows subnormal numbers, XLA does not
+    lower, upper = xp.asarray(box.lower), xp.asarray(box.upper)
+
     def ends(index: np.ndarray) -> Float[Array, "cells n"]:
-        within = index * (box.widths / many) + box.lower
-        return jnp.where(index == many, box.upper, within)  # exactly, and so nothing is left out
+        within = index * ((upper - lower) / many) + lower
+        return jnp.asarray(xp.where(index == many, upper, within))  # so nothing is left out
 
     return ends(index), ends(index + 1)
 

@@ -369,7 +369,8 @@ def most_room(item: Requirement, reached: Box) -> float:
 
 def _surely_within(ball: Ellipsoid, box: Box) -> bool:
     """Whether a box lies in an ellipsoid, in exact arithmetic: its corners do."""
-    return all(map(ball.surely_contains, np.asarray(box.corners())))
+    corners = np.asarray(box.corners())  # none of a box that has too many
+    return len(corners) > 0 and all(map(ball.surely_contains, corners))
 
 
 def _surely_beyond(ball: Ellipsoid, box: Box) -> bool:

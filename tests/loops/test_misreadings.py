@@ -1,5 +1,6 @@
 """Functions and files that look like others: they are read as they are, or refused."""
 
+import contextlib
 import dataclasses
 
 import jax
@@ -11,6 +12,8 @@ from jax.scipy.sparse.linalg import cg
 from jax.tree_util import Partial
 
 import reachjax as rj
+from reachjax.loops.units.step import Floor
+from reachjax.sets.cells import grid
 from tests.loops.onnx_models import node, run, saved
 from tests.loops.traced import interval
 
@@ -35,7 +38,14 @@ def one_iteration(x):
     return cg(jnp.diag(1 + x**2), jnp.ones(2), maxiter=1)[0]
 
 
+def written(w, x):
+    kept = jax.new_ref(w)
+    kept[...] = x
+    return kept[...]
+
+
 REFUSED = {
+    "an array that is written into": Partial(written, jnp.array([1.0, 2.0])),
     "a quotient of whole numbers beside one of reals": quotients,
     "a product that wraps beside one of reals": square_of_eight_bits,
     "a solver by iterations": one_iteration,
@@ -146,3 +156,80 @@ def test_nothing_is_said_for_ever_of_a_plant_that_may_depend_on_the_time():
     tube = rj.reach(rj.ClosedLoop(Late(jnp.array(0.5)), STILL), X0, 3, rj.Template.box(1))
     with pytest.raises(ValueError, match="time"):
         rj.verify(tube, safe=X0, forever=True)
+
+
+@pytest.mark.parametrize(
+    ("function", "low"),
+    [
+        (lambda x: jnp.where(jnp.isfinite(jnp.log(x)), x, -x), -1.0),
+        (lambda x: jnp.where(jnp.isnan(jnp.sqrt(x)), 1.0, 0.0), -1.0),
+        (lambda x: jnp.where(jnp.isinf(1 / x), 5.0, 0.0), 0.0),
+        (lambda x: jnp.where(jnp.log(x) > -jnp.inf, 0.0, 1.0), -1.0),
+        (lambda x: jnp.where(jnp.isfinite(jnp.exp(x)), 0.0, 1.0), 800.0),
+        (lambda x: jnp.floor(jnp.arcsin(x) / 4 + 0.5), 1.5),
+        (lambda x: 0.0 * jnp.sign(jnp.log(x)) + 1.0, -1.0),
+        (lambda x: jnp.hypot(0.0 * jnp.log(x), x), -1.0),
+    ],
+)
+def test_what_rests_on_a_number_says_nothing_where_there_is_none(function, low):
+    """Outside of a domain there is no number, whether or not the result is one."""
+    net = rj.Network(function, 1, 1)
+    loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[1.0]]), net)
+    around = rj.Box([low - 0.1], [low + 0.1])
+    with pytest.raises((ValueError, ArithmeticError)):
+        rj.reach(loop, around, 1, rj.Template.box(1), rj.LinearBounds())
+    with contextlib.suppress(ValueError):
+        assert not rj.decide(loop, around, 1, goal=rj.Box([-1e3], [1e3]), cells=4).proved
+
+
+def frozen(x):
+    """The solution for another matrix, as a solver that has its factors gives it."""
+    factor = jax.scipy.linalg.cho_factor(4 * jnp.eye(2))
+    return jax.lax.custom_linear_solve(
+        lambda v: jnp.diag(1 + x**2) @ v,
+        jnp.ones(2),
+        lambda mv, b: jax.scipy.linalg.cho_solve(factor, b),
+    )
+
+
+def frozen_of_known(x):
+    factor = jax.scipy.linalg.lu_factor(4 * jnp.eye(2))
+    return jax.lax.custom_linear_solve(
+        lambda v: jnp.diag(jnp.arange(1.0, 3.0)) @ v,
+        x,
+        lambda mv, b: jax.scipy.linalg.lu_solve(factor, b),
+    )
+
+
+@pytest.mark.parametrize("function", [frozen, frozen_of_known])
+def test_solvers_by_factors_of_another_matrix_are_refused(function):
+    with pytest.raises(TypeError, match=r"jnp\.linalg\.solve"):
+        rj.Network(function, 2, 2)
+
+
+def test_rectifiers_of_numbers_whose_width_overflows_are_not_zero():
+    for unit in (rj.ReLU(), rj.LeakyReLU(0.1)):
+        lines = unit.lines(np.array([-1.5e308, -1e300]), np.array([1.5e308, 1e-9]))
+        assert not lines.affine.any()
+        ends = lines.above.slope * np.array([1.5e308, 1e-9]) + lines.above.offset
+        assert (ends >= np.array([1.5e308, 1e-9])).all()
+
+
+def test_the_nearest_whole_number_away_from_zero_is_within_its_bounds():
+    unit = Floor(0.5, even=False)
+    y = np.array([-0.49999999999999994, 0.49999999999999994, -(2.0**52) - 1, 0.5, -0.5, 2.5])
+    found = unit(y)
+    assert found.tolist() == [0, 0, -(2.0**52) - 1, 1, -1, 3]
+    low, high = unit.interval(y, y)
+    assert ((low <= found) & (found <= high)).all()
+
+
+def test_numbers_that_compiled_code_takes_for_zero_are_not_lost():
+    tiny = 1e-310
+    assert float(rj.Box([0.0], [tiny]).support([[1.0]])[0]) >= tiny
+    assert float(rj.Box([0.0], [1e308]).support([[tiny]])[0]) >= tiny * 1e308
+    cells = grid(rj.Box([-tiny], [10 * tiny]), (2,))
+    assert min(float(np.asarray(cell.part.lower)[0]) for cell in cells) == -tiny
+    loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[0.0]]), STILL)
+    below, start = rj.Box([-1.0], [0.0]), rj.Box([0.0], [tiny])
+    assert not rj.decide(loop, start, 1, safe=below).proved

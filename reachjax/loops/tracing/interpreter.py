@@ -204,7 +204,9 @@ class Interpreter(abc.ABC):
         length, rows = params["length"], []
         order = range(length)[::-1] if params["reverse"] else range(length)
         for k in order:
-            given = [each[k] if self.is_plain(each) else self.entry(each, k) for each in streams]
+            given = [
+                _row(each, k) if self.is_plain(each) else self.entry(each, k) for each in streams
+            ]
             found = self.walk(params["jaxpr"], [*constants, *carry, *given], k)
             carry, row = found[: len(carry)], found[len(carry) :]
             rows.append(row)
@@ -361,3 +363,8 @@ def line_of(equation: Any) -> str:
         if _is_a_users(frame.file_name):
             return f" (in {frame.function_name}, {frame.file_name}:{frame.line_num})"
     return ""
+
+
+def _row(plain: Any, k: int) -> Any:
+    """An entry along the first axis; numpy makes a number of an entry, which is marked again."""
+    return Parameter.of(plain[k]) if isinstance(plain, Parameter) else plain[k]

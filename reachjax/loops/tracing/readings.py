@@ -36,6 +36,9 @@ DRAWS = ("random_", "rng_", "threefry")
 CALLBACKS = ("pure_callback", "io_callback")
 """Primitives that call Python, where nothing can be traced."""
 
+WRITES = ("get", "swap", "addupdate", "new_ref", "ref", "freeze")
+"""Primitives of arrays that are written into."""
+
 
 class Recording(Interpreter):
     """The steps of a function: each equation is recorded by its rule.
@@ -232,6 +235,8 @@ def require_traced(jaxpr: Any) -> None:
                 "it draws random numbers: what is random is a disturbance or a noise of the loop; "
                 "put modules into evaluation mode"
             )
+        if name in WRITES:
+            why = "it writes into an array: use x.at[...].set(...), which makes another one"
         if name in CALLBACKS:
             why = "what Python computes outside of JAX has no bounds: use functions of JAX"
         if why:

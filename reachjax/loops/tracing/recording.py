@@ -54,12 +54,15 @@ class Recorder:
         steps: that make them, the same; None for the inputs.
         known: results of equations, and their operands, which are so kept alive.
         line: where a user wrote the equation at hand.
+        required: values that must be real numbers, as what is read rests on that, whether or not
+            the result depends on them.
     """
 
     def __init__(self, shapes: Sequence[Shape]):
         self.steps: list[Step | None] = [None] * len(shapes)
         self.line = ""
         self.known: dict[Any, tuple[list[Operand], Sequence[Operand]]] = {}
+        self.required: list[Value] = []
         self.inputs = [Value(place, shape) for place, shape in enumerate(shapes)]
         self.values = [*self.inputs]
         self._made: dict[Any, Value] = {}
@@ -68,14 +71,25 @@ class Recorder:
     def run(self, numbers: Sequence[Any], unit: AtUnit, wanted: Value) -> Any:
         """The numbers of a value, from those of the inputs, of any one kind.
 
-        What it does not depend on is left out: units there add no columns and need no bounds.
+        What it does not depend on is left out, but for what is required: units there add no columns
+        and need no bounds.
         """
-        found = dict(enumerate(numbers))
-        for place in self.between(wanted):
+        found, places = dict(enumerate(numbers)), {*self.between(wanted)}
+        for each in self.required:
+            places.update(self.between(each, done=places))
+        for place in sorted(places):
             step = self.steps[place]
             if step is not None:
                 found[place] = step.apply(unit, *(found[parent] for parent in step.parents))
         return found[wanted.place]
+
+    def require(self, operand: Operand) -> None:
+        """Let numbers be real ones: units that they depend on must have bounds."""
+        if isinstance(operand, Value) and any(
+            step is not None and step.unit is not None
+            for step in map(self.steps.__getitem__, self.between(operand))
+        ):
+            self.required.append(operand)
 
     def between(
         self, wanted: Value, first: Value | None = None, done: Container[int] = ()

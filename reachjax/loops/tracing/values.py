@@ -169,10 +169,11 @@ class Unknown:
     Attributes:
         primitive: what made it.
         why: it has none, and what to do.
+        source: what it was made of.
     """
 
-    def __init__(self, primitive: str, why: str):
-        self.primitive, self.why = primitive, why
+    def __init__(self, primitive: str, why: str, source: Any = None):
+        self.primitive, self.why, self.source = primitive, why, source
 
     @property
     def error(self) -> UnsupportedError:

@@ -35,7 +35,7 @@ from reachjax.loops.units.base import (
     Product,
 )
 from reachjax.numerics.checks import real_number
-from reachjax.numerics.rounding import gamma, larger, namespace, smaller
+from reachjax.numerics.rounding import TINY, gamma, larger, namespace, smaller
 
 ZERO = (("output", "slack"),)
 PRODUCTS = (
@@ -87,10 +87,13 @@ class ReLU(AbstractUnit):
         xp = namespace(lower, upper)
         active, inactive = lower >= 0, (upper <= 0) & (lower < 0)
         switching = ~(active | inactive)
-        width = xp.where(switching, upper - lower, 1.0)
+        half = 0.5 * upper  # the width itself may overflow
+        width = xp.where(switching, half - 0.5 * lower, 1.0)
         # both rounded up: the chord stays above at its two ends
-        slope = xp.where(switching, upper / width, 1.0 * active) * (1 + gamma(4) * switching)
+        slope = xp.where(switching, half / width, 1.0 * active) * (1 + gamma(4) * switching)
+        lost = switching & ~(slope >= TINY)  # in floats: 0 and a constant are above as well
         offset = xp.where(switching, -slope * lower * (1 + gamma(4)), 0.0)
+        slope, offset = xp.where(lost, 0.0, slope), xp.where(lost, upper + 2 * TINY, offset)
         under = 1.0 * (active | (switching & (upper > -lower)))
         return Lines(below=Line(under, xp.zeros_like(under)), above=Line(slope, offset))
 

@@ -273,12 +273,15 @@ class Floor(AbstractUnit):
         xp = namespace(y)
         if self.above != 0.5:
             return xp.floor(y + self.above)
-        away = xp.where(y < 0, xp.ceil(y - 0.5), xp.floor(y + 0.5))
-        return xp.round(y) if self.even else away
+        if self.even:
+            return xp.round(y)
+        whole = xp.trunc(y)  # what is left is exact, and half of it or more goes away from zero
+        return whole + xp.where(abs(y - whole) >= 0.5, xp.sign(y), 0.0)
 
     def interval(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """The whole numbers of both ends; at an edge the one on its other side."""
         xp = namespace(lower, upper)
+        upper = xp.where((upper < 0) & (upper > -TINY), 0.0, upper)  # which XLA takes for zero
         return xp.ceil(lower + self.above) - 1.0, xp.floor(upper + self.above)
 
     def lines(self, lower: Array, upper: Array) -> Lines:

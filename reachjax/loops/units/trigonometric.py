@@ -73,7 +73,7 @@ class WaveUnit(SmoothUnit):
         ends, (least, most) = (slope * lower, slope * upper), self.extent(lower, upper)
         least, most = least - larger(*ends), most - smaller(*ends)
         # slopes may be too small for floats
-        flushed = errors(lambda: TINY * (1 + farthest(lower, upper)))
+        flushed = errors(lambda: TINY * (1 + farthest(lower, upper)) + gamma(4) * farthest(*ends))
         least, most = least - gamma(4) * abs(least), most + gamma(4) * abs(most)
         least, most = least - flushed, most + flushed
         return select(far, least, low), select(far, most, high)

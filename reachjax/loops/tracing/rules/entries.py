@@ -55,6 +55,8 @@ def entries(recorder: Recorder, operand: Operand) -> np.ndarray:
         limits, shape = recorder.limits(operand, ConstantLimits), operand.shape
         value, numbers = operand.source or (operand, np.arange(operand.size))
         known = (limits.least == limits.most) & np.isfinite(limits.least)
+        if known.any():
+            recorder.require(operand)
         found = [
             Fraction(end) if same else Entry(value.place, number)
             for end, same, number in zip(
@@ -137,6 +139,8 @@ def sums(recorder: Recorder, rows: Iterable[Iterable[Product]]) -> list[Scalar]:
             elif isinstance(other, Fraction):
                 if other:
                     mine.append((1, (one, sign * other)))
+                else:
+                    recorder.require(recorder.values[one.place])
             else:
                 mine.append((sign, (min(one, other), max(one, other))))
         offsets.append(offset)

@@ -361,6 +361,7 @@ def _staircase(
     count, shape = len(edges), value.shape
     numbers = (first + np.arange(count + 1)).astype(kind)
     if not count:
+        recorder.require(value)
         return np.broadcast_to(numbers[0], shape)
     columns = [*[1] * len(shape)]
     steps: list[Any] = [None] * count

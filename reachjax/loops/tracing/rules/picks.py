@@ -276,6 +276,10 @@ def number(recorder: Recorder, pick: Operand) -> Operand:
     numbers = pick.numbers
     if is_known(numbers):
         own = isinstance(numbers, Parameter)
+        if np.asarray(numbers).dtype.kind in "iu" and np.any(abs(np.asarray(numbers)) > 2**53):
+            raise UnsupportedError(
+                "its whole numbers are too large to be floats: keep them below 2^53"
+            )
         numbers = np.asarray(numbers).astype(float)
         if not np.all(np.isfinite(numbers)):
             raise UnsupportedError(NOT_FINITE)
@@ -309,6 +313,7 @@ def merged(recorder: Recorder, pick: Pick) -> Operand:
         return pick
     firsts = [mine[0] for mine in groups.values()]
     if len(groups) == 1:
+        recorder.require(pick.which)
         return numbers[0]
     matrix = np.zeros((len(groups), len(numbers)))
     for row, mine in zip(matrix, groups.values(), strict=True):

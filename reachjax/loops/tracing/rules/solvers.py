@@ -14,7 +14,9 @@ part of what is certified.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -39,8 +41,15 @@ from reachjax.loops.tracing.rules.entries import (
 )
 from reachjax.loops.tracing.rules.equations import Equation, Rule
 from reachjax.loops.tracing.rules.inverses import Block, block_of, inverse, less, reciprocals
-from reachjax.loops.tracing.traces import equations
-from reachjax.loops.tracing.values import Operand, Unknown, UnsupportedError
+from reachjax.loops.tracing.traces import description, equations
+from reachjax.loops.tracing.values import (
+    Operand,
+    Unknown,
+    UnsupportedError,
+    Value,
+    is_known,
+    is_plain,
+)
 from reachjax.loops.units import Sqrt
 
 LARGEST = 6
@@ -55,9 +64,6 @@ PIVOTS = (
 MOVES = ("dot_general", "transpose", "reshape", "broadcast_in_dim", "squeeze", "reduce_sum", "jit")
 """Primitives of products of a matrix and a vector that JAX's own solvers are made of."""
 
-APPROXIMATE = ("while", "scan", "cond")
-"""Primitives of solvers that end before the solution is found."""
-
 
 def _solved(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
     """`custom_linear_solve`, as `jnp.linalg.solve` and `inv` are: two triangles are solved."""
@@ -68,11 +74,11 @@ def _solved(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
         raise UnsupportedError(
             "its product with a vector is not that of one matrix: use jnp.linalg.solve(A, b)"
         )
-    by = [each.primitive.name for each in equations(bodies.solve)]
-    if by.count("triangular_solve") != 2 or {*by} & {*APPROXIMATE}:
+    factors = operands[counts.matvec + counts.vecmat :][: counts.solve]
+    if not _solves(bodies, given[0], right[0].shape, factors):
         raise UnsupportedError(
-            "its solver is not known to be exact, as those by iterations are not: use "
-            "jnp.linalg.solve(A, b)"
+            "its solver is not known to give the solution, as one by iterations, or by factors of "
+            "another matrix, does not: use jnp.linalg.solve(A, b)"
         )
     matrix, b = (entries(recorder, each) for each in (given[0], right[0]))
     if not b.size:
@@ -81,6 +87,50 @@ def _solved(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
     A = zeros(*places.shape)
     A[places > 0] = matrix.ravel()[places[places > 0] - 1]
     return [as_value(recorder, solution(recorder, A, b.ravel()).reshape(b.shape))]
+
+
+def _solves(
+    bodies: Any, matrix: Operand, shape: tuple[int, ...], factors: Sequence[Operand]
+) -> bool:
+    """Whether a solver is one of JAX's own, by factors of this very matrix."""
+    if description(bodies.solve) not in _solvers(np.shape(matrix), shape):
+        return False
+    if is_plain(matrix):
+        return all(map(is_plain, factors)) and _agree(bodies, matrix, shape, factors)
+    by_pivots = (isinstance(each, Unknown) and each.source is matrix for each in factors)
+    return all(by_pivots) or all(isinstance(each, Value) for each in factors)
+
+
+def _agree(bodies: Any, matrix: Any, shape: tuple[int, ...], factors: Sequence[Any]) -> bool:
+    """Whether known factors are of a known matrix: products of solutions are what was given."""
+    if not all(map(is_known, (matrix, *factors))):
+        return True  # they were known when the function was given
+    given = np.random.default_rng(0).normal(size=shape)
+    with jax.ensure_compile_time_eval():
+        own = [jnp.asarray(np.asarray(each)) for each in (matrix, *factors)]
+        (found,) = core.jaxpr_as_fun(bodies.solve)(*own[1:], jnp.asarray(given))
+        (again,) = core.jaxpr_as_fun(bodies.matvec)(own[0], found)
+    size = abs(np.asarray(matrix)).max(initial=0.0) * abs(np.asarray(found)).max(initial=0.0)
+    return bool((abs(np.asarray(again) - given) <= 1e-9 * (1 + size)).all())
+
+
+@lru_cache(maxsize=256)
+def _solvers(matrix: tuple[int, ...], right: tuple[int, ...]) -> frozenset[str | None]:
+    """Descriptions of JAX's own solvers for these shapes."""
+    turned = (*right[:-2], *right[:-3:-1])
+    found = set()
+    for shape in dict.fromkeys((right, turned)):
+        given = [jax.ShapeDtypeStruct(each, float) for each in (matrix, shape)]
+        for way in (jnp.linalg.solve, partial(jax.scipy.linalg.solve, assume_a="pos")):
+            for solve in (way, jax.vmap(way), lambda A, b: jnp.linalg.inv(A)):
+                with contextlib.suppress(TypeError, ValueError):  # of other shapes
+                    made = equations(jax.make_jaxpr(solve)(*given))
+                    found |= {
+                        description(each.params["jaxprs"].solve)
+                        for each in made
+                        if each.primitive.name == "custom_linear_solve"
+                    }
+    return frozenset(found)
 
 
 def _places(matvec: Any, matrix: Sequence[int], vector: Sequence[int]) -> np.ndarray:
@@ -167,7 +217,7 @@ def _roots(recorder: Recorder, squares: Sequence[Scalar]) -> list[Scalar]:
 
 def _factors(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> list[Unknown]:
     """An LU factorisation, which may only be passed on to a solver."""
-    return [Unknown(equation.name, PIVOTS)] * 3
+    return [Unknown(equation.name, PIVOTS, operands[0])] * 3
 
 
 def solution(recorder: Recorder, A: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -135,13 +135,16 @@ class Trace:
             return called(own, *vectors)
 
         names, whole = [each.name for each in kinds], of([None] * len(kinds))
+        own = None
         if any(names):
             own = jax.make_jaxpr(called)(of(names), *vectors)
             varies = [number >= len(kinds) for number in range(len(own.jaxpr.invars))]
             if rounds_plain(own, varies) or _narrows(own):
                 return _owned(jax.make_jaxpr(brought_back)(whole, *vectors))
         found = jax.make_jaxpr(called)(whole, *vectors)
-        if any(names) and [*_steps(own)] != [*_steps(found)]:  # it asks for a parameter's precision
+        if own is not None and [*_steps(own)] != [
+            *_steps(found)
+        ]:  # it asks for a parameter's precision
             found = jax.make_jaxpr(brought_back)(whole, *vectors)
         return _owned(found)
 

@@ -142,9 +142,8 @@ class Trace:
             if rounds_plain(own, varies) or _narrows(own):
                 return _owned(jax.make_jaxpr(brought_back)(whole, *vectors))
         found = jax.make_jaxpr(called)(whole, *vectors)
-        if own is not None and [*_steps(own)] != [
-            *_steps(found)
-        ]:  # it asks for a parameter's precision
+        asks = own is not None and [*_steps(own)] != [*_steps(found)]
+        if asks:  # for the precision of a parameter
             found = jax.make_jaxpr(brought_back)(whole, *vectors)
         return _owned(found)
 

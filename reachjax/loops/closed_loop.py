@@ -33,7 +33,7 @@ from reachjax.numerics.checks import (
     whole_number,
 )
 from reachjax.numerics.host import in_numpy
-from reachjax.numerics.pytrees import Replaceable, converted, pytree, written_elsewhere
+from reachjax.numerics.pytrees import Replaceable, converted, is_own, pytree, written_elsewhere
 from reachjax.numerics.seals import AbstractSealed
 from reachjax.sets import AbstractSet, Box
 from reachjax.sets.unusable import ThinSetError
@@ -306,8 +306,13 @@ class ClosedLoop(Replaceable, AbstractSealed):
         The name of such a class does not say what it computes. Of a user's set of disturbances or
         noise it is the box around it.
         """
-        if not written_elsewhere(self):
-            return ""
+        sets = [each for each in (self.disturbance, self.noise) if written_elsewhere(each)]
+        boxes = [each.bounding_box() for each in sets if each is not None]
+        ends = [end for box in boxes for end in (box.lower, box.upper) if is_concrete(end)]
+        told = "".join(np.asarray(end).tobytes().hex() for end in ends)
+        parts = self.plant, self.controller, self.input_box
+        if is_own(type(self).__module__) and not written_elsewhere(parts):
+            return told
 
         def step(loop: ClosedLoop, x: Array, t: Array, w: Array | None, v: Array | None) -> Any:
             return loop.step(x, t, w=w, v=v)
@@ -317,11 +322,7 @@ class ClosedLoop(Replaceable, AbstractSealed):
 
         x, t = jax.ShapeDtypeStruct((self.states,), float), jax.ShapeDtypeStruct((), int)
         draws = map(drawn_from, (self.disturbance, self.noise))
-        traced = str(description(jax.make_jaxpr(step)(self, x, t, *draws)))
-        own = [each for each in (self.disturbance, self.noise) if written_elsewhere(each)]
-        boxes = [each.bounding_box() for each in own if each is not None]
-        ends = [np.asarray(end).tobytes().hex() for box in boxes for end in (box.lower, box.upper)]
-        return traced + "".join(ends)
+        return str(description(jax.make_jaxpr(step)(self, x, t, *draws))) + told
 
     def simulate(
         self,

@@ -593,7 +593,7 @@ def _support(
 def _support_in_numpy(
     lower: Float[np.ndarray, " n"], upper: Float[np.ndarray, " n"], directions: np.ndarray
 ) -> Float[np.ndarray, " m"]:
-    """The same of numbers that XLA takes for zero."""
+    """The support of a box, rounded up, of numbers some of which XLA takes for zero."""
     with np.errstate(all="ignore"):
         terms = directions * np.where(directions > 0, upper, lower)
         rounding = gamma(len(lower) + 2) * abs(terms).sum(axis=1) + 2 * len(lower) * TINY

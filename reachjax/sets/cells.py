@@ -86,13 +86,12 @@ def grid_ends(
     numbers = [whole_number(f"cells[{i}]", count, 1) for i, count in enumerate(counts)]
     index = np.stack(np.meshgrid(*map(np.arange, numbers), indexing="ij"), axis=-1)
     index, many = index.reshape(-1, len(numbers)), np.asarray(numbers)
-
     xp = np if is_concrete(box) else jnp  # numpy knows subnormal numbers, XLA does not
     lower, upper = xp.asarray(box.lower), xp.asarray(box.upper)
 
     def ends(index: np.ndarray) -> Float[Array, "cells n"]:
         within = index * ((upper - lower) / many) + lower
-        return jnp.asarray(xp.where(index == many, upper, within))  # so nothing is left out
+        return jnp.asarray(xp.where(index == many, upper, within))  # exact ends
 
     return ends(index), ends(index + 1)
 

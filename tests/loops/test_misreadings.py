@@ -169,6 +169,8 @@ def test_nothing_is_said_for_ever_of_a_plant_that_may_depend_on_the_time():
         (lambda x: jnp.floor(jnp.arcsin(x) / 4 + 0.5), 1.5),
         (lambda x: 0.0 * jnp.sign(jnp.log(x)) + 1.0, -1.0),
         (lambda x: jnp.hypot(0.0 * jnp.log(x), x), -1.0),
+        (lambda x: jnp.isfinite(jnp.log(x)).astype(int), -1.0),
+        (lambda x: jax.nn.softmax(jnp.stack([x[0] + jnp.log(x[0]), jnp.log(x[0])]))[:1], -1.0),
     ],
 )
 def test_what_rests_on_a_number_says_nothing_where_there_is_none(function, low):
@@ -201,7 +203,39 @@ def frozen_of_known(x):
     )
 
 
-@pytest.mark.parametrize("function", [frozen, frozen_of_known])
+def frozen_of_roots(x):
+    factor = jax.scipy.linalg.cho_factor(jnp.diag(2 + x**2))
+    return jax.lax.custom_linear_solve(
+        lambda v: jnp.diag(1 + x**2) @ v,
+        jnp.ones(2),
+        lambda mv, b: jax.scipy.linalg.cho_solve(factor, b),
+        symmetric=True,
+    )
+
+
+SPREAD = jnp.array([[2.0, 0.3], [-0.1, 1.5]])
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: jnp.linalg.solve(SPREAD, x),
+        lambda x: jnp.linalg.solve(SPREAD + jnp.outer(x, x), x),
+        lambda x: jnp.linalg.inv(SPREAD + jnp.diag(x**2)) @ x,
+        jax.grad(lambda x: x @ jnp.linalg.solve(SPREAD, x)),
+        lambda x: jax.scipy.linalg.solve(jnp.diag(1 + x**2), x, assume_a="pos"),
+        lambda x: jax.scipy.linalg.solve(SPREAD @ SPREAD.T, x, assume_a="pos", lower=True),
+        lambda x: jax.scipy.linalg.solve(SPREAD + jnp.diag(x**2), x, assume_a="pos"),
+    ],
+)
+def test_jaxs_own_solvers_are_read(function):
+    net, x = rj.Network(function, 2, 2), np.array([0.3, -0.4])
+    low, high = interval(net, x, x)
+    assert (low - 1e-9 <= function(x)).all()
+    assert (function(x) <= high + 1e-9).all()
+
+
+@pytest.mark.parametrize("function", [frozen, frozen_of_known, frozen_of_roots])
 def test_solvers_by_factors_of_another_matrix_are_refused(function):
     with pytest.raises(TypeError, match=r"jnp\.linalg\.solve"):
         rj.Network(function, 2, 2)
@@ -233,3 +267,18 @@ def test_numbers_that_compiled_code_takes_for_zero_are_not_lost():
     loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[0.0]]), STILL)
     below, start = rj.Box([-1.0], [0.0]), rj.Box([0.0], [tiny])
     assert not rj.decide(loop, start, 1, safe=below).proved
+
+
+def test_an_equation_whose_result_rests_on_whether_there_is_a_number_is_refused():
+    with pytest.raises(TypeError, match="whether there is a number"):
+        rj.SampledPlant(lambda x, u: jnp.where(jnp.isfinite(jnp.log(x)), -x, x) + 0 * u, 1, 1, 0.1)
+
+
+def test_a_constant_of_a_transformation_is_no_obstacle():
+    """What is traced around the function is a number of it."""
+
+    def value(s):
+        net = rj.Network(Partial(lambda w, x: s * x + w, SINGLE), 2, 2)
+        return net(jnp.array([1.0, 2.0])).sum()
+
+    assert float(jax.grad(value)(2.0)) == 3.0

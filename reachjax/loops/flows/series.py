@@ -81,7 +81,13 @@ class Tape:
         self._units: dict[tuple[AbstractUnit, int], int] = {}
         self._waves: dict[int, tuple[int, int]] = {}
         found = {value.place: value.place for value in recorder.inputs}
-        for place in recorder.between(wanted):
+        places = recorder.between(wanted)
+        if not {*places} >= {*recorder.required}:
+            raise UnsupportedError(
+                "it asks whether there is a number, as jnp.isnan does, on which its result does "
+                "not depend: keep the states in its domain, and leave the question out"
+            )
+        for place in places:
             step = recorder.steps[place]
             if step is None:
                 continue

@@ -243,8 +243,8 @@ class Function:
             (wanted,) = reading.walk(closed, [*self._given(), *recorder.inputs])
             if isinstance(wanted, Choice):
                 wanted = number_of(recorder, as_pick(recorder, wanted))
-            if recorder.required and not isinstance(wanted, Value):  # not a constant alone
-                wanted = reading.varying(wanted)
+            if recorder.required and not isinstance(wanted, Value):  # units are met all the same
+                wanted = reading.varying(wanted.astype(float))
         except UnsupportedError as error:
             what = (
                 f"the primitive {error.primitive!r}{error.line}"

@@ -35,6 +35,7 @@ from reachjax.loops.units import (
     Square,
     UnboundedError,
 )
+from reachjax.loops.units.smooth import SmoothUnit
 from reachjax.numerics import numbers
 from reachjax.numerics.rounding import TINY, UNIT, Ball, larger, namespace
 
@@ -54,15 +55,18 @@ class Recorder:
         steps: that make them, the same; None for the inputs.
         known: results of equations, and their operands, which are so kept alive.
         line: where a user wrote the equation at hand.
-        required: values that must be real numbers, as what is read rests on that, whether or not
-            the result depends on them.
+        required: values, by their places, that must be real numbers, as what is read rests on
+            that, whether or not the result depends on them.
+        factored: the matrices of which triangular ones are the factors, by the places of these.
     """
 
     def __init__(self, shapes: Sequence[Shape]):
         self.steps: list[Step | None] = [None] * len(shapes)
         self.line = ""
         self.known: dict[Any, tuple[list[Operand], Sequence[Operand]]] = {}
-        self.required: list[Value] = []
+        self.required: dict[int, Value] = {}
+        self.factored: dict[int, Operand] = {}
+        self._asked: set[int] = set()
         self.inputs = [Value(place, shape) for place, shape in enumerate(shapes)]
         self.values = [*self.inputs]
         self._made: dict[Any, Value] = {}
@@ -75,7 +79,7 @@ class Recorder:
         and need no bounds.
         """
         found, places = dict(enumerate(numbers)), {*self.between(wanted)}
-        for each in self.required:
+        for each in self.required.values():
             places.update(self.between(each, done=places))
         for place in sorted(places):
             step = self.steps[place]
@@ -85,11 +89,13 @@ class Recorder:
 
     def require(self, operand: Operand) -> None:
         """Let numbers be real ones: units that they depend on must have bounds."""
-        if isinstance(operand, Value) and any(
-            step is not None and step.unit is not None
-            for step in map(self.steps.__getitem__, self.between(operand))
-        ):
-            self.required.append(operand)
+        if not isinstance(operand, Value):
+            return
+        before = self.between(operand, done=self._asked)
+        self._asked.update(before)
+        steps = map(self.steps.__getitem__, before)
+        if any(step is not None and step.unit is not None and _is_bounded(step) for step in steps):
+            self.required[operand.place] = operand
 
     def between(
         self, wanted: Value, first: Value | None = None, done: Container[int] = ()
@@ -504,3 +510,22 @@ def _flat(plain: Any, value: Value) -> Any:
     if isinstance(plain, Parameter):
         return np.broadcast_to(plain, value.shape, subok=True).reshape(-1)
     return namespace(plain).broadcast_to(plain, value.shape).reshape(-1)
+
+
+FAR = 1e3
+"""Units that have bounds between its negative and it are taken to have some everywhere."""
+
+
+def _is_bounded(step: Step) -> bool:
+    """Whether a unit has a domain, or overflows: inputs in it are more than any inputs."""
+    unit: Any = step.unit
+    ends = np.full(2, -FAR), np.full(2, FAR)
+    with np.errstate(all="ignore"):
+        try:
+            if isinstance(unit, SmoothUnit) and not unit.defined(*ends).all():
+                return True
+            return not np.isfinite(unit.interval(*ends)).all()
+        except UnboundedError:
+            return True
+        except ValueError:  # it takes another number of inputs, as products do, which have bounds
+            return False

@@ -259,19 +259,17 @@ def _bits(atom: Any) -> int:
 def _steps(closed: core.ClosedJaxpr) -> Iterator[Any]:
     """What a jaxpr does, whatever the precision of its floats is."""
     for each in _constants(closed):
-        yield np.asarray(each, float).tobytes() if jnp.isdtype(each.dtype, "numeric") else None
+        if is_concrete(each) and not jnp.issubdtype(each.dtype, jax.dtypes.extended):
+            yield np.asarray(each, bool if each.dtype == bool else float).tobytes()
     for equation in equations(closed):
         if equation.primitive.name == "convert_element_type":
             continue
         yield equation.primitive.name
-        yield [v.val.tolist() if hasattr(v.val, "tolist") else v.val for v in _literals(equation)]
+        numbers = (each.val for each in equation.invars if isinstance(each, core.Literal))
+        yield [repr(np.asarray(number).tolist()) for number in numbers]
         for name, value in sorted(equation.params.items()):
             if name not in NAMES and not any(True for _ in subjaxprs(value)):
                 yield name, re.sub(PRECISION, "float", str(value))
-
-
-def _literals(equation: Any) -> list[Any]:
-    return [each for each in equation.invars if isinstance(each, core.Literal)]
 
 
 def _owned(value: Any) -> Any:

@@ -56,7 +56,7 @@ def entries(recorder: Recorder, operand: Operand) -> np.ndarray:
         value, numbers = operand.source or (operand, np.arange(operand.size))
         known = (limits.least == limits.most) & np.isfinite(limits.least)
         if known.any():
-            recorder.require(operand)
+            recorder.require(recorder.picked(operand, np.flatnonzero(known)))
         found = [
             Fraction(end) if same else Entry(value.place, number)
             for end, same, number in zip(

@@ -190,6 +190,8 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
     if columns is None:
         return None
     first, logarithm = _logarithm(recorder, columns, other.shape)
+    for place in mine.parts | first.parts:  # of what cancels
+        recorder.require(recorder.values[place])
     difference = (mine - first).recorded(recorder, other.shape)
     if not isinstance(difference, Value) and not isinstance(logarithm, Value):
         return None

@@ -66,7 +66,7 @@ MOVES = ("dot_general", "transpose", "reshape", "broadcast_in_dim", "squeeze", "
 
 
 def _solved(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Any:
-    """`custom_linear_solve`, as `jnp.linalg.solve` and `inv` are: two triangles are solved."""
+    """`custom_linear_solve`, of which `jnp.linalg.solve` and `inv` are made: the solution."""
     counts, bodies = equation.params["const_lengths"], equation.params["jaxprs"]
     given, right = operands[: counts.matvec], operands[sum(counts) :]
     made = [each.primitive.name for each in equations(bodies.matvec)]
@@ -75,12 +75,14 @@ def _solved(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
             "its product with a vector is not that of one matrix: use jnp.linalg.solve(A, b)"
         )
     factors = operands[counts.matvec + counts.vecmat :][: counts.solve]
-    if not _solves(bodies, given[0], right[0].shape, factors):
+    if not _is_own_solver(bodies, given[0], right[0].shape, factors):
         raise UnsupportedError(
             "its solver is not known to give the solution, as one by iterations, or by factors of "
             "another matrix, does not: use jnp.linalg.solve(A, b)"
         )
     matrix, b = (entries(recorder, each) for each in (given[0], right[0]))
+    if isinstance(factors[0], Value):
+        matrix = _squared(recorder, factors[0]).reshape(matrix.shape)
     if not b.size:
         return [as_value(recorder, b)]
     places = _places(bodies.matvec, matrix.shape, b.shape)
@@ -89,48 +91,75 @@ def _solved(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
     return [as_value(recorder, solution(recorder, A, b.ravel()).reshape(b.shape))]
 
 
-def _solves(
+def _is_own_solver(
     bodies: Any, matrix: Operand, shape: tuple[int, ...], factors: Sequence[Operand]
 ) -> bool:
-    """Whether a solver is one of JAX's own, by factors of this very matrix."""
-    if description(bodies.solve) not in _solvers(np.shape(matrix), shape):
+    """Whether a solver is one of JAX's: by pivots of this very matrix, or by roots of any."""
+    double = bool(jax.config.read("jax_enable_x64"))
+    own = _own_solvers(np.shape(matrix), tuple(shape), double)
+    if (description(bodies.matvec), description(bodies.solve)) not in own:
         return False
-    if is_plain(matrix):
-        return all(map(is_plain, factors)) and _agree(bodies, matrix, shape, factors)
-    by_pivots = (isinstance(each, Unknown) and each.source is matrix for each in factors)
-    return all(by_pivots) or all(isinstance(each, Value) for each in factors)
+    if all(map(is_plain, factors)):
+        return is_plain(matrix) and _agree(bodies, matrix, shape, factors)
+    if len(factors) == 1:
+        return isinstance(factors[0], Value)
+    sources = [each.source for each in factors if isinstance(each, Unknown)]
+    return len(sources) == len(factors) and all(
+        isinstance(each, Value) and isinstance(matrix, Value) and each.place == matrix.place
+        for each in sources
+    )
+
+
+def _squared(recorder: Recorder, factor: Value) -> np.ndarray:
+    """The symmetric matrix of which a triangular one is the factor: of one triangle of it."""
+    made = [place for place in recorder.between(factor) if place in recorder.factored]
+    if not made:
+        raise UnsupportedError("its factor is that of no matrix: use jnp.linalg.solve(A, b)")
+    A = entries(recorder, recorder.factored[made[-1]])
+    lower = np.tri(A.shape[-1], dtype=bool)
+    return np.where(lower, A, A.swapaxes(-1, -2))
+
+
+@lru_cache(maxsize=256)
+def _own_solvers(
+    matrix: tuple[int, ...], right: tuple[int, ...], double: bool
+) -> frozenset[tuple[str | None, str | None]]:
+    """Descriptions of products and solvers of JAX's for these shapes, turned ones too."""
+    turned = (*right[:-2], *right[:-3:-1])
+    found = set()
+    positive = partial(jax.scipy.linalg.solve, assume_a="pos")
+    for shape in dict.fromkeys((right, turned)):
+        given = [jax.ShapeDtypeStruct(each, float) for each in (matrix, shape)]
+        for way in (jnp.linalg.solve, positive, partial(positive, lower=True)):
+            each = jax.vmap(way)
+            shared = jax.vmap(way, (None, 0)), jax.vmap(each, (None, 0))
+            for solve in (way, each, jax.vmap(each), *shared, lambda A, b: jnp.linalg.inv(A)):
+                with contextlib.suppress(TypeError, ValueError):  # of other shapes
+                    made = equations(jax.make_jaxpr(solve)(*given))
+                    for one in made:
+                        if one.primitive.name == "custom_linear_solve":
+                            own = one.params["jaxprs"]
+                            found.add((description(own.matvec), description(own.solve)))
+                            ways = description(own.vecmat), description(own.transpose_solve)
+                            found.add(ways)
+    return frozenset(found)
 
 
 def _agree(bodies: Any, matrix: Any, shape: tuple[int, ...], factors: Sequence[Any]) -> bool:
     """Whether known factors are of a known matrix: products of solutions are what was given."""
-    if not all(map(is_known, (matrix, *factors))):
-        return True  # they were known when the function was given
+    known = [is_known(each) for each in (matrix, *factors)]
+    if not all(known):
+        return not any(known)  # traced are both, or one of them is of something else
     given = np.random.default_rng(0).normal(size=shape)
     with jax.ensure_compile_time_eval():
         own = [jnp.asarray(np.asarray(each)) for each in (matrix, *factors)]
         (found,) = core.jaxpr_as_fun(bodies.solve)(*own[1:], jnp.asarray(given))
         (again,) = core.jaxpr_as_fun(bodies.matvec)(own[0], found)
+    if not np.isfinite(np.asarray(found)).all():
+        return True  # singular, which is said elsewhere
     size = abs(np.asarray(matrix)).max(initial=0.0) * abs(np.asarray(found)).max(initial=0.0)
-    return bool((abs(np.asarray(again) - given) <= 1e-9 * (1 + size)).all())
-
-
-@lru_cache(maxsize=256)
-def _solvers(matrix: tuple[int, ...], right: tuple[int, ...]) -> frozenset[str | None]:
-    """Descriptions of JAX's own solvers for these shapes."""
-    turned = (*right[:-2], *right[:-3:-1])
-    found = set()
-    for shape in dict.fromkeys((right, turned)):
-        given = [jax.ShapeDtypeStruct(each, float) for each in (matrix, shape)]
-        for way in (jnp.linalg.solve, partial(jax.scipy.linalg.solve, assume_a="pos")):
-            for solve in (way, jax.vmap(way), lambda A, b: jnp.linalg.inv(A)):
-                with contextlib.suppress(TypeError, ValueError):  # of other shapes
-                    made = equations(jax.make_jaxpr(solve)(*given))
-                    found |= {
-                        description(each.params["jaxprs"].solve)
-                        for each in made
-                        if each.primitive.name == "custom_linear_solve"
-                    }
-    return frozenset(found)
+    near = np.sqrt(np.finfo(np.asarray(found).dtype).eps) * (1 + size)
+    return bool((abs(np.asarray(again) - given) <= near).all())
 
 
 def _places(matvec: Any, matrix: Sequence[int], vector: Sequence[int]) -> np.ndarray:
@@ -207,7 +236,10 @@ def _cholesky(recorder: Recorder, equation: Equation, operands: Sequence[Operand
         L[:, j, j] = pivots
         for (k, i, _), each in zip(below, made, strict=True):
             L[k, i, j] = each
-    return as_value(recorder, L.reshape(A.shape))
+    found = as_value(recorder, L.reshape(A.shape))
+    if isinstance(found, Value):
+        recorder.factored[found.place] = operands[0]
+    return found
 
 
 def _roots(recorder: Recorder, squares: Sequence[Scalar]) -> list[Scalar]:

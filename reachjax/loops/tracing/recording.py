@@ -93,8 +93,8 @@ class Recorder:
             return
         before = self.between(operand, done=self._asked)
         self._asked.update(before)
-        steps = map(self.steps.__getitem__, before)
-        if any(step is not None and step.unit is not None and _is_bounded(step) for step in steps):
+        units = [step.unit for place in before if (step := self.steps[place]) is not None]
+        if any(unit is not None and _has_limits(unit) for unit in units):
             self.required[operand.place] = operand
 
     def between(
@@ -516,10 +516,9 @@ FAR = 1e3
 """Units that have bounds between its negative and it are taken to have some everywhere."""
 
 
-def _is_bounded(step: Step) -> bool:
-    """Whether a unit has a domain, or overflows: inputs in it are more than any inputs."""
-    unit: Any = step.unit
-    ends = np.full(2, -FAR), np.full(2, FAR)
+def _has_limits(unit: AbstractUnit) -> bool:
+    """Whether a unit has a domain, or overflows: it says nothing of some inputs."""
+    ends: Any = np.full(2, -FAR), np.full(2, FAR)
     with np.errstate(all="ignore"):
         try:
             if isinstance(unit, SmoothUnit) and not unit.defined(*ends).all():
@@ -528,4 +527,4 @@ def _is_bounded(step: Step) -> bool:
         except UnboundedError:
             return True
         except ValueError:  # it takes another number of inputs, as products do, which have bounds
-            return False
+            return not isinstance(unit, Bilinear)

@@ -517,14 +517,15 @@ FAR = 1e3
 
 
 def _has_limits(unit: AbstractUnit) -> bool:
-    """Whether a unit has a domain, or overflows: it says nothing of some inputs."""
-    ends: Any = np.full(2, -FAR), np.full(2, FAR)
+    """Whether a unit has a domain, or overflows: of some inputs it says nothing.
+
+    Others than smooth ones, rectifiers and products, have bounds of all of them.
+    """
+    if not isinstance(unit, SmoothUnit):
+        return False
+    ends: Any = np.full(1, -FAR), np.full(1, FAR)
     with np.errstate(all="ignore"):
         try:
-            if isinstance(unit, SmoothUnit) and not unit.defined(*ends).all():
-                return True
-            return not np.isfinite(unit.interval(*ends)).all()
+            return not (unit.defined(*ends).all() and np.isfinite(unit.interval(*ends)).all())
         except UnboundedError:
             return True
-        except ValueError:  # it takes another number of inputs, as products do, which have bounds
-            return not isinstance(unit, Bilinear)

@@ -42,6 +42,9 @@ from reachjax.numerics.rounding import TINY, UNIT, Ball, larger, namespace
 NONE = Limits.of(0.0)
 """Limits of the number zero."""
 
+FAR = 1e3
+"""Units that have bounds between its negative and it are taken to have some everywhere."""
+
 
 class Recorder:
     """The steps so far.
@@ -510,10 +513,6 @@ def _flat(plain: Any, value: Value) -> Any:
     if isinstance(plain, Parameter):
         return np.broadcast_to(plain, value.shape, subok=True).reshape(-1)
     return namespace(plain).broadcast_to(plain, value.shape).reshape(-1)
-
-
-FAR = 1e3
-"""Units that have bounds between its negative and it are taken to have some everywhere."""
 
 
 def _has_limits(unit: AbstractUnit) -> bool:

@@ -15,7 +15,7 @@ part of what is certified.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from typing import Any
 
@@ -135,14 +135,17 @@ def _own_solvers(
             shared = jax.vmap(way, (None, 0)), jax.vmap(each, (None, 0))
             for solve in (way, each, jax.vmap(each), *shared, lambda A, b: jnp.linalg.inv(A)):
                 with contextlib.suppress(TypeError, ValueError):  # of other shapes
-                    made = equations(jax.make_jaxpr(solve)(*given))
-                    for one in made:
-                        if one.primitive.name == "custom_linear_solve":
-                            own = one.params["jaxprs"]
-                            found.add((description(own.matvec), description(own.solve)))
-                            ways = description(own.vecmat), description(own.transpose_solve)
-                            found.add(ways)
+                    found.update(_both_ways(jax.make_jaxpr(solve)(*given)))
     return frozenset(found)
+
+
+def _both_ways(closed: core.ClosedJaxpr) -> Iterator[tuple[str | None, str | None]]:
+    """Descriptions of the products and solvers of a jaxpr, as they are and turned."""
+    for each in equations(closed):
+        if each.primitive.name == "custom_linear_solve":
+            own = each.params["jaxprs"]
+            yield description(own.matvec), description(own.solve)
+            yield description(own.vecmat), description(own.transpose_solve)
 
 
 def _agree(bodies: Any, matrix: Any, shape: tuple[int, ...], factors: Sequence[Any]) -> bool:

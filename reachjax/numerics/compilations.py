@@ -49,8 +49,9 @@ class CompiledBeside:
     thread of its own, for which neither a limit nor Ctrl-C waits, but the end of Python does: JAX
     must not be taken down under it. It begins once callers have spent as much in numpy as
     compiling takes; at once if one call takes as much, or if it is cheap; and only if what is left
-    of their time is longer. What it finds is of use only where it is faster. Where it finds
-    nothing, since compiling failed, its callers go on in numpy, and a warning is logged.
+    of their time is longer. Who has many calls to make waits for it. What it finds is of use only
+    where it is faster. Where it finds nothing, since compiling failed, its callers go on in numpy,
+    and a warning is logged.
 
     Args:
         function: made by `jax.jit`, with keywords for what is static. What it is called with is
@@ -73,6 +74,7 @@ class CompiledBeside:
         evaluations: int,
         left: float,
         share: float = 1.0,
+        calls: float | None = None,
         **static: Any,
     ) -> bool:
         """Whether the compiled function is there for such arguments, and faster than numpy.
@@ -86,6 +88,8 @@ class CompiledBeside:
             evaluations: how many evaluations of what is compiled that is.
             left: the seconds until somebody stops waiting.
             share: the part of the call that is of use.
+            calls: how many of them are to be made, by a caller who waits for the compilation if
+                that takes less than all of them in numpy.
             static: keywords of the function.
         """
         known = self._of(given, static)
@@ -93,7 +97,8 @@ class CompiledBeside:
             known.seconds = seconds()
         if known.seconds is None or known.began:
             return known.faster(share)
-        asked, price = share * known.seconds, EVALUATIONS * known.seconds / evaluations
+        asked = (share if calls is None else calls) * known.seconds
+        price = EVALUATIONS * known.seconds / evaluations
         with self._lock:
             early = price > CHEAP and max(known.spent, asked) < price
             known.spent += asked
@@ -104,7 +109,7 @@ class CompiledBeside:
             LOGGER.info("JAX compiles beside what goes on, for about %.0f s", price)
         thread = threading.Thread(target=self._compiled, args=(known, given, static))
         thread.start()
-        if price <= CHEAP:  # beside others each would take twice as long
+        if price <= CHEAP or calls is not None:  # beside others each would take twice as long
             thread.join(min(left, threading.TIMEOUT_MAX))
         return known.faster(share)
 

@@ -87,11 +87,21 @@ def decided_by_cells(
 
 
 @lenient
-def sifted(task: CellTask, cells: Sequence[Ends], budget: Budget) -> list[Outcome | None]:
-    """What forms of many cells say in one compiled call; None where they pay better one by one."""
+def sifted(
+    task: CellTask, cells: Sequence[Ends], budget: Budget, calls: float | None = None
+) -> list[Outcome | None]:
+    """What forms of many cells say in one compiled call; None where they pay better one by one.
+
+    Args:
+        task: what is to be proved of each.
+        cells: at most `TOGETHER` of them.
+        budget: of the whole call.
+        calls: how many such calls are to be made by who waits for the compilation.
+    """
     with jax.enable_x64(True):
         sieve = Sieve(task.loop, task.horizon, task.start, task.required)
-        return [*sieve.sifted(cells)] if sieve.pays(cells, budget) else [None] * len(cells)
+        pays = sieve.pays(cells, budget, calls)
+        return [*sieve.sifted(cells)] if pays else [None] * len(cells)
 
 
 class _Decisions(AbstractSearch):

@@ -11,7 +11,7 @@ taken: both questions are asked again as they follow from these.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
 from typing import Any
@@ -188,25 +188,37 @@ def _of_cells(
     """The margins of all cells as they come, by forms in compiled calls of many where that pays."""
     if len(cells) == 1:  # a process takes longer to begin than most cells to prove
         executor = None
-    task, jobs = _task(asked), CellJobs[None](executor, AHEAD)
-    pays = len(cells) >= TOGETHER and all(cell.is_box for cell in cells)
+    jobs = CellJobs[None](executor, AHEAD)
     try:
-        for first in range(0, len(cells), TOGETHER):
-            some = range(first, min(first + TOGETHER, len(cells)))
-            alone = pays and not any(grounds.climbs[number] for number in some)
-            outcomes = sifted(task, [cells[each].ends for each in some], ENDLESS) if alone else []
-            for number, outcome in zip(some, outcomes or [None] * len(some), strict=True):
-                if outcome is not None and outcome.proved:
-                    yield _margins(asked, outcome)
-                    continue
-                part = jax.device_get(cells[number].part)
-                jobs.submit(None, _of_cell, asked, part, grounds.climbs[number])
-                if len(jobs) >= jobs.most:
-                    yield from (margins for _, margins in jobs.finished())
+        for number, outcome in _by_many(asked, cells, grounds.climbs):
+            if outcome is not None and outcome.proved:
+                yield _margins(asked, outcome)
+                continue
+            part = jax.device_get(cells[number].part)
+            jobs.submit(None, _of_cell, asked, part, grounds.climbs[number])
+            if len(jobs) >= jobs.most:
+                yield from (margins for _, margins in jobs.finished())
         while len(jobs):
             yield from (margins for _, margins in jobs.finished())
     finally:
         jobs.cancelled()
+
+
+def _by_many(
+    asked: Asked, cells: Sequence[Node], climbs: Sequence[Sequence[Climb]]
+) -> Iterator[tuple[int, Outcome | None]]:
+    """The places of all cells, with what compiled calls say of those that rest on forms alone.
+
+    The others come first, so that an executor is busy with them meanwhile.
+    """
+    formed = [number for number, some in enumerate(climbs) if not some]
+    if len(formed) < TOGETHER or not all(cell.is_box for cell in cells):
+        formed = []
+    yield from ((number, None) for number in sorted(set(range(len(cells))).difference(formed)))
+    for first in range(0, len(formed), TOGETHER):
+        some, calls = formed[first : first + TOGETHER], (len(formed) - first) / TOGETHER
+        outcomes = sifted(_task(asked), [cells[each].ends for each in some], ENDLESS, calls)
+        yield from zip(some, outcomes, strict=True)
 
 
 @lenient

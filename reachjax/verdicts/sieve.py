@@ -129,7 +129,7 @@ class Sieve:
         self._later = jnp.asarray(self._directions[1:])
         self._whole = by_time.whole[1:] if by_time.whole.any() else None
 
-    def pays(self, cells: Sequence[Ends], budget: Budget) -> bool:
+    def pays(self, cells: Sequence[Ends], budget: Budget, calls: float | None = None) -> bool:
         """Whether the compiled call is there, and faster than what these cells take one by one.
 
         It takes numbers that are no normal ones for zero, so it is not for cells or loops of these.
@@ -137,6 +137,7 @@ class Sieve:
         Args:
             cells: that may be bounded so, or else will be one by one.
             budget: of the whole call.
+            calls: how many such calls are to be made by who waits for the compilation.
         """
         if self._of_subnormals or holds_subnormals(cells):
             return False
@@ -148,6 +149,7 @@ class Sieve:
             evaluations=TOGETHER * steps * passes,
             left=budget.left,
             share=len(cells) / TOGETHER,
+            calls=calls,
             **self._static,
         )
 

@@ -109,6 +109,13 @@ def test_what_takes_no_longer_than_one_call_in_numpy_is_compiled_at_once():
     pytest.fail("it was not compiled, though a call takes as long")
 
 
+@pytest.mark.parametrize(("calls", "waits"), [(40, True), (20, False)])
+def test_who_has_many_calls_to_make_waits_for_what_takes_less(calls, waits):
+    found, x = beside(9 + calls)
+    given = {"seconds": lambda: 1.0, "evaluations": 100, "left": np.inf}  # thirty seconds
+    assert found.pays(x, by=2.0, calls=calls, **given) is waits
+
+
 def test_what_is_slower_than_numpy_or_cannot_be_measured_is_not_used():
     found, x = beside(6)
     given = {"evaluations": 1000, "left": np.inf}

@@ -46,6 +46,9 @@ WORDS = {"PROVED": "verified", "REFUTED": "falsified", "UNKNOWN": "unknown"}
 AGAIN = 60.0
 """A call that took longer, in seconds, is not made again."""
 
+DRAWING = 120.0
+"""Seconds that sets may take of which figures are drawn and widths measured."""
+
 NOTE = """\
 first: wall seconds of `decide` in a new process, where nothing is compiled, reading apart
 warm: of one more call;  recheck: of proving the verdict's file anew in another process
@@ -208,10 +211,10 @@ def tubes_of(
 ) -> list[rj.ReachTube]:
     """Boxes at samples by forms, from each cell that a proof takes, else from the whole set.
 
-    Nothing where forms have no bounds, or take longer than a decision may.
+    Nothing where forms have no bounds, or take longer than `DRAWING`, or than a decision may.
     """
     cells = [rj.Box(cell.lower, cell.upper) for cell in verdict.cells if verdict.proved]
-    template, until = rj.Template.box(loop.states), time.monotonic() + settings.limit
+    template, until = rj.Template.box(loop.states), time.monotonic() + min(settings.limit, DRAWING)
     found = []
     for X0 in cells or [instance.X0]:
         given = loop, X0, instance.horizon, template, rj.LinearBounds()

@@ -217,9 +217,12 @@ def tubes_of(
     template, until = rj.Template.box(loop.states), time.monotonic() + min(settings.limit, DRAWING)
     found = []
     for X0 in cells or [instance.X0]:
+        left = until - time.monotonic()
+        if left <= 0:
+            return []
         given = loop, X0, instance.horizon, template, rj.LinearBounds()
         try:
-            found.append(rj.reach(*given, time_limit=max(until - time.monotonic(), 0.0)))
+            found.append(rj.reach(*given, time_limit=left))
         except (ValueError, RuntimeError):
             return []
     return found

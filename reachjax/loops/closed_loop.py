@@ -9,7 +9,7 @@ tells.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -230,7 +230,7 @@ class ClosedLoop(Replaceable, AbstractSealed):
     @property
     def varies(self) -> bool:
         """Whether a step depends on its time."""
-        return self.steps is not None or self.plant.clock
+        return self.steps is not None or self.plant.varies
 
     @property
     def is_disturbed(self) -> bool:
@@ -441,29 +441,45 @@ _KNOWN: dict[Any, tuple[UnitLayer, ...]] = {}
 def _layers(tree: Any) -> tuple[UnitLayer, ...]:
     """The layers of units that the forward pass of a loop, or of a part of it, meets.
 
-    They depend on its structure, and on the shapes and kinds of its leaves, but on no number: known
-    numbers are run as they are, which traces nothing.
+    They depend on its structure, on the shapes and kinds of what is traced, and on all numbers that
+    are known: a function that chooses by a known parameter meets the units of its choice alone. So
+    does the pass over numbers of any kind, with the same known numbers.
     """
     leaves, structure = jax.tree.flatten(tree)
-    kinds = tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-    found = _KNOWN.get((structure, kinds))
+    key = structure, tuple(map(_told, leaves))
+    found = _KNOWN.get(key)
     if found is None:
-        if is_concrete(tree):
+        if is_concrete(tree):  # traces nothing
             with np.errstate(all="ignore"):
                 found = _met(in_numpy(tree), np.zeros)
         else:
-            shapes = [jax.ShapeDtypeStruct(*each) for each in kinds]
-            found = _traced(jax.tree.unflatten(structure, shapes))
+            found = _traced(leaves, structure)
         if len(_KNOWN) >= MOST_KNOWN:
             _KNOWN.clear()
-        _KNOWN[structure, kinds] = found
+        _KNOWN[key] = found
     return found
 
 
-def _traced(tree: Any) -> tuple[UnitLayer, ...]:
-    """The layers, of a tree with shapes and kinds for leaves."""
+def _told(leaf: Any) -> tuple[Any, ...]:
+    """What layers may depend on of a leaf: its shape, its kind, and its numbers if known."""
+    shape, kind = jnp.shape(leaf), jnp.result_type(leaf)
+    if not is_concrete(leaf):
+        return shape, kind
+    numbers = jax.random.key_data(leaf) if jnp.issubdtype(kind, jax.dtypes.prng_key) else leaf
+    return shape, kind, np.asarray(numbers).tobytes()
+
+
+def _traced(leaves: Sequence[Any], structure: Any) -> tuple[UnitLayer, ...]:
+    """The layers of a tree some of whose leaves are traced, of which shapes and kinds are known."""
     found = []
-    jax.eval_shape(lambda tree: found.append(_met(tree, jnp.zeros)), tree)
+    open_ones = {k: leaf for k, leaf in enumerate(leaves) if not is_concrete(leaf)}
+    shapes = [jax.ShapeDtypeStruct(*_told(leaf)) for leaf in open_ones.values()]
+
+    def meet(given: Sequence[Any]) -> None:
+        filled = dict(enumerate(leaves)) | dict(zip(open_ones, given, strict=True))
+        found.append(_met(jax.tree.unflatten(structure, filled.values()), jnp.zeros))
+
+    jax.eval_shape(meet, shapes)
     return found[0]
 
 

@@ -69,7 +69,7 @@ class DelayedPlant(AbstractPlant):
     @property
     def clock(self) -> bool:
         """Whether its plant is a function of the time, whatever that is."""
-        return self.plant.clock
+        return self.plant.varies
 
     @property
     def period(self) -> Any:

@@ -10,6 +10,7 @@ is exact; one step of the classical Runge-Kutta method is its Taylor polynomial 
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -31,6 +32,9 @@ from reachjax.numerics.checks import (
 )
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.pytrees import Replaceable, converted, pytree
+
+STEPS = "propagate", "at", "flow_at"
+"""What plants step by."""
 
 
 class AbstractPlant(Replaceable, abc.ABC):
@@ -65,6 +69,20 @@ class AbstractPlant(Replaceable, abc.ABC):
     def clock(self) -> bool:
         """Whether `propagate` may depend on `t`: it may, unless a plant says that it does not."""
         return True
+
+    @property
+    def varies(self) -> bool:
+        """Whether a step may depend on its time.
+
+        What a class says of its clock is not believed of one that is derived from it, but steps in
+        a way of its own.
+        """
+        said = _rank(type(self), "clock")
+        return (
+            self.steps is not None
+            or self.clock
+            or any(_rank(type(self), name) < said for name in STEPS)
+        )
 
     @property
     @abc.abstractmethod
@@ -116,6 +134,14 @@ def _depth(value: Any) -> int:
     if isinstance(value, tuple | list):
         return 1 + max(map(_depth, value), default=0)
     return np.ndim(value)
+
+
+def _rank(kind: type, name: str) -> float:
+    """How far up among the classes that one is derived from a name is told of."""
+    told = (
+        name in vars(each) or name in vars(each).get("__annotations__", ()) for each in kind.__mro__
+    )
+    return next((k for k, here in enumerate(told) if here), math.inf)
 
 
 @pytree

@@ -318,12 +318,15 @@ class Ball(AbstractNumber):
         """A ball that surely holds `[lower, upper]`; a single point is held exactly.
 
         A compiler may evaluate an expression in several places and round it differently in each,
-        so the radius holds for every rounding of the midpoint.
+        so the radius holds for every rounding of the midpoint. It takes what is no normal number
+        for zero, the width of narrow ranges among them.
         """
         mid = lower + (upper - lower) / 2
         if not is_counted():
             return cls(mid, (upper - lower) / 2)
         rad = (upper - lower) / 2 * (1 + gamma(4)) + gamma(4) * abs(mid)
+        if namespace(mid) is not np:
+            rad = rad + 2 * TINY
         return cls(mid, select(lower == upper, 0.0, rad))
 
     @property
@@ -392,4 +395,4 @@ class Ball(AbstractNumber):
     def meeting(self, other: Self) -> Self:
         """Numbers that both hold."""
         lower = larger(self.lower, other.lower)
-        return type(self).between(lower, larger(lower, smaller(self.upper, other.upper)))
+        return type(self).between(lower, larger(smaller(self.upper, other.upper), lower))

@@ -256,6 +256,8 @@ def step_forms(
         successor = _spilled(successor, free)
         if not is_counted():  # nothing is left of a flow's radii
             successor = AffineForms(successor.rows, successor.radii[:, -1:])
+    if place is not None and done > loop.units:
+        raise RuntimeError(f"a step met {done} units, but has columns for {loop.units}")
     ends = successor.ends(start)
     if known is not None:
         ends = met(ends, (known.lower, known.upper))

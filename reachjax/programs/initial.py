@@ -108,6 +108,10 @@ class InitialColumns(Replaceable):
         """How many columns there are, products among them."""
         return self.spread.shape[1] + len(self.pairs[0])
 
+    def _require_products(self) -> None:
+        if not self.curved:
+            raise RuntimeError("a loop without columns for products met a unit that is curved")
+
     def by_coordinate(self, products: Float[np.ndarray, "k m"]) -> Float[np.ndarray, "k n"]:
         """What products are worth, to each column that they are of; squares twice; in numpy."""
         found = np.zeros((self.spread.shape[1], len(products)))
@@ -116,13 +120,19 @@ class InitialColumns(Replaceable):
         return found.T
 
     def squared(self, rows: Rows) -> tuple[Any, Rows]:
-        """`(r . w)^2` for each row: its constant, and its coefficients of the products."""
+        """`(r . w)^2` for each row: its constant, and its coefficients of the products.
+
+        Raises:
+            RuntimeError: there are no columns for these.
+        """
+        self._require_products()
         i, j = self.pairs
         products = taken(rows, i) * taken(rows, j) * np.where(i == j, 0.5, 2.0)
         return (rows**2).sum(axis=1) / 2, products
 
     def multiplied(self, one: Rows, other: Rows) -> tuple[Any, Rows]:
         """`(r . w) (s . w)` for each pair of rows, as `squared`."""
+        self._require_products()
         i, j = self.pairs
         mixed = taken(one, i) * taken(other, j) + taken(one, j) * taken(other, i)
         products = mixed * np.where(i == j, 0.25, 1.0)

@@ -121,7 +121,8 @@ def decide(
             times, to where it must be then.
         safe: where every state must be at all times (its complement is avoided).
         avoid: closed sets in which no state may be: a sequence for all times, or a mapping from
-            times, or from ranges of times, to sequences.
+            times, or from ranges of times, to sequences. Of a differential equation a time after
+            the first one stands for all of its period, since the sample before.
         relaxation: how many linear programs a bound may take.
         start: the time of `X0`, for time-varying loops.
         samples: how many trajectories are simulated in search of a counterexample, besides those

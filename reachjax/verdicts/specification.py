@@ -44,8 +44,9 @@ differential equation by numbers of type `float` in its units of time, or pairs 
 NAMES_INSIDE, NAMES_OUTSIDE = r"goal|safe", r"avoid\[(0|[1-9]\d*)\]"
 """The names that `requirements` gives; any other one may be that of a step of a proof."""
 
-SAME = 1e-9
-"""Times are one if they differ by less than this part of a period: users write decimals."""
+SAME = 1e-13
+"""Times are one if they differ by less than this part of themselves: users write decimals, and sums
+of them."""
 
 
 class TimedGoal(NamedTuple):
@@ -121,7 +122,7 @@ def _in_units(goal: Mapping[Any, Any], horizon: int, period: float | None) -> It
         for k, each in ((first, given[0]), (last, given[1])):
             if not 0 <= k <= horizon:
                 raise ValueError(f"goal names {each}, but the horizon is {horizon * period:g}")
-            if abs(k * period - each) > SAME * period:
+            if abs(k * period - each) > SAME * abs(each):
                 raise ValueError(
                     f"goal names {each}, which is no sample: samples are {period:g} apart"
                 )

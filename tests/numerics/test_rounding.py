@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from reachjax.numerics.rounding import UNIT, Ball, settled
+from reachjax.numerics.rounding import TINY, UNIT, Ball, settled
 
 fractions = np.vectorize(Fraction, otypes=[object])
 
@@ -178,3 +178,20 @@ def test_what_is_settled_is_rounded_once_for_all_its_uses():
     assert compiled.as_text().count(" call(") == 1
     np.testing.assert_array_equal(compiled(x)[:, -1], x * x + 1.0)
     np.testing.assert_allclose(jax.grad(lambda x: used_twice(x)[:, -1].sum())(x), 2 * x)
+
+
+@pytest.mark.parametrize("first", [False, True])
+def test_what_is_not_known_is_not_known_of_what_two_balls_hold(first):
+    unknown, other = Ball(np.full(1, -np.inf), np.full(1, np.inf)), Ball(np.ones(1), np.ones(1))
+    with np.errstate(invalid="ignore"):
+        found = unknown.meeting(other) if first else other.meeting(unknown)
+        assert not found.lower[0] > 0
+        assert not found.upper[0] < 2
+
+
+def test_compiled_ranges_narrower_than_all_normal_numbers_are_held():
+    lower, upper = np.array([0.0, TINY, 1.0]), np.array([1.5 * TINY, 1.5 * TINY, 1.0])
+    mid, rad = jax.jit(lambda *ends: ((ball := Ball.between(*ends)).mid, ball.rad))(lower, upper)
+    mid, rad = np.asarray(mid), np.asarray(rad)
+    assert np.all((mid - rad <= lower) & (upper <= mid + rad))
+    assert rad[2] == 0.0

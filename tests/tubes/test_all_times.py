@@ -69,6 +69,8 @@ def test_errors_of_spans_say_which_times_there_are():
     loop, G = loops()[0], rj.Box([-1.2, -1.2], [1.2, 1.2])
     with pytest.raises(ValueError, match="no sample"):
         rj.decide(loop, X0, 2, goal={(0.2, 0.5): G})
+    with pytest.raises(ValueError, match="no sample"):  # a fast state moves far meanwhile
+        rj.decide(loop, X0, 2, goal={(0.5 - 4e-10, 1.0): G})
     with pytest.raises(ValueError, match="the horizon is 1"):
         rj.decide(loop, X0, 2, goal={(0.5, 1.5): G})
     discrete = rj.ClosedLoop(rj.AffinePlant(np.eye(2), np.zeros((2, 1))), STILL)

@@ -1,11 +1,14 @@
 """Long horizons end where states come into a set that they come back to; what is said holds."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.loops.units import evaluate
 from reachjax.verdicts import closing
 
 LATER = 1000
@@ -137,3 +140,30 @@ def test_a_loop_that_varies_in_time_is_done_step_by_step():
     verdict = rj.decide(loop, X0, 150, safe=rj.Box([-1.0, -1.0], [1.0, 1.0]))
     assert verdict.proved
     assert verdict.recurrence is None
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Drifting(rj.AffinePlant):
+    """A plant that is pushed once it is late, and inherits that it has no clock."""
+
+    def propagate(self, x, u, t=0, unit=evaluate, w=None):
+        return super().propagate(x, u, t, unit, w) + np.full(2, 1e-3) * (t > 170)
+
+
+class Still(Drifting):
+    """A plant of that kind that says that it has none."""
+
+    clock = False
+
+
+def test_a_plant_that_steps_in_a_way_of_its_own_may_have_a_clock():
+    """What the class above says is not believed of it; nor are its inputs made late."""
+    given = 0.9 * np.eye(2), np.zeros((2, 1))
+    for plant, varies in ((rj.AffinePlant, False), (Drifting, True), (Still, False)):
+        loop = rj.ClosedLoop(plant(*given), STILL)
+        assert loop.varies is varies
+    loop = rj.ClosedLoop(Drifting(*given), STILL)
+    with pytest.raises(ValueError, match="must not vary in time"):
+        rj.delayed(loop)
+    assert rj.decide(loop, X0, 200, safe=rj.Box([-1.0, -1.0], [1.0, 1.0])).recurrence is None

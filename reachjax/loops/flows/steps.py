@@ -26,6 +26,7 @@ is at most `r`. So what `w` does within a period is worth its mean, but for the 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -382,6 +383,13 @@ def _escaped(X: Ball, B: Ball) -> UnboundedError:
     return UnboundedError(Within(origin=origin), 0, float(X.lower[k]), float(X.upper[k]))
 
 
+def _known(extreme: Any, of: Sequence[Ball]) -> Any:
+    """The extremes of some balls, NaN where one of these is."""
+    xp = namespace(extreme)
+    unknown = (xp.isnan(end) for each in of for end in (each.lower, each.upper))
+    return xp.where(reduce(xp.logical_or, unknown), xp.nan, extreme)
+
+
 def drift(slopes: list[tuple[Ball, Ball]], W: Ball, h: Any) -> tuple[Any, Any]:
     """How far a signal can take states from where its mean does.
 
@@ -397,8 +405,10 @@ def drift(slopes: list[tuple[Ball, Ball]], W: Ball, h: Any) -> tuple[Any, Any]:
         reduce(extreme, (getattr(G, end) for _, G in slopes))
         for extreme, end in ((smaller, "lower"), (larger, "upper"))
     )
+    low, high = (_known(each, [G for _, G in slopes]) for each in (low, high))
     G, n = Ball.between(low, high), len(slopes[0][0].mid)
     rate = reduce(larger, (larger(abs(A.lower), abs(A.upper)) for A, _ in slopes))
+    rate = _known(rate, [A for A, _ in slopes])
     size, radius = larger(abs(low), abs(high)), h * W.rad * (1 + gamma(4))
     growth = _exponential_less_one(h * rate * (1 + gamma(2)))
     error = 1 + gamma(4 * n + 16)

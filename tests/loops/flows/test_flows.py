@@ -10,7 +10,7 @@ from mpmath import mpf
 
 import reachjax as rj
 from reachjax.loops.batches import Batch
-from reachjax.loops.flows.steps import WORTH
+from reachjax.loops.flows.steps import WORTH, drift
 from reachjax.loops.flows.taylor_models import Symbols
 from reachjax.loops.tracing.limits import Limits
 from reachjax.loops.units import UnboundedError
@@ -234,6 +234,15 @@ def test_what_is_not_known_stays_so():
     for mid, rad in ((np.nan, 0.0), (0.0, np.inf), (np.inf, 0.0), (0.0, np.nan)):
         found = plant.propagate(Ball(np.array([mid]), np.array([rad])), Ball.exact(np.zeros(1)))
         assert not np.isfinite(found.mid + found.rad).any()
+
+
+def test_slopes_of_a_step_that_are_not_known_take_states_anywhere():
+    known = Ball.exact(np.ones((1, 1)))
+    lost = Ball(np.full((1, 1), np.nan), np.full((1, 1), np.nan))
+    for slopes in ((known, lost), (lost, known), (lost, lost)):
+        for steps in ([(known, known), slopes], [slopes, (known, known)]):
+            end, within = drift(steps, Ball(np.zeros(1), np.ones(1)), 0.1)
+            assert not np.isfinite(end + within).any()
 
 
 @pytest.mark.parametrize(("held", "steps"), [(True, 1), (False, 1), (False, 4)])

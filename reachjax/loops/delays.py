@@ -69,6 +69,11 @@ class DelayedPlant(AbstractPlant):
     @property
     def clock(self) -> bool:
         """Whether its plant is a function of the time, whatever that is."""
+        return self.plant.clock
+
+    @property
+    def varies(self) -> bool:
+        """Whether a step of its plant may depend on the time."""
         return self.plant.varies
 
     @property

@@ -299,7 +299,7 @@ def test_cells_that_compiled_steps_leave_open_are_proved_by_shorter_ones(monkeyp
     X0, safe = rj.Box([0.1, 0.1], [0.2, 0.2]), rj.Box([-0.8] * 2, [0.8] * 2)
     called = list[int]()
 
-    def pays(sieve, cells, budget):
+    def pays(sieve, cells, budget, calls=None):
         called.append(len(cells))
         return True
 

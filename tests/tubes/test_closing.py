@@ -154,7 +154,9 @@ class Drifting(rj.AffinePlant):
 class Still(Drifting):
     """A plant of that kind that says that it has none."""
 
-    clock = False
+    @property
+    def clock(self) -> bool:
+        return False
 
 
 def test_a_plant_that_steps_in_a_way_of_its_own_may_have_a_clock():

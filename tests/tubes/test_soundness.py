@@ -22,7 +22,9 @@ INSIDE = rj.Box([-0.2], [1.2])
 class MisreadPlant(rj.AffinePlant):
     """A plant whose bounds are of half the successor that JAX computes."""
 
-    clock = False
+    @property
+    def clock(self) -> bool:
+        return False
 
     def propagate(self, x: Any, u: Any, t: Any = 0, unit: Any = None, w: Any = None) -> Any:
         following = super().propagate(x, u, t, unit, w)

@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import AbstractNetwork, ClosedLoop
+from reachjax.loops.units import UnboundedError
 from reachjax.methods.propagation import Progress, known_numbers, require_kinds
 from reachjax.numerics.archives import writable
 from reachjax.numerics.budget import Budget, Interrupted
@@ -62,6 +63,8 @@ from reachjax.training.steps import (
 )
 from reachjax.training.worst_cells import worst_cells
 from reachjax.verdicts.decide import decide
+from reachjax.verdicts.findings import Findings
+from reachjax.verdicts.grounds import Asked
 from reachjax.verdicts.sieve import smallest
 from reachjax.verdicts.specification import (
     AvoidSets,
@@ -102,9 +105,6 @@ last proof, where one is known."""
 
 HALVINGS = 6
 """So often the way between a controller that is proved and one that is not is halved."""
-
-LITTLE = 0.02
-"""Training ends where an epoch lowers the loss of what is proved by less than this part of it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,6 +158,7 @@ def train(
     cells: int = 1000,
     start: int = 0,
     seed: int = 0,
+    gain: float = 0.02,
     time_limit: float | None = None,
     path: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
@@ -191,15 +192,20 @@ def train(
         batch: how many cells are trained on at a step, at most.
         samples: how many initial states are drawn from these at each step.
         steps: of an epoch.
-        epochs: at most. After the first one that is proved as many come again at most, as long as
-            they lower the task's loss of what is proved.
+        epochs: at most.
         cells: into how many cells `decide` may cut the initial set: few make a controller that is
             proved quickly.
         start: the time of `X0`, for time-varying loops.
         seed: of all that is drawn.
+        gain: a part of the task's loss. What is proved is trained on for as many epochs as its
+            first proof took, or until one lowers its loss by less than that. 1 ends training with
+            the first proof. 0 leaves the end to `epochs` and `time_limit`, also of a controller
+            that is proved as it was given, which is not trained else.
         time_limit: seconds for the whole call, decisions and compiling included; a compilation that
             has begun is waited for.
         path: of a file that is written after each epoch; if it is there, training goes on from it.
+            What was proved there is decided anew: where the time is too short for that, nothing is
+            trained, and the file stays as it is.
         progress: wraps the iteration over epochs to show a progress bar, such as `tqdm.tqdm`.
 
     Returns:
@@ -209,7 +215,8 @@ def train(
 
     Raises:
         ImportError: optax is not installed.
-        Interrupted: Ctrl-C; its `found` is what `train` would return for the last epoch.
+        Interrupted: Ctrl-C; its `found` is what `train` would return for the last epoch, or for
+            the controller as it was given.
         RuntimeError: JAX's 64-bit floats are off.
         TypeError, ValueError: as `decide`; an argument is of another kind; the controller has no
             arrays; the file is of another training.
@@ -248,6 +255,7 @@ def train(
         requirements(loop.states, horizon, period_of(loop), goal=goal, safe=safe, avoid=avoid)
     )
     spec = Specification(horizon, start, required, real_number("margin", margin, 0.0))
+    gain = real_number("gain", gain, 0.0)
     chosen = _skipping(_adam() if optimizer is None else optimizer, FOREVER - 1)
     run = _Run(loop, X0, spec, task_loss, chosen, tuple(stages), seed)
     kept = None if path is None else writable("path", path)
@@ -255,12 +263,15 @@ def train(
         run.resume(kept)
     budget = Budget.of(time_limit)
     asked = {"goal": goal, "safe": safe, "avoid": avoid, "cells": cells, "start": start}
-    sizes = _Sizes(batch, samples, steps, weight)
+    sizes = _Sizes(batch, samples, steps, weight, gain)
     try:
         first = min(FIRST, budget.left / 10) if budget.timed else FIRST
-        run.decide(budget, max(LEAST, first, PATIENCE * run.proof), asked, after=len(run.epochs))
+        seconds = math.inf if run.proof else max(LEAST, first)
+        run.decide(budget, seconds, asked, after=len(run.epochs))
+        if run.proof and not run.found.proved:
+            return run.found  # it is proved, as the file says: there is nothing to train
         for _ in wrapped(progress, range(len(run.epochs), epochs)):
-            if run.over or budget.late:
+            if budget.late or run.over(gain):
                 break
             run.epoch(sizes, budget, asked)
             if kept is not None:
@@ -291,6 +302,7 @@ class _Sizes(NamedTuple):
     samples: int
     steps: int
     weight: float
+    gain: float
 
 
 def _mean(losses: Float[np.ndarray, " s"]) -> float:
@@ -355,6 +367,9 @@ class _Run:
     ):
         self._loop, self._X0, self._spec, self._seed = loop, X0, spec, seed
         self._task_loss, self._optimizer, self._stages = hashable(task_loss), optimizer, stages
+        # no controller changes whether the initial set is where it should be
+        later = tuple(item for item in spec.required if item.time > 0)
+        self._lowered = dataclasses.replace(spec, required=later or spec.required)
         self._weights = weights_of(loop.controller)
         if not self._weights:
             raise ValueError(
@@ -374,18 +389,22 @@ class _Run:
         assert self.known is not None  # it is decided before anything else
         return dataclasses.replace(self.known, history=TrainingHistory(tuple(self.epochs)))
 
-    @property
-    def over(self) -> bool:
-        """Whether the controller is proved, and going on is not worth it."""
+    def over(self, gain: float) -> bool:
+        """Whether the controller is proved, and going on is not worth it.
+
+        Args:
+            gain: as of `train`.
+        """
+        if not self.found.proved or gain == 0:
+            return False
         took = (k for k, epoch in enumerate(self.epochs, 1) if epoch.status == "PROVED")
         longest = 2 * next(took, 0)
-        return self.found.proved and (self._fruitless or len(self.epochs) >= longest)
+        return self._fruitless or len(self.epochs) >= longest
 
     @property
     def _seal(self) -> Seal:
-        spec, regions = self._spec, [item.region.facets for item in self._spec.required]
-        numbers = jnp.array([spec.horizon, spec.start, spec.margin], float)
-        return seal_of(self._loop, self._X0, numbers, regions)
+        asked = np.frombuffer(repr(self._spec.key).encode(), np.uint8)
+        return seal_of(self._loop, self._X0, asked)
 
     def decide(self, budget: Budget, seconds: float, asked: dict[str, Any], after: int) -> Verdict:
         """The verdict on the controller as it is, whose counterexample is remembered.
@@ -411,7 +430,15 @@ class _Run:
         loop = under(self._loop, weights)
         limit = min(seconds, budget.left) if budget.timed else seconds
         given, clock = (loop, self._X0, self._spec.horizon), Budget()
-        verdict = decide(*given, **asked, seed=self._seed + after, time_limit=limit)
+        asked = asked | {"time_limit": limit if math.isfinite(limit) else None}
+        try:
+            verdict = decide(*given, **asked, seed=self._seed + after)
+        except UnboundedError:  # over no cell: weights that went astray may come back
+            found = Findings(*given, self._spec.start, self._spec.required)
+            verdict = found.verdict(asked=Asked(*given, self._spec.start, self._spec.required))
+        except Interrupted as error:
+            self.known = self.known or Trained(loop, error.found, TrainingHistory())
+            raise
         if verdict.proved:
             self.proof = clock.elapsed
         return Trained(loop, verdict, TrainingHistory())
@@ -423,7 +450,7 @@ class _Run:
         count = min(sizes.batch, stage.cells)
         corners = worst_cells(self._X0, self.found.verdict.cells, stage.cells, count, rng)
         program = Program(
-            self._spec,
+            self._lowered,
             self._task_loss,
             hashable(stage.objective),
             self._optimizer,
@@ -442,7 +469,7 @@ class _Run:
                 break
         skipped = failures(self._state) - skipped
         task, missed = np.array(losses).T
-        quiet = not np.any(missed[-max(1, len(losses) // QUIET) :] > 0)
+        quiet = bool(np.all(missed[-max(1, len(losses) // QUIET) :] <= 0))  # NaN is not
         seconds = clock.elapsed * (PATIENCE if quiet else 1.0)
         if share.late:  # it may be the last one
             seconds = max(seconds, share.elapsed)
@@ -512,7 +539,8 @@ class _Run:
                 self.known, self._weights, least = tried, middle, lower
             else:
                 other = middle
-        self._fruitless = reached - least <= LITTLE * abs(least)
+        little = before.proved and reached - least <= sizes.gain * abs(least)
+        self._fruitless = little or sizes.gain >= 1
         return self.found.verdict
 
     def keep(self, path: Path) -> None:

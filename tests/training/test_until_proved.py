@@ -1,5 +1,6 @@
 """Training until a controller is proved: what it trains on, when it ends, and that it goes on."""
 
+import dataclasses
 from functools import partial
 
 import equinox as eqx
@@ -11,6 +12,8 @@ import pytest
 from flax import linen, nnx
 
 import reachjax as rj
+from reachjax.loops.units import UnboundedError
+from reachjax.training import until_proved
 from reachjax.training.worst_cells import worst_cells
 from reachjax.verdicts.specification import requirements
 
@@ -138,6 +141,87 @@ def test_a_training_goes_on_from_its_file_after_a_proof(tmp_path):
     assert change(whole.loop, states) <= change(first.loop, states)
 
 
+def test_what_a_file_says_is_proved_is_not_trained_away(tmp_path, monkeypatch):
+    """Where there is no time to prove it anew, the controller and its file stay."""
+    loop, change = gained(-0.1)
+    path = tmp_path / "gain.training"
+    given = {"goal": GOAL, "margin": 0.1, "optimizer": optax.adam(0.05), "path": path}
+    first = rj.train(loop, X0, 2, change, **given, epochs=3)
+    assert first.proved
+    kept = path.read_bytes()
+    blank = dataclasses.replace(first.verdict, status=rj.VerdictStatus.UNKNOWN)
+    asked = []
+
+    def late(*_, time_limit=None, **__):
+        asked.append(time_limit)
+        return blank
+
+    monkeypatch.setattr(until_proved, "decide", late)
+    second = rj.train(loop, X0, 2, change, **given, epochs=9)
+    assert (asked, second.proved, len(second.history)) == ([None], False, len(first.history))
+    np.testing.assert_array_equal(leaves(second.loop)[0], leaves(first.loop)[0])
+    assert path.read_bytes() == kept
+
+
+def test_an_interrupted_first_decision_returns_the_controller_as_it_was_given(monkeypatch):
+    loop = loop_of()
+    verdict = rj.decide(loop, X0, 2, goal=GOAL)
+
+    def interrupted(*_, **__):
+        raise rj.Interrupted("interrupted", verdict)
+
+    monkeypatch.setattr(until_proved, "decide", interrupted)
+    with pytest.raises(rj.Interrupted) as raised:
+        trained(loop, X0)
+    assert raised.value.found.verdict is verdict
+    assert raised.value.found.loop.controller is not None
+    assert len(raised.value.found.history) == 0
+
+
+def test_a_controller_whose_bounds_leave_a_domain_is_trained_all_the_same():
+    def divided(x, u):  # its denominator is one half, which bounds over one cell do not see
+        y = x + u
+        return 0.5 * y / (jnp.sin(4 * y) ** 2 + jnp.cos(4 * y) ** 2 - 0.5)
+
+    loop = loop_of(rj.MLP.from_layers([([[0.0]], [0.0])])).replace(
+        plant=rj.NonlinearPlant(divided, 1, 1)
+    )
+    asked = {"goal": rj.Box([-3.0], [3.0]), "cells": 1}
+    with pytest.raises(UnboundedError):
+        rj.decide(loop, X0, 2, **asked)
+    learning = {"steps": 25, "optimizer": optax.adam(2e-2), "stages": [rj.Stage(rj.Simulated())]}
+    found = rj.train(loop, X0, 2, task, **asked, **learning)
+    assert found.history.epochs[0].margin == -np.inf
+    assert found.proved
+
+
+def test_requirements_of_the_initial_set_alone_are_not_trained_for():
+    """That the set touches what is safe is no loss: no controller changes it."""
+    safe = rj.Box([-2.0], [2.0])
+    learning = {"margin": 0.02, "steps": 25, "epochs": 20, "optimizer": optax.adam(2e-2)}
+    found = rj.train(loop_of(), X0, 2, task, goal=GOAL, safe=safe, **learning)
+    assert found.proved
+    assert found.history.epochs[-1].penalty == 0
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.0])
+def test_training_ends_with_the_first_proof_or_goes_on_to_the_end(gain):
+    loop, change = gained(-0.3)
+    once = {"goal": GOAL, "margin": 0.05, "steps": 2, "optimizer": optax.adam(0.05)}
+    found = rj.train(loop, X0, 2, change, **once, gain=gain, epochs=9)
+    took = [epoch.status for epoch in found.history.epochs].index("PROVED") + 1
+    assert len(found.history) == (took if gain else 9)
+
+
+def test_what_is_proved_as_it_was_given_is_trained_where_that_is_asked():
+    loop, change = gained(-0.3)
+    given = loop.replace(controller=gained(-0.6)[0].controller)
+    learning = {"goal": GOAL, "steps": 5, "optimizer": optax.adam(0.01), "epochs": 5, "gain": 0.0}
+    found = rj.train(given, X0, 2, change, **learning)
+    assert (found.proved, len(found.history)) == (True, 5)
+    assert leaves(found.loop)[0] > -0.6  # nearer to what the loss is least of
+
+
 def test_a_training_goes_on_from_its_file(tmp_path):
     slow = {"optimizer": optax.adam(1e-3), "stages": (rj.Stage(rj.Certified(), cells=2),)}
     whole = trained(loop_of(), X0, **slow | {"epochs": 4})
@@ -149,8 +233,10 @@ def test_a_training_goes_on_from_its_file(tmp_path):
     for one, other in zip(leaves(whole.loop), leaves(second.loop), strict=True):
         np.testing.assert_array_equal(one, other)
     assert second.history.epochs[:2] == first.history.epochs
-    with pytest.raises(ValueError, match="path must be that of a training of this loop"):
-        trained(loop_of(), rj.Box([1.0], [2.5]), **slow | {"path": path})
+    twice = {"path": path, "goal": {1: rj.Box([-9.0], [9.0]), 2: GOAL}}
+    for X, more in ((rj.Box([1.0], [2.5]), {"path": path}), (X0, twice)):
+        with pytest.raises(ValueError, match="path must be that of a training of this loop"):
+            trained(loop_of(), X, **slow | more)
 
 
 def test_steps_are_compiled_once_for_all_initial_sets_and_weights():

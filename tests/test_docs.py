@@ -52,6 +52,13 @@ def test_a_how_to_runs(path, begun, monkeypatch):
     run(path, dict(begun))
 
 
+def test_a_training_loop_of_ones_own_is_short():
+    (code,) = (
+        each for each in blocks(DOCS / "how-to" / "training.md") if "PenaltySchedule" in each
+    )
+    assert len(code.splitlines()) <= 25
+
+
 def test_a_public_name_stands_on_one_page_of_the_reference():
     pages = "".join(page.read_text() for page in sorted((DOCS / "reference").glob("*.md")))
     assert sorted(re.findall(r"^::: reachjax\.(\w+)$", pages, re.MULTILINE)) == sorted(rj.__all__)

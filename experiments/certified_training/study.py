@@ -100,7 +100,7 @@ class Settings:
     """Networks of each loop, from different random weights."""
     sized: int = 3
     """Of how many of these the largest set is looked for."""
-    pretraining_steps: int = 1000
+    pretraining_steps: int = 10_000
     """Steps of Adam on imitation alone, before the ways part."""
     seconds: float = 40.0
     """That each network is then trained for, decisions in between included."""
@@ -182,7 +182,9 @@ class Study:
         if stored.settings_of(path) != key:
             return None
         arrays = stored.load(path, key)
-        return arrays and Outcome(**{name: value.item() for name, value in arrays.items()})
+        if arrays is None:
+            return None
+        return Outcome(**{name: value.item() for name, value in arrays.items()})
 
     def run(self, way: str, seed: int) -> Outcome:
         """Train a network in a way and judge it; or take that from its file."""
@@ -274,7 +276,8 @@ class Study:
 
     def _imitating(self, loop: rj.ClosedLoop, seconds: float) -> tuple[rj.ClosedLoop, int]:
         """The loop after so many seconds of Adam on the task's loss alone, and the steps."""
-        net, began, steps = loop.controller, time.monotonic(), 0
+        net: Any = loop.controller
+        began, steps = time.monotonic(), 0
         state = self._optimizer.init(net)
         while time.monotonic() - began < seconds:
             for _ in range(STEPS):

@@ -23,25 +23,35 @@ COLOURS = {
     "few cells": "tab:red",
 }
 
-NOTE = f"""\
-The row "given" is of networks before they are trained on, the others are after equal time.
-P/R/U: so many networks are proved, refuted, unknown. A network counts as proved if the training
-or the decision after it proved it.
-good: so many are proved at an error of at most {report.WITHIN} times that of plain training.
-error: the imitation error on held-out states, over that of plain training; the median.
-%: the root of that error itself, in percent of the deviation of what the law does; the median.
-Where it is far below one percent for all ways, the ratio beside it says little.
-cells, s: cells and seconds of the decision after training; medians over the networks that it proved, and a dash
-where it proved none. Nothing is compiled meanwhile that was compiled before.
-first: seconds to the first proof, compilation included; the median over the networks that are
-proved. Plain training is decided at its end only; a network that is proved as it was given needs
-the seconds of its decision.
-built: the part of these that compiles, from empty caches, measured before any clock runs.
-step: milliseconds of training a step, decisions in between included; the median.
-box: the volume of the largest box of initial states that is proved, over that after plain training;
-the median over the networks for which it was looked for, and a dash where plain training has none.
-Where the row of samples has as many proofs as those below it, at no larger error, samples are
-enough."""
+NOTE = {
+    "given": "networks before they are trained on; the other rows are after equal time.",
+    "P/R/U": "so many networks are proved, refuted, unknown. A network counts as proved if its "
+    "training, or the decision afterwards, proved it.",
+    "good": f"so many are proved at an error of at most {report.WITHIN} times that of plain "
+    "training.",
+    "error": "the imitation error on held-out states, over that of plain training; the median.",
+    "%": "the root of that error itself, in percent of the deviation of what the law does; the "
+    "median. Where it is far below one percent for all ways, the ratio beside it says little.",
+    "cells, s": "cells and seconds of the decision after training; medians over the networks that "
+    "it proved, and a dash where it proved none.",
+    "first": "seconds to the first proof, compilation included; the median over the networks that "
+    "are proved. Plain training is decided at its end only. A network that is proved as it was "
+    "given needs the seconds of that decision at most.",
+    "built": "the part of these that compiles, from empty caches, measured before clocks run.",
+    "step": "milliseconds of training a step, decisions in between included; the median.",
+    "box": "the volume of the largest box of initial states that is proved, over that after plain "
+    "training; the median over the networks for which it was looked for, and a dash where no such "
+    "box is known after plain training.",
+}
+"""The rows and columns of the tables, in sentences."""
+
+ENOUGH = """Where the row of samples has as many proofs as those below it, at no larger error, \
+samples are enough."""
+
+
+def said() -> str:
+    """The sentences under the tables."""
+    return "\n".join([*(f"[bold]{name}[/]: {text}" for name, text in NOTE.items()), ENOUGH])
 
 
 def median(values: Iterable[float], digits: int = 0) -> str:

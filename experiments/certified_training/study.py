@@ -245,9 +245,9 @@ class Study:
         judged = self._judged(loop, proved, sized=seed < self._settings.sized)
         if judged["verdict"] == "PROVED" and np.isnan(first):
             first = training + judged["deciding"]
-        before = self.run(GIVEN, seed) if way != GIVEN else None
-        if before is not None and before.verdict == "PROVED" and way != "plain":
-            first = before.deciding
+        before = None if way in (GIVEN, "plain") else self.run(GIVEN, seed)
+        if before is not None and before.verdict == "PROVED":
+            first = float(np.nanmin([first, before.deciding]))
         clocks = {"first": first, "compiling": compiling, "training": training}
         return Outcome(**judged, **clocks, steps=steps)
 
@@ -412,7 +412,7 @@ def main(settings: Settings) -> None:
     found = collected(settings, studied(settings))
     for name, group in found.items():
         rich.print(figures.table(name, group))
-    rich.print(figures.NOTE)
+    rich.print(figures.said())
     outcomes = {
         name: {way: [asdict(each) for each in every] for way, every in group.items()}
         for name, group in found.items()

@@ -100,7 +100,7 @@ def draw(found: dict[str, dict[str, list[Outcome]]], path: Path) -> None:
 
     Those that are not proved are drawn where their training ended.
     """
-    figure, axes = report.panels(2, len(found), (3.2 * len(found), 6.0), sharey="row")
+    figure, axes = report.panels(2, len(found), (3.2 * len(found), 6.4), sharey="row")
     for (above, below), (loop, group) in zip(axes.T, found.items(), strict=True):
         for way, outcomes in group.items():
             if way == "given":
@@ -120,7 +120,9 @@ def draw(found: dict[str, dict[str, list[Outcome]]], path: Path) -> None:
         below.set_yscale("log")
         below.yaxis.set_major_formatter("{x:g}")
         below.yaxis.set_minor_formatter("")
+    axes[1, 0].set_ylim(0.8, max(12.0, axes[1, 0].get_ylim()[1]))
     axes[0, 0].set_ylabel("seconds to the first proof")
     axes[1, 0].set_ylabel("cells of the decision")
-    report.legend_below(figure, title="way (filled: proved, hollow: not)")
+    title, columns = "way (filled: proved, hollow: not)", len(COLOURS) if len(found) > 1 else 2
+    report.legend_below(figure, title=title, ncols=columns)
     report.save(figure, path)

@@ -120,7 +120,7 @@ def draw(found: dict[str, dict[str, list[Outcome]]], path: Path) -> None:
         below.set_yscale("log")
         below.yaxis.set_major_formatter("{x:g}")
         below.yaxis.set_minor_formatter("")
-    axes[1, 0].set_ylim(0.8, max(12.0, axes[1, 0].get_ylim()[1]))
+    axes[1, 0].set_ylim(0.8, max(12.0, 1.3 * axes[1, 0].get_ylim()[1]))
     axes[0, 0].set_ylabel("seconds to the first proof")
     axes[1, 0].set_ylabel("cells of the decision")
     title, columns = "way (filled: proved, hollow: not)", len(COLOURS) if len(found) > 1 else 2

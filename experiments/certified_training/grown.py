@@ -333,11 +333,13 @@ def size_of(name: str, layers: Layers, settings: Settings) -> Size:
     return Size(**kept)
 
 
-NOTE = """\
-largest box: its area, from which the loop is safe at all times and comes to the goal.
-attraction: the area of the cells from which the loop is safe for ever, at least that of the box
-into which all its states come back. A dash: no such box was proved, and nothing is known of the
-region of attraction; then there is no ratio either where that is so before training."""
+NOTE = (
+    "largest box: its area, from which the loop is safe at all times and comes to the goal.\n"
+    "attraction: the area of the cells from which the loop is safe for ever, at least that of the "
+    "box into which all its states come back. A dash: no such box is proved, so that nothing is "
+    "known of a region of attraction. Where that is so before training, there is no ratio."
+)
+"""What the columns of the table mean, in sentences."""
 
 
 def dashed(value: float, digits: int) -> str:

@@ -63,8 +63,8 @@ LONGER = 2
 """So many horizons states have to come into that box."""
 
 WIDER, LEAST = 1.3, 1.05
-"""A box whose sides are so many times as long is trained on next; half of that less 1 where it is
-not proved, until that is less than the other one."""
+"""A box whose sides are so many times as long is trained on next, at most. What exceeds one is
+halved where that is not proved, and doubled where it is, until it is less than the other one."""
 
 STAGES = (rj.Stage(rj.Simulated(), epochs=2), rj.Stage(rj.Certified(), cells=16))
 
@@ -266,10 +266,16 @@ def nothing(loop: rj.ClosedLoop, states: jax.Array) -> jax.Array:
     return jnp.zeros(())
 
 
+def next_factor(factor: float, *, proved: bool) -> float:
+    """How many times as long sides are tried next, after a box that is proved or is not."""
+    return min(WIDER, 1 + 2 * (factor - 1)) if proved else 1 + (factor - 1) / 2
+
+
 def grown(loop: rj.ClosedLoop, region: rj.Box, settings: Settings) -> tuple[rj.ClosedLoop, rj.Box]:
     """A loop of which a larger box is proved, box by box, and the last one.
 
-    What is not proved in time is trained on, for a box that is not as wide.
+    What is not proved in time is trained on, for a box that is not as wide. A task's loss of zero
+    cannot be lowered, so that a round ends with the epoch after its first proof.
     """
     optimizer, factor, latest = optax.adam(settings.learning_rate), WIDER, loop
     with bar() as shown:
@@ -294,9 +300,9 @@ def grown(loop: rj.ClosedLoop, region: rj.Box, settings: Settings) -> tuple[rj.C
             latest = found.loop
             if found.proved:
                 loop, region = latest, wider
-            else:
-                factor = 1 + (factor - 1) / 2
-            if factor < LEAST:
+            factor = next_factor(factor, proved=found.proved)
+            whole = bool(np.all(np.asarray(region.upper) >= WIDEST))
+            if factor < LEAST or whole:
                 break
     return loop, region
 
@@ -327,19 +333,33 @@ def size_of(name: str, layers: Layers, settings: Settings) -> Size:
     return Size(**kept)
 
 
+NOTE = (
+    "largest box: its area, from which the loop is safe at all times and comes to the goal.\n"
+    "attraction: the area of the cells from which the loop is safe for ever, at least that of the "
+    "box into which all its states come back. A dash: no such box is proved, so that nothing is "
+    "known of a region of attraction. Where that is so before training, there is no ratio."
+)
+"""What the columns of the table mean, in sentences."""
+
+
+def dashed(value: float, digits: int) -> str:
+    """A number in words, a dash where it is not known."""
+    return "-" if np.isnan(value) else f"{value:.{digits}f}"
+
+
 def table(sizes: dict[str, Size]) -> Table:
     """A controller a row, and how many times as large what is proved is after training."""
     rows: list[tuple[Any, ...]] = [
         (
             name,
             f"{size.volume:.4f}",
-            f"{size.attracted:.3f}",
+            dashed(size.attracted or float("nan"), 3),
             len(size.cells),
             *(f"{each:.0f}" for each in size.seconds),
         )
         for name, size in sizes.items()
     ]
-    rows.append(("times as large", *(f"{each:.1f}" for each in ratios(sizes)), "", "", ""))
+    rows.append(("times as large", *(dashed(each, 1) for each in ratios(sizes)), "", "", ""))
     headings = ("largest box", "attraction", "cells", "s, box", "s, attraction")
     title = "areas in rad^2/s that are proved of a pendulum"
     return report.table(title, ("controller",), headings, rows)
@@ -389,6 +409,7 @@ def main(settings: Settings) -> None:
     larger = trained(plain, before, settings)
     sizes = {"plain": before, "trained for size": size_of("after", larger, settings)}
     rich.print(table(sizes))
+    rich.print(NOTE)
     loops = dict(zip(sizes, (closed(plain, settings), closed(larger, settings)), strict=True))
     draw(sizes, loops, settings.output / "grown.png")
     found = {

@@ -1,7 +1,9 @@
 """The five loops of the study: laws to imitate, and what is asked, four of them at all times."""
 
 import dataclasses
+import hashlib
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,9 @@ OBSTACLE = 0.4
 
 ROOM = 0.01
 """Between what a law attains and what is safe, in parts of how far states move."""
+
+PART = 0.2
+"""The margin of training, in parts of the least room that the law has: it stays reachable."""
 
 PERIODS = 40
 """Of the cart-pole, that is two seconds: those in which it may fall."""
@@ -126,11 +131,48 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "cart-pole": cartpole,
     "cruise control": cruise,
 }
-MARGIN = {"cruise control": 0.005}
-"""How far requirements should be from failing; of the others a hundredth of a metre or radian."""
 
 
-def required(problem: Problem) -> dict[str, object]:
+def least_room(problem: Problem) -> float:
+    """How far the law itself is from breaking what is required, where it is nearest to that.
+
+    It is measured at samples, from the corners of the initial set, in the units of the state.
+    """
+    states = under_law(problem)
+
+    def rooms(region: rj.PolyhedralSet, seen: Float[ndarray, "... n"]) -> Float[ndarray, "... m"]:
+        C, d, norms = (np.asarray(part) for part in region.facets_in_units())
+        return (d - seen @ C.T) / norms
+
+    found = [np.max(-rooms(region, states), axis=-1).min() for region in problem.avoid]
+    if problem.goal is not None:
+        found.append(rooms(problem.goal, states[:, -1]).min())
+    if problem.safe is not None:
+        found.append(rooms(problem.safe, states).min())
+    return float(min(found))
+
+
+def margin(problem: Problem) -> float:
+    """How far requirements should be from failing in training: a part of the law's least room."""
+    return PART * max(0.0, least_room(problem))
+
+
+def fingerprint(problem: Problem) -> str:
+    """A short word that differs where the loop, its law or what is required of it differs.
+
+    Numbers count to nine digits, so that rounding on another machine changes nothing.
+    """
+    seen, regions = problem.samples(100, 0), (problem.X0, problem.goal, problem.safe)
+    given = [*regions, *problem.avoid]
+    facets = [part for region in given if region is not None for part in region.facets]
+    words = problem.horizon, problem.hidden, problem.activation, [each is None for each in given]
+    found = hashlib.sha256(repr(words).encode())
+    for numbers in (seen.states, seen.inputs, under_law(problem), *facets):
+        found.update((np.round(np.asarray(numbers), 9) + 0.0).tobytes())
+    return found.hexdigest()[:16]
+
+
+def required(problem: Problem) -> dict[str, Any]:
     """What `rj.train` and `rj.decide` take of a problem."""
     return {"goal": problem.goal, "safe": problem.safe, "avoid": problem.avoid or None}
 

@@ -60,6 +60,21 @@ def test_volumes_and_areas_are_compared():
     assert np.isnan(ratios({"before": nowhere, "after": after})[1])
 
 
+def test_what_is_not_known_is_a_dash():
+    nowhere = replace(size([0.1, 0.1]), back=np.full(2, np.nan))
+    columns = grown.table({"before": nowhere, "after": size([0.2, 0.2])}).columns
+    assert list(columns[2].cells) == ["-", "0.001", "-"]
+    columns = grown.table({"before": size([0.1, 0.1]), "after": nowhere}).columns
+    assert list(columns[2].cells) == ["0.001", "-", "0.0"]
+
+
+def test_boxes_are_wider_again_after_one_that_is_proved():
+    factor = grown.next_factor(grown.WIDER, proved=False)
+    assert factor == pytest.approx(1.15)
+    assert grown.next_factor(factor, proved=True) == pytest.approx(grown.WIDER)
+    assert grown.next_factor(grown.WIDER, proved=True) == grown.WIDER
+
+
 @pytest.mark.costly
 def test_cells_of_a_region_of_attraction_come_into_a_box_that_is_come_back_to():
     loop = linear(-12.0, -5.0)

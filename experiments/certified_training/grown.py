@@ -294,6 +294,7 @@ def grown(loop: rj.ClosedLoop, region: rj.Box, settings: Settings) -> tuple[rj.C
                 margin=0.005,
                 steps=50,
                 seed=seed,
+                gain=1.0,  # nothing is left to lower once it is proved
                 time_limit=settings.seconds,
             )
             shown.advance(task)

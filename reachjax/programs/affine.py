@@ -287,8 +287,9 @@ class AffineForms(AbstractNumber):
         xp = namespace(self.rows)
         lost: Any = False
         for each in others:
-            form = each.rows[:, 0] + abs(each.columns).sum(axis=1) + each.within_part + each.off
-            interval = each.rows[:, 1] + each.radii[:, -1]
+            form = abs(each.rows[:, 0]) + abs(each.columns).sum(axis=1)
+            form = form + each.within_part + each.off
+            interval = abs(each.rows[:, 1]) + each.radii[:, -1]
             lost = lost | xp.any(~(xp.isfinite(form) | xp.isfinite(interval)))
         return AffineForms(self.rows, self.radii + xp.where(lost, xp.nan, 0.0), self.inner)
 

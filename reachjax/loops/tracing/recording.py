@@ -75,7 +75,6 @@ class Recorder:
         self.required: dict[int, Value] = {}
         self.factored: dict[int, Operand] = {}
         self.maxima: dict[int, list[frozenset[Entry]]] = {}
-        self._asked: set[int] = set()
         self.inputs = [Value(place, shape) for place, shape in enumerate(shapes)]
         self.values = [*self.inputs]
         self._made: dict[Any, Value] = {}
@@ -100,8 +99,7 @@ class Recorder:
         """Let numbers be real ones: units that they depend on must have bounds."""
         if not isinstance(operand, Value):
             return
-        before = self.between(operand, done=self._asked)
-        self._asked.update(before)
+        before = self.between(operand)
         units = [step.unit for place in before if (step := self.steps[place]) is not None]
         if any(unit is not None and _has_limits(unit) for unit in units):
             self.required[operand.place] = operand

@@ -25,7 +25,18 @@ from reachjax.loops.tracing.combinations import LARGEST, Combination, InexactErr
 from reachjax.loops.tracing.limits import ConstantLimits, Limits
 from reachjax.loops.tracing.recording import Entry, Recorder
 from reachjax.loops.tracing.values import Term, Value, is_constant
-from reachjax.loops.units import ISRU, Exp, Log, Reciprocal, Softplus, Sqrt, Square, Tanh, Within
+from reachjax.loops.units import (
+    ISRU,
+    AbstractUnit,
+    Exp,
+    Log,
+    Reciprocal,
+    Softplus,
+    Sqrt,
+    Square,
+    Tanh,
+    Within,
+)
 from reachjax.numerics.rounding import TINY, gamma
 
 TERMS = 96
@@ -194,10 +205,9 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
     if columns is None:
         return None
     if isinstance(one, Value) and not _is_moderate(recorder, other, terms):
-        recorder.require(recorder.unit(Reciprocal(), other))
+        _require_sum(recorder, other, Reciprocal())
         if more:  # factors may be large
-            both = recorder.added(other, recorder.absolute(one))
-            recorder.require(recorder.unit(Reciprocal(), both))
+            recorder.require(one)
     first, logarithm = _logarithm(recorder, columns, other.shape)
     for place in mine.parts | first.parts:  # of what cancels
         recorder.require(recorder.values[place])
@@ -217,7 +227,7 @@ def of_sum(recorder: Recorder, value: Value) -> Value | None:
     if terms is None or columns is None or len(columns) < 2:
         return None
     if not _is_moderate(recorder, value, terms):
-        recorder.require(recorder.unit(Log(), value))
+        _require_sum(recorder, value, Log())
     first, logarithm = _logarithm(recorder, columns, value.shape)
     return recorder.added(first.recorded(recorder, value.shape), logarithm)
 
@@ -260,6 +270,12 @@ def _is_moderate(recorder: Recorder, value: Value, terms: list[list[Exponent]]) 
     if np.all(limits.least >= TINY) and np.all(limits.most < np.inf):
         return True
     return all(_has_one(recorder, each) for each in terms)
+
+
+def _require_sum(recorder: Recorder, value: Value, unit: AbstractUnit) -> None:
+    """Let a sum be a number, of which a unit has a value unless the sum is never near zero."""
+    limits = recorder.limits(value, ConstantLimits)
+    recorder.require(value if np.all(limits.least >= TINY) else recorder.unit(unit, value))
 
 
 def _has_one(recorder: Recorder, terms: list[Exponent]) -> bool:

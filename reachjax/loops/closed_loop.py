@@ -217,6 +217,24 @@ class ClosedLoop(Replaceable, AbstractSealed):
         """The number of units of one step."""
         return sum(layer.size for layer in self.unit_layers)
 
+    def require_units(self, units: int | None = None, inputs: int | None = None) -> None:
+        """Raise an error if a step has more units, or inputs of units, than were counted before.
+
+        A function that chooses by a parameter has the units of its choice, but those of all
+        choices where the parameter is traced.
+
+        Raises:
+            TypeError: it has more.
+        """
+        counts = (self.units, units), (self.unit_inputs, inputs)
+        if any(known is not None and found > known for found, known in counts):
+            raise TypeError(
+                "a function of the loop chooses by a parameter: where it is known, as for bounds, "
+                "a step has fewer units than where it is traced, as in derivatives and programs. "
+                "Let the function close over the number that it chooses by, or choose in Python, "
+                "outside of it; or give relaxation=LinearBounds()"
+            )
+
     @property
     def unit_inputs(self) -> int:
         """The number of inputs of the units of one step, of which some have two."""

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
+from reachjax.loops.delays import DelayedPlant
 from reachjax.loops.scenarios import Scenarios
 from reachjax.loops.units import UnboundedError
 from reachjax.methods.cell_tree import Node
@@ -176,6 +177,9 @@ def spans_by_forms(
     the sample that a period begins with, of the box around that set. Traced numbers have the first
     alone: whether a set is smaller is not known, and one call is compiled.
 
+    Of a plant whose inputs are late they hold the sample that a period begins with, too: its inputs
+    on their way jump there.
+
     Args:
         loop: the closed loop, whose plant is a differential equation.
         sets: the initial set, and what is proved of each sample after it.
@@ -196,6 +200,9 @@ def spans_by_forms(
         steps = unrolled_at_once(loop, *given, between=1)
         assert steps.between is not None  # they were asked for
         found = [*jnp.max(steps.between, axis=1)]
+    if isinstance(loop.plant, DelayedPlant):  # at a sample inputs on their way have yet to move up
+        begun = (region.support(rows) for region, rows in zip(sets[:-1], directions, strict=True))
+        found = [jnp.maximum(*each) for each in zip(found, begun, strict=True)]
     pairs = zip(shapes, found, strict=True)
     return tuple(shape.polytope(owned(offsets)) for shape, offsets in pairs)
 

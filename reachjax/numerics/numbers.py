@@ -6,7 +6,7 @@ Arrays are numbers too, plain ones, which know nothing of errors; the functions 
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 
@@ -79,6 +79,10 @@ class AbstractNumber(abc.ABC):
         """The numbers with what is known of them besides, from other numbers, if that is kept."""
         return self
 
+    def where_known(self, others: Sequence[Any]) -> Self:
+        """The numbers, of which nothing is known where nothing is of others, if that is seen."""
+        return self
+
 
 def size(number: Any) -> int:
     """How many numbers there are, along the last axis of an array."""
@@ -126,3 +130,10 @@ def nearly_times(number: Any, factor: Any) -> Any:
 def met(number: Any, held: Callable[..., Any], *given: Any) -> Any:
     """A number with what is known of it besides, from other numbers, if its kind keeps that."""
     return number.met(held, *given) if isinstance(number, AbstractNumber) else number
+
+
+def where_known(number: Any, others: Sequence[Any]) -> Any:
+    """A number of which nothing is known where nothing is of others, if its kind sees that."""
+    others = [other for other in others if isinstance(other, AbstractNumber)]
+    known = not others or not isinstance(number, AbstractNumber)
+    return number if known else number.where_known(others)

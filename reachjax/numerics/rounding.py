@@ -392,6 +392,11 @@ class Ball(AbstractNumber):
         """What these hold and what others say of them."""
         return self.meeting(held(*given))
 
+    def where_known(self, others: Sequence[Self]) -> Self:
+        """The numbers, of which nothing is known where an end of others is infinite, or none."""
+        lost = sum((each.mid - each.mid + (each.rad - each.rad)).sum() for each in others)
+        return type(self)(self.mid, self.rad + lost)
+
     def meeting(self, other: Self) -> Self:
         """Numbers that both hold."""
         lower = larger(self.lower, other.lower)

@@ -360,6 +360,12 @@ def _restored(kind: Any, parts: Any) -> Any:
     return kind.restored(parts)
 
 
+def _is_same(array: Any, other: Any) -> bool:
+    """Whether arrays have the same numbers; NaN is itself."""
+    one, other = np.asarray(array), np.asarray(other)
+    return one.shape == other.shape and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+
+
 def _rebuilt(named: tuple[Any, ...], *values: Any) -> Any:
     """An object as it was, down to the last bit, if a user might have made it.
 
@@ -380,7 +386,15 @@ def _rebuilt(named: tuple[Any, ...], *values: Any) -> Any:
         )
     require_structure(kind, fields)
     if SEAL not in fields:  # else the parts are checked where they are sealed again
-        kind(**{f.name: fields[f.name] for f in known if f.init})
+        own = kind(**{f.name: fields[f.name] for f in known if f.init})
+        for name, value in fields.items():
+            if isinstance(value, np.ndarray | jax.Array) and not _is_same(
+                value, getattr(own, name)
+            ):
+                raise ValueError(
+                    f"its {kind.__qualname__}.{name} is {np.asarray(value).tolist()!r:.60}, which "
+                    "no object of that kind has"
+                )
     return unchecked(kind, **fields)
 
 

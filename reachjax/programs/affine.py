@@ -282,6 +282,17 @@ class AffineForms(AbstractNumber):
         """The numbers up to an error of so much each."""
         return AffineForms(self.rows, (self.radii + by[..., None]) * (1 + gamma(4)), self.inner)
 
+    def where_known(self, others: Sequence[AffineForms]) -> AffineForms:
+        """The numbers, of which nothing is known where others have no form and no interval."""
+        xp = namespace(self.rows)
+        lost: Any = False
+        for each in others:
+            form = abs(each.rows[:, 0]) + abs(each.columns).sum(axis=1)
+            form = form + each.within_part + each.off
+            interval = abs(each.rows[:, 1]) + each.radii[:, -1]
+            lost = lost | xp.any(~(xp.isfinite(form) | xp.isfinite(interval)))
+        return AffineForms(self.rows, self.radii + xp.where(lost, xp.nan, 0.0), self.inner)
+
     def padded(self, width: int) -> AffineForms:
         """The forms over at least so many columns, the new ones empty (numpy)."""
         more = width - self.rows.shape[1] + 2

@@ -116,6 +116,7 @@ def loop_rows(
         bounds: of this step's units.
         prune: whether units that the bounds prove to be affine leave their columns empty.
     """
+    loop.require_units(len(places))
     size, done, seen = state.mid.shape[1], 0, 0
     none = columns(0, 0, size)
     inputs, outputs = [none], [none]

@@ -146,6 +146,7 @@ def _values(
     intervals: bool,
 ) -> Float[Array, "N f"]:
     """Values after 1, ..., N steps where bounds are attained."""
+    loop.require_units(inputs=held.ranges.shape[-1])
     start, steps = InitialColumns.of(X0, box, loop.curved), len(held.ranges)
     (more, between), first = step_columns(loop), start.count
     end, weights = first + steps * more, jnp.moveaxis(jnp.asarray(held.of_units), 1, 0)

@@ -215,6 +215,7 @@ def replayed(
     start: int = 0,
 ) -> Float[Array, " f"]:
     """Numbers `(f,)` whose derivatives in loop, set and directions are those of the bounds."""
+    loop.require_units(inputs=replay.slopes.shape[-1])
     initial, (_, ball) = InitialColumns.of(X0, box), X0.parts
     cornered = ball is None and replay.of_set.shape[1] > 0
     steps = replay.slopes.shape[1]

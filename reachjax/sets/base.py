@@ -340,7 +340,9 @@ class PolyhedralSet(AbstractSet):
     def bounds_along(self, directions: Float[Array, "m n"]) -> Float[Array, " m"]:
         """Offsets of the facets whose normal is a direction, and the support of other directions.
 
-        An offset is looser than the support where its facet does not touch the set.
+        An offset is looser than the support where its facet does not touch the set. It is brought
+        to the direction's length by a product that is not rounded upwards, for what is shown or
+        differentiated: nothing is proved by it.
         """
         A, b = self.facets
         offsets, found = supports.offsets_along(A, b, directions)

@@ -15,14 +15,13 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from reachjax.numerics.checks import require_kind
 from reachjax.sets import PolyhedralSet
 from reachjax.verdicts.grounds import Asked, Key
-from reachjax.verdicts.specification import Requirement
+from reachjax.verdicts.specification import Requirement, bits_of
 from reachjax.verdicts.verdict import Recurrence
 
 ARRIVES = "in the set at the end"
@@ -166,17 +165,10 @@ def _kinds(rest: list[Requirement]) -> tuple[dict[Key, str], dict[str, Requireme
     strictest: dict[str, Requirement] = {}
     for item in rest:
         if id(item.region) not in bits:
-            bits[id(item.region)] = _bits(item.region)
+            bits[id(item.region)] = bits_of(item.region)
         kind = item.name, item.inside, bits[id(item.region)]
         name = kinds.setdefault(kind, f"{item.name}, {len(kinds)}")
         names[_key(item)] = name
         if name not in strictest or item.throughout:
             strictest[name] = item
     return names, strictest
-
-
-def _bits(region: PolyhedralSet) -> Any:
-    """What tells a set from any other one."""
-    leaves, structure = jax.tree.flatten(region)
-    arrays = map(np.asarray, leaves)
-    return structure, *((each.dtype.str, each.shape, each.tobytes()) for each in arrays)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from reachjax.loops import ClosedLoop
-from reachjax.loops.tracing.functions import with_constants
+from reachjax.loops.tracing.functions import numbers_within, with_constants
 from reachjax.loops.units import UnboundedError
 from reachjax.numerics.budget import Budget
 from reachjax.numerics.compilations import CompiledBeside
@@ -161,7 +161,7 @@ class Sieve:
     @cached_property
     def _of_subnormals(self) -> bool:
         """Whether the loop, or what is required, has numbers that compiled code takes for zero."""
-        return holds_subnormals((self._loop, self._later))
+        return holds_subnormals((self._loop, self._later, numbers_within(self._loop)))
 
     def _measured(self, cell: Ends) -> float | None:
         """The seconds that a call takes one by one; None where this cell has no bounds."""

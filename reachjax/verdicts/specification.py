@@ -408,9 +408,14 @@ def asked_again(
     times = {item.time for item in said if item.name == "safe"}
     if times and times != set(range(horizon + 1)):
         raise ValueError("a safe set must be required at all times")
+    meant: dict[str, Any] = {}
     for item in said:
-        meant = NAMES_INSIDE if item.inside else NAMES_OUTSIDE
-        if re.fullmatch(meant, item.name, re.ASCII) is None:
+        own = bits_of(item.ball or item.region)
+        if item.name != "goal" and own != meant.setdefault(item.name, own):
+            raise ValueError(f"{item.name} must be one set, the same at all times")
+    for item in said:
+        names = NAMES_INSIDE if item.inside else NAMES_OUTSIDE
+        if re.fullmatch(names, item.name, re.ASCII) is None:
             raise ValueError(f"{item.name!r} is no part of a specification")
         if not 0 <= item.time <= horizon:
             raise ValueError(f"{item.name} is required at t = {item.time}, beyond the horizon")
@@ -423,6 +428,13 @@ def asked_again(
         for item, region in kept
     ]
     return tuple(_each_checked(whole, states))
+
+
+def bits_of(region: AbstractSet) -> Any:
+    """The bits of a set, by which it is told from any other one."""
+    leaves, structure = jax.tree.flatten(region)
+    arrays = map(np.asarray, leaves)
+    return structure, *((each.dtype.str, each.shape, each.tobytes()) for each in arrays)
 
 
 def _each_checked(found: Sequence[Requirement], states: int) -> list[Requirement]:

@@ -15,6 +15,10 @@ def bent_or_smooth(mode, x):
     return jnp.where(mode > 0, jnp.maximum(x, 0.0), jnp.tanh(x))
 
 
+def scaled_choice(mode, gain, x):
+    return gain * bent_or_smooth(mode, x)
+
+
 def steeper_beyond(s, x):
     return jnp.where(x > s, 2 * x - s, x)
 
@@ -75,3 +79,23 @@ def test_derivatives_of_a_function_that_chooses_are_differences():
     step = 1e-5
     expected = (width(1.0 + step) - width(1.0 - step)) / (2 * step)
     assert jax.grad(width)(1.0) == pytest.approx(float(expected), rel=1e-4)
+
+
+@pytest.mark.parametrize("by", ["programs", "derivatives", "derivatives of a choice"])
+def test_choices_that_are_open_where_parameters_are_traced_are_named(by):
+    """Programs and derivatives are made in compiled code, where no parameter is known."""
+    X0, template = rj.Box([0.2], [1.0]), rj.Template.box(1)
+    way = {"relaxation": rj.PaperQC()} if by == "programs" else {}
+
+    def width(mode, gain=1.0):
+        plant = rj.AffinePlant([[0.5]], [[1.0]])
+        net = rj.Network(jax.tree_util.Partial(scaled_choice, mode, gain), 1, 1)
+        return rj.reach(rj.ClosedLoop(plant, net), X0, 2, template, **way).sets[2].b.sum()
+
+    asked = {
+        "programs": width,
+        "derivatives": lambda mode: jax.grad(lambda gain: width(mode, gain))(1.0),
+        "derivatives of a choice": jax.grad(width),
+    }
+    with pytest.raises(TypeError, match="chooses by a parameter"):
+        asked[by](jnp.array(1.0))

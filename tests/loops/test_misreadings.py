@@ -269,9 +269,31 @@ def test_numbers_that_compiled_code_takes_for_zero_are_not_lost():
     assert not rj.decide(loop, start, 1, safe=below).proved
 
 
-def test_an_equation_whose_result_rests_on_whether_there_is_a_number_is_refused():
-    with pytest.raises(TypeError, match="whether there is a number"):
-        rj.SampledPlant(lambda x, u: jnp.where(jnp.isfinite(jnp.log(x)), -x, x) + 0 * u, 1, 1, 0.1)
+TURN = 2 * np.pi
+TURNING = {
+    "question": lambda y: jnp.where(jnp.isfinite(jnp.log(y + 0.5)), 1.0, 0.0),
+    "quotient": lambda y: jnp.exp(-2000 * y) / (1 + jnp.exp(-2000 * y)),
+    "logarithm": lambda y: jnp.log(1 + jnp.exp(-2000 * y)),
+    "multiple": lambda y: 0.0 * jnp.sqrt(y + 0.5),
+}
+
+
+@pytest.mark.parametrize("name", TURNING)
+def test_an_equation_is_not_one_where_its_domain_is_left_in_between_samples(name):
+    """States go round in a period: at samples they are where the function is a number."""
+
+    def turned(x, u):
+        return jnp.stack([TURN * x[1], -TURN * x[0], TURNING[name](x[0]) + 0 * u[0]])
+
+    def bounds(radius):
+        box = rj.Box([radius, -1e-3, 0.0], [radius + 1e-3, 1e-3, 0.0])
+        return rj.reach(loop, box, 1, rj.Template.box(3), rj.LinearBounds()).spans[0].b
+
+    net = rj.MLP.from_layers([([[0.0] * 3], [0.0])])
+    loop = rj.ClosedLoop(rj.SampledPlant(turned, 3, 1, 1.0), net)
+    with pytest.raises(ValueError, match=r"no bounds|overflow"):
+        bounds(0.9)
+    assert np.isfinite(bounds(0.01)).all()
 
 
 def test_a_constant_of_a_transformation_is_no_obstacle():

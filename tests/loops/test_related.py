@@ -113,3 +113,61 @@ def test_rounding_of_factors_decides_nothing(name):
     values, off = images(function, x)
     over = values @ fractions(region.A).T - fractions(region.b)
     assert over.max() <= off * (1 + abs(values).max())
+
+
+def largest_of_all(x):
+    return jnp.exp(x - x.max()) / jnp.exp(x - x.max()).sum()
+
+
+def of_some(x):
+    """A quotient whose exponents have the largest of some numbers taken from them alone."""
+    powers = jnp.exp(x - x[:1].max())
+    return powers / powers.sum()
+
+
+def finite_or_zero(x):
+    large = 1e10 * jnp.exp(x)
+    return jnp.where(jnp.isfinite(large), x, 0.0)
+
+
+# a function, where its exponentials overflow or all underflow, and where they do not
+BEYOND = {
+    "sigmoid": (lambda x: jnp.exp(x) / (1 + jnp.exp(x)), (700.0, 720.0), (-720.0, 600.0)),
+    "multiple": (lambda x: 1e10 * jnp.exp(x) / (1 + jnp.exp(x)), (680.0, 700.0), (0.0, 600.0)),
+    "softplus": (lambda x: jnp.log(1 + jnp.exp(x)), (700.0, 720.0), (-720.0, 600.0)),
+    "log1p": (lambda x: jnp.log1p(jnp.exp(x)), (700.0, 720.0), (-720.0, 600.0)),
+    "sum": (lambda x: jnp.exp(x) / (jnp.exp(x) + jnp.exp(x + 1)), (709.0, 709.6), (-9.0, 9.0)),
+    "sum of one": (lambda x: jnp.exp(x) / (2 * jnp.exp(x)), (709.0, 709.6), (-9.0, 9.0)),
+    "underflow": (lambda x: jnp.log(jnp.exp(x) + jnp.exp(2 * x)), (-800.0, -700.0), (-9.0, 9.0)),
+    "zero over zero": (lambda x: jnp.exp(x) / jnp.exp(x).sum(), (-800.0, -700.0), (-9.0, 9.0)),
+    "required": (finite_or_zero, (680.0, 700.0), (-9.0, 9.0)),
+    "largest of some": (of_some, (-500.0, 500.0), (-9.0, 9.0)),
+}
+
+
+def image(function, ends):
+    """The set of the values of a function of two numbers over a square."""
+    plant = rj.NonlinearPlant(lambda x, u: function(x), 2, 1)
+    loop = rj.ClosedLoop(plant, rj.Network(lambda x: 0 * x[:1], inputs=2, outputs=1))
+    lower, upper = (np.full(2, end) for end in ends)
+    return rj.reach(loop, rj.Box(lower, upper), 1, rj.Template.box(2), FORMS).sets[1]
+
+
+@pytest.mark.parametrize("name", BEYOND)
+def test_what_overflows_as_jax_computes_it_has_no_bounds(name):
+    function, beyond, within = BEYOND[name]
+    corners = jnp.array([beyond, beyond[::-1], [beyond[0]] * 2, [beyond[1]] * 2])
+    values = jax.vmap(function)(corners)
+    assert not np.isfinite(values).all() or np.any(values == 0)
+    with pytest.raises(ValueError, match=r"no bounds|overflow"):
+        image(function, beyond)
+    assert np.isfinite(image(function, within).b).all()
+
+
+@pytest.mark.parametrize(
+    "function", [jax.nn.softmax, jax.nn.logsumexp, jax.nn.log_softmax, jax.nn.softplus,
+                 jax.nn.sigmoid, largest_of_all, lambda x: 1 / (1 + jnp.exp(-x))]
+)  # fmt: skip
+def test_what_is_moderate_as_jax_computes_it_has_bounds_far_out(function):
+    whole = image(lambda x: jnp.broadcast_to(function(x), (2,)), (-2000.0, 2000.0))
+    assert np.isfinite(whole.b).all()

@@ -344,3 +344,19 @@ def test_a_file_of_an_earlier_version_is_read(kind, path):
     else:
         with pytest.raises(rj.DisagreementError, match=r"an earlier version wrote .* reach again"):
             rj.load(path, recheck=True)
+
+
+@pytest.mark.parametrize("by", [1e-13, 0.1])
+def test_a_shape_that_is_not_symmetric_is_refused(by, tmp_path):
+    """An ellipsoid makes its shape symmetric, so that no file of one has another."""
+    path, net = tmp_path / "a.tube", rj.MLP.from_layers([([[0.0, 0.0]], [0.0])])
+    loop = rj.ClosedLoop(rj.AffinePlant([[0.5, 0.1], [0.0, 0.5]], [[1.0], [0.0]]), net)
+    X0 = rj.Ellipsoid([0.0, 0.0], [[2.0, 0.25], [0.25, 1.0]])
+    rj.reach(loop, X0, 1, rj.Template.box(2)).save(path)
+    head, arrays = opened(path)
+    (shape,) = (a for a in arrays if a.shape == (2, 2) and a[0, 1] == 0.25)
+    shape[0, 1] += by
+    written(path, head, arrays)
+    for recheck in (False, True):
+        with pytest.raises(rj.UnreadableError, match="shape"):
+            rj.load(path, recheck=recheck)

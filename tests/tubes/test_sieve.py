@@ -94,6 +94,28 @@ def test_what_compiled_code_takes_for_zero_is_not_sifted(where, monkeypatch):
     assert not (pays(1e-310, 0.0) if where == "weights" else pays(1e-300, 1e-310))
 
 
+SMALL = np.array([1e-310])
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x, u: SMALL * x * 1e308 + u,
+        lambda x, u: 1e-310 * x * 1e308 + u,
+        lambda x, u: jax.jit(lambda y: SMALL * y)(x) * 1e308 + u,
+    ],
+    ids=["closed over", "written", "in a call"],
+)
+def test_functions_of_numbers_that_compiled_code_takes_for_zero_are_not_sifted(
+    function, monkeypatch
+):
+    monkeypatch.setattr("reachjax.numerics.compilations.CompiledBeside.pays", lambda *_, **__: True)
+    net = rj.MLP.from_layers([([[0.0]], [0.0])])
+    loop = rj.ClosedLoop(rj.NonlinearPlant(function, 1, 1), net)
+    sieve = Sieve(loop, 1, 0, requirements(1, 1, goal=rj.Box([-1.0], [5e3])))
+    assert not sieve.pays([(np.array([1e6]), np.array([2e6]))], Budget())
+
+
 @pytest.mark.costly
 def test_what_is_computed_of_parameters_alone_is_sifted_as_well():
     """It is an argument of the compiled call, which is there as soon as it pays."""

@@ -271,6 +271,25 @@ def test_what_is_required_at_all_times_is_required_at_all_of_them(tmp_path):
         rj.load(path, loop, recheck=True)
 
 
+@pytest.mark.parametrize("name", ["safe", "avoid"])
+def test_what_has_one_name_is_one_set(name, tmp_path):
+    """Else a file says that a set is safe, and proves of another one that it is, at one time."""
+    loop, path = rectified(), tmp_path / "a.verdict"
+    far = rj.Box([50.0, 50.0], [60.0, 60.0])
+    given = {"avoid": [far]} if name == "avoid" else {"safe": around(loop, 3.0, slice(None))}
+    verdict = rj.decide(loop, X0, STEPS, **given)
+    assert verdict.proved
+    *others, last = verdict.asked.required
+    other = (
+        rj.Box([51.0, 51.0], [60.0, 60.0]) if name == "avoid" else around(loop, 9.0, slice(None))
+    )
+    several = (*others, dataclasses.replace(last, region=other))
+    forged(path, verdict, asked=verdict.asked._replace(required=several))
+    for recheck in (False, True):
+        with pytest.raises(rj.UnreadableError, match="must be one set"):
+            rj.load(path, recheck=recheck)
+
+
 def test_multipliers_of_any_kind_prove_nothing_that_is_false():
     """Of goals that samples break, nothing that a file may propose is a proof."""
     loop = rectified()

@@ -81,13 +81,11 @@ class Tape:
         self._units: dict[tuple[AbstractUnit, int], int] = {}
         self._waves: dict[int, tuple[int, int]] = {}
         found = {value.place: value.place for value in recorder.inputs}
-        places = recorder.between(wanted)
-        if not {*places} >= {*recorder.required}:
-            raise UnsupportedError(
-                "it asks whether there is a number, as jnp.isnan does, on which its result does "
-                "not depend: keep the states in its domain, and leave the question out"
-            )
-        for place in places:
+        places = {*recorder.between(wanted)}
+        besides = [each for each in recorder.required.values() if each.place not in places]
+        for each in besides:
+            places.update(recorder.between(each, done=places))
+        for place in sorted(places):
             step = recorder.steps[place]
             if step is None:
                 continue
@@ -98,8 +96,21 @@ class Tape:
             else:
                 _require_no_jump(step)
                 found[place] = step.unit.on_tape(self, parents, step.apply)
-        self.result = found[wanted.place]
+        self.result = self._where_known(found[wanted.place], [found[one.place] for one in besides])
         self.needed = self._of_values()
+
+    def _where_known(self, wanted: int, others: Sequence[int]) -> int:
+        """A number plus zero times others, which is not known where one of these is not."""
+        if not others:
+            return wanted
+        zeros = [np.zeros((self.sizes[wanted], self.sizes[each])) for each in others]
+
+        def known(number: Any, *given: Any) -> Any:
+            for zero, each in zip(zeros, given, strict=True):
+                number = number + zero @ each
+            return number
+
+        return self.affine(known, wanted, *others)
 
     def _of_values(self) -> set[int]:
         """The numbers that values of the result rest on, its series left aside."""

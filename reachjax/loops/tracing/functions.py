@@ -260,14 +260,20 @@ def with_constants(tree: Any) -> Any:
 
     So it is not done again, and rounded otherwise, in what is compiled.
     """
-
-    def is_function(node: Any) -> bool:
-        return isinstance(node, Function)
-
-    leaves, structure = jax.tree.flatten(tree, is_leaf=is_function)
-    found = [each.with_constants() if is_function(each) else each for each in leaves]
+    leaves, structure = jax.tree.flatten(tree, is_leaf=_is_function)
+    found = [each.with_constants() if _is_function(each) else each for each in leaves]
     same = all(one is other for one, other in zip(leaves, found, strict=True))
     return tree if same else jax.tree.unflatten(structure, found)
+
+
+def numbers_within(tree: Any) -> list[Any]:
+    """The numbers in the functions of a tree, which are no leaves of it."""
+    leaves = filter(_is_function, jax.tree.leaves(tree, is_leaf=_is_function))
+    return [number for each in leaves for number in each.structure.trace.numbers]
+
+
+def _is_function(node: Any) -> bool:
+    return isinstance(node, Function)
 
 
 class Compiled:

@@ -46,6 +46,10 @@ FAR = 1e3
 """Units that have bounds between its negative and it are taken to have some everywhere."""
 
 
+Entry = tuple[int, int]
+"""A number: the place of the value that it is an entry of, and which one."""
+
+
 class Recorder:
     """The steps so far.
 
@@ -61,6 +65,7 @@ class Recorder:
         required: values, by their places, that must be real numbers, as what is read rests on
             that, whether or not the result depends on them.
         factored: the matrices of which triangular ones are the factors, by the places of these.
+        maxima: of which numbers each entry of a value is the largest, by the place of the value.
     """
 
     def __init__(self, shapes: Sequence[Shape]):
@@ -69,33 +74,32 @@ class Recorder:
         self.known: dict[Any, tuple[list[Operand], Sequence[Operand]]] = {}
         self.required: dict[int, Value] = {}
         self.factored: dict[int, Operand] = {}
-        self._asked: set[int] = set()
+        self.maxima: dict[int, list[frozenset[Entry]]] = {}
         self.inputs = [Value(place, shape) for place, shape in enumerate(shapes)]
         self.values = [*self.inputs]
         self._made: dict[Any, Value] = {}
         self._limits: dict[type[Limits], dict[int, Limits]] = {}
 
-    def run(self, numbers: Sequence[Any], unit: AtUnit, wanted: Value) -> Any:
+    def run(self, given: Sequence[Any], unit: AtUnit, wanted: Value) -> Any:
         """The numbers of a value, from those of the inputs, of any one kind.
 
         What it does not depend on is left out, but for what is required: units there add no columns
-        and need no bounds.
+        and need no bounds. Where what is required has none, as sums overflow, nor has the value.
         """
-        found, places = dict(enumerate(numbers)), {*self.between(wanted)}
+        found, places = dict(enumerate(given)), {*self.between(wanted)}
         for each in self.required.values():
             places.update(self.between(each, done=places))
         for place in sorted(places):
             step = self.steps[place]
             if step is not None:
                 found[place] = step.apply(unit, *(found[parent] for parent in step.parents))
-        return found[wanted.place]
+        return numbers.where_known(found[wanted.place], [found[place] for place in self.required])
 
     def require(self, operand: Operand) -> None:
         """Let numbers be real ones: units that they depend on must have bounds."""
         if not isinstance(operand, Value):
             return
-        before = self.between(operand, done=self._asked)
-        self._asked.update(before)
+        before = self.between(operand)
         units = [step.unit for place in before if (step := self.steps[place]) is not None]
         if any(unit is not None and _has_limits(unit) for unit in units):
             self.required[operand.place] = operand
@@ -171,6 +175,12 @@ class Recorder:
         for known in self._limits.values():
             known.pop(value.place, None)
         return value
+
+    def largest_of(self, value: Value) -> list[frozenset[Entry]]:
+        """The numbers that each entry is the largest of, itself if it is no maximum."""
+        base, index = value.source or (value, np.arange(value.size))
+        known = self.maxima.get(base.place)
+        return [frozenset({(base.place, k)}) if known is None else known[k] for k in index.tolist()]
 
     def is_nonnegative(self, value: Value) -> bool:
         """Whether numbers are squares, say, or sums of them: never below zero."""

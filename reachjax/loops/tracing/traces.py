@@ -166,6 +166,13 @@ class Trace:
         return found
 
     @property
+    def numbers(self) -> Iterator[Any]:
+        """The constants that it closes over, and those that are written in it."""
+        yield from (each for each in _constants(self.closed) if _is_float(each))
+        for equation in equations(self.closed):
+            yield from (each.val for each in equation.invars if isinstance(each, core.Literal))
+
+    @property
     def rounds_constants(self) -> bool:
         """Whether it rounds numbers that depend on parameters or constants alone."""
         if self._rounds is None:

@@ -46,6 +46,9 @@ def _larger(recorder: Recorder, one: Value, other: Operand) -> Value:
     if is_known(other) and not np.any(other):
         return recorder.rectified(one)
     found = recorder.added(recorder.rectified(recorder.added(one, other, -1)), other)
+    if isinstance(other, Value):
+        both = zip(recorder.largest_of(one), recorder.largest_of(other), strict=True)
+        recorder.maxima[found.place] = [mine | others for mine, others in both]
     return recorder.limited(found, lambda limits: limits(one).larger(limits(other)))
 
 

@@ -5,6 +5,10 @@ y^2)`, so it is at most one in size whatever bounds say of `v` and of the norm. 
 a sum of them is a logistic sigmoid of its exponent less the logarithm of the sum of the others, and
 `log(e^a + e^b) = a + log(1 + e^(b - a))`: nothing overflows, and no divisor comes near to zero.
 
+As JAX computes it, it may: `exp(x) / (1 + exp(x))` is NaN from 710 on. So the sum itself must have
+bounds, unless it is seen to be moderate whatever the inputs are, as where the largest of all
+exponents is taken from each.
+
 What a recording is made of rests on its steps and on constants, never on numbers of parameters.
 """
 
@@ -18,11 +22,22 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from reachjax.loops.tracing.combinations import LARGEST, Combination, InexactError
-from reachjax.loops.tracing.limits import Limits
-from reachjax.loops.tracing.recording import Recorder
+from reachjax.loops.tracing.limits import ConstantLimits, Limits
+from reachjax.loops.tracing.recording import Entry, Recorder
 from reachjax.loops.tracing.values import Term, Value, is_constant
-from reachjax.loops.units import ISRU, Exp, Reciprocal, Softplus, Sqrt, Square, Tanh, Within
-from reachjax.numerics.rounding import gamma
+from reachjax.loops.units import (
+    ISRU,
+    AbstractUnit,
+    Exp,
+    Log,
+    Reciprocal,
+    Softplus,
+    Sqrt,
+    Square,
+    Tanh,
+    Within,
+)
+from reachjax.numerics.rounding import TINY, gamma
 
 TERMS = 96
 """More exponentials in sums are left as they are: each costs a unit in every sum that it is in."""
@@ -189,6 +204,10 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
     columns = _columns(rows)
     if columns is None:
         return None
+    if isinstance(one, Value) and not _is_moderate(recorder, other, terms):
+        _require_sum(recorder, other, Reciprocal())
+        if more:  # factors may be large
+            recorder.require(one)
     first, logarithm = _logarithm(recorder, columns, other.shape)
     for place in mine.parts | first.parts:  # of what cancels
         recorder.require(recorder.values[place])
@@ -205,8 +224,10 @@ def of_sum(recorder: Recorder, value: Value) -> Value | None:
     """The logarithm of a sum of exponentials; None if it is of something else."""
     terms = _exponents(recorder, value)
     columns = None if terms is None else _columns(terms)
-    if columns is None or len(columns) < 2:
+    if terms is None or columns is None or len(columns) < 2:
         return None
+    if not _is_moderate(recorder, value, terms):
+        _require_sum(recorder, value, Log())
     first, logarithm = _logarithm(recorder, columns, value.shape)
     return recorder.added(first.recorded(recorder, value.shape), logarithm)
 
@@ -241,6 +262,43 @@ def _exponents(recorder: Recorder, value: Value) -> list[list[Exponent]] | None:
         for row, k in zip(*np.nonzero(matrix), strict=True):
             found[row].append(Exponent((inner.place, int(numbers[k])), exponents[[k]]))
     return found
+
+
+def _is_moderate(recorder: Recorder, value: Value, terms: list[list[Exponent]]) -> bool:
+    """Whether sums of exponentials are neither near zero nor large, whatever the inputs are."""
+    limits = recorder.limits(value, ConstantLimits)
+    if np.all(limits.least >= TINY) and np.all(limits.most < np.inf):
+        return True
+    return all(_has_one(recorder, each) for each in terms)
+
+
+def _require_sum(recorder: Recorder, value: Value, unit: AbstractUnit) -> None:
+    """Let a sum be a number, of which a unit has a value unless the sum is never near zero."""
+    limits = recorder.limits(value, ConstantLimits)
+    recorder.require(value if np.all(limits.least >= TINY) else recorder.unit(unit, value))
+
+
+def _has_one(recorder: Recorder, terms: list[Exponent]) -> bool:
+    """Whether the largest of all exponents is taken from each, so that one of them is zero."""
+    numbers, largest = set[Entry](), set[Entry]()
+    for each in terms:
+        if each.entry is None:
+            return False
+        place, k = each.entry
+        value = recorder.values[place]
+        if value.terms is None or len(value.terms) != 2 or np.any(value.offset):
+            return False
+        (one, *plain), (other, *minus) = value.terms
+        if plain != [1.0, 1.0] or minus != [-1.0, 1.0]:
+            return False
+        base, index = _entries(one)
+        numbers.add((base.place, int(index[k])))
+        base, index = _entries(other)
+        largest.add((base.place, int(index[k])))
+    if len(largest) != 1:
+        return False
+    ((place, k),) = largest
+    return place in recorder.maxima and recorder.maxima[place][k] == numbers
 
 
 def _columns(rows: list[list[Exponent]]) -> list[Combination] | None:

@@ -141,6 +141,7 @@ BEYOND = {
     "underflow": (lambda x: jnp.log(jnp.exp(x) + jnp.exp(2 * x)), (-800.0, -700.0), (-9.0, 9.0)),
     "zero over zero": (lambda x: jnp.exp(x) / jnp.exp(x).sum(), (-800.0, -700.0), (-9.0, 9.0)),
     "required": (finite_or_zero, (680.0, 700.0), (-9.0, 9.0)),
+    "norm": (lambda x: x / jnp.sqrt(1 + x * x), (1e154, 1e156), (-1e6, 1e6)),
     "largest of some": (of_some, (-500.0, 500.0), (-9.0, 9.0)),
 }
 

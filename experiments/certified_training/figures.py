@@ -30,8 +30,8 @@ NOTE = {
     "good": f"so many are proved at an error of at most {report.WITHIN} times that of plain "
     "training.",
     "error": "the imitation error on held-out states, over that of plain training; the median.",
-    "%": "the root of that error itself, in percent of the deviation of what the law does; the "
-    "median. Where it is far below one percent for all ways, the ratio beside it says little.",
+    "%": "the root of that error itself, in percent of the deviation of what is shown; the "
+    "median. Demonstrations themselves err by 10.",
     "cells, s": "cells and seconds of the decision after training; medians over the networks that "
     "it proved, and a dash where it proved none. Seconds are fewer after a training whose own "
     "decisions compiled the call for many cells, so ways are to be compared by cells.",

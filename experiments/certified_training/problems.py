@@ -15,6 +15,7 @@ import reachjax as rj
 from experiments.benchmark.rivals import cruise_control
 from experiments.nonlinear.problems import Problem
 from experiments.sampled import problems as sampled
+from experiments.sampling import Samples
 
 OBSTACLE = 0.4
 """Half the side of the square around the origin that the navigation avoids, in metres."""
@@ -24,6 +25,10 @@ ROOM = 0.01
 
 PART = 0.2
 """The margin of training, in parts of the least room that the law has: it stays reachable."""
+
+ERROR = 0.1
+"""Of demonstrations, in parts of the deviation of what the law does: nobody shows it exactly, and a
+network that is exact in what was shown is no better a copy."""
 
 PERIODS = 40
 """Of the cart-pole, that is two seconds: those in which it may fall."""
@@ -162,7 +167,7 @@ def fingerprint(problem: Problem) -> str:
 
     Numbers count to nine digits, so that rounding on another machine changes nothing.
     """
-    seen, regions = problem.samples(100, 0), (problem.X0, problem.goal, problem.safe)
+    seen, regions = demonstrations(problem, 100, 0), (problem.X0, problem.goal, problem.safe)
     given = [*regions, *problem.avoid]
     facets = [part for region in given if region is not None for part in region.facets]
     words = problem.horizon, problem.hidden, problem.activation, [each is None for each in given]
@@ -177,9 +182,16 @@ def required(problem: Problem) -> dict[str, Any]:
     return {"goal": problem.goal, "safe": problem.safe, "avoid": problem.avoid or None}
 
 
-def imitation(problem: Problem, states: Float[ndarray, "c n"]) -> Callable[..., jnp.ndarray]:
-    """The task's loss: the mean squared error beside the law, in parts of its variance."""
-    x, u = jnp.asarray(states), jnp.asarray(problem.law(states))
+def demonstrations(problem: Problem, count: int, seed: int) -> Samples:
+    """What is shown at so many states: what the law does, but for a normal error."""
+    exact = problem.samples(count, seed)
+    errors = np.random.default_rng((seed, count)).normal(size=exact.inputs.shape)
+    return Samples(exact.states, exact.inputs + ERROR * exact.inputs.std(axis=0) * errors)
+
+
+def imitation(shown: Samples) -> Callable[..., jnp.ndarray]:
+    """The task's loss: the mean squared error beside what is shown, in parts of its variance."""
+    x, u = jnp.asarray(shown.states), jnp.asarray(shown.inputs)
     scale = jnp.var(u, axis=0)
 
     def loss(loop: rj.ClosedLoop, _: object) -> jnp.ndarray:

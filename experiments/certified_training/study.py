@@ -1,12 +1,13 @@
 """What training until proved gives: five loops, ten seeds, five ways, equal time.
 
-Networks imitate a law and break what is asked, or come close to it. Each is trained on in five ways
-for equally many seconds: by imitation alone; and by `rj.train`, with a penalty on simulated
-trajectories, on affine forms over sixteen cells, on these from coarse to fine after simulations,
-and for few cells, with a penalty on how much forms are wider than trajectories. A run that is
-proved goes on to the end of its time, and keeps what is proved at the least loss. All are judged
-alike: imitation error on held-out samples, the verdict of `decide`, how many cells and seconds that
-takes, and for some networks the largest box of initial states that is proved.
+Networks imitate demonstrations of a law, which err by a tenth of its deviation, and break what is
+asked, or come close to it. Each is trained on in five ways for equally many seconds: by imitation
+alone; and by `rj.train`, with a penalty on simulated trajectories, on affine forms over sixteen
+cells, on these from coarse to fine after simulations, and for few cells, with a penalty on how much
+forms are wider than trajectories. A run that is proved goes on to the end of its time, and keeps
+what is proved at the least loss. All are judged alike: imitation error on held-out samples, the
+verdict of `decide`, how many cells and seconds that takes, and for some networks the largest box of
+initial states that is proved.
 
 Compilation takes from ten seconds to more than a minute, longer than some trainings would. So all
 is compiled before a clock runs, from empty caches: a decision, and a step of each stage's
@@ -36,6 +37,7 @@ from experiments import report, stored
 from experiments.certified_training import figures
 from experiments.certified_training.problems import (
     PROBLEMS,
+    demonstrations,
     fingerprint,
     imitation,
     margin,
@@ -101,7 +103,7 @@ class Settings:
     """Networks of each loop, from different random weights."""
     sized: int = 3
     """Of how many of these the largest set is looked for."""
-    pretraining_steps: int = 10_000
+    pretraining_steps: int = 3000
     """Steps of Adam on imitation alone, before the ways part."""
     seconds: float = 40.0
     """That each network is then trained for, decisions in between included."""
@@ -114,7 +116,7 @@ class Settings:
     growing: float = 10.0
     """Seconds for the largest set."""
     samples: int = 5000
-    """State-input pairs of a law."""
+    """Demonstrations of a law."""
     output: Path = Path("results/certified_training")
     """Where everything is written."""
 
@@ -170,9 +172,9 @@ class Study:
     def __init__(self, name: str, settings: Settings):
         self._settings, self._problem = settings, PROBLEMS[name]()
         self._folder = settings.output / name.replace(" ", "_")
-        self._samples = self._problem.samples(settings.samples, 0)
-        self._task = imitation(self._problem, self._samples.states[:1000])
-        self._held_out = imitation(self._problem, self._problem.samples(HELD_OUT, 1).states)
+        self._samples = demonstrations(self._problem, settings.samples, 0)
+        self._task = imitation(self._samples)
+        self._held_out = imitation(demonstrations(self._problem, HELD_OUT, 1))
         self._optimizer = optax.adam(settings.learning_rate)
         self._margin, self._problem_key = margin(self._problem), fingerprint(self._problem)
         self._compiled: dict[object, float] = {}

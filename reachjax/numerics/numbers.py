@@ -80,7 +80,10 @@ class AbstractNumber(abc.ABC):
         return self
 
     def where_known(self, others: Sequence[Any]) -> Self:
-        """The numbers, of which nothing is known where nothing is of others, if that is seen."""
+        """The numbers, of which nothing is known where nothing is of others, if that is seen.
+
+        Kinds of which nothing is proved alone may return them as they are.
+        """
         return self
 
 

@@ -394,8 +394,8 @@ class Ball(AbstractNumber):
 
     def where_known(self, others: Sequence[Self]) -> Self:
         """The numbers, of which nothing is known where an end of others is infinite, or none."""
-        lost = sum((each.mid - each.mid + (each.rad - each.rad)).sum() for each in others)
-        return type(self)(self.mid, self.rad + lost)
+        ends = [end for each in others for end in (each.lower, each.upper)]
+        return type(self)(self.mid, self.rad + sum((end - end).sum() for end in ends))
 
     def meeting(self, other: Self) -> Self:
         """Numbers that both hold."""

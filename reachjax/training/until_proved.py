@@ -18,6 +18,7 @@ import dataclasses
 import functools
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -218,7 +219,8 @@ def train(
         Interrupted: Ctrl-C; its `found` is what `train` would return for the last epoch, or for
             the controller as it was given.
         RuntimeError: JAX's 64-bit floats are off.
-        TypeError, ValueError: as `decide`; an argument is of another kind; the controller has no
+        TypeError, ValueError: as `decide`, but for bounds that leave a domain, which are a warning
+            before training; an argument is of another kind; the controller has no
             arrays; the file is of another training.
 
     Example:
@@ -263,7 +265,7 @@ def train(
         run.resume(kept)
     budget = Budget.of(time_limit)
     asked = {"goal": goal, "safe": safe, "avoid": avoid, "cells": cells, "start": start}
-    sizes = _Sizes(batch, samples, steps, weight, gain)
+    sizes = _Sizes(batch, samples, steps, weight)
     try:
         first = min(FIRST, budget.left / 10) if budget.timed else FIRST
         seconds = math.inf if run.proof else max(LEAST, first)
@@ -302,7 +304,13 @@ class _Sizes(NamedTuple):
     samples: int
     steps: int
     weight: float
-    gain: float
+
+
+def _part(lost: float, whole: float) -> float:
+    """What is lost of a loss, as a part of what is left; of nothing all, if any."""
+    if not whole:
+        return math.inf if lost else 0.0
+    return lost / abs(whole)
 
 
 def _mean(losses: Float[np.ndarray, " s"]) -> float:
@@ -322,7 +330,7 @@ class _Kept(NamedTuple):
         stage: the number of the stage.
         begun: the epoch that it began with.
         epochs: so far.
-        fruitless: whether the last one of a proved controller lowered its loss by little.
+        gained: by what part of it the last one of a proved controller lowered its loss.
         proof: the seconds that the last proof took; zero before.
     """
 
@@ -333,7 +341,7 @@ class _Kept(NamedTuple):
     stage: int
     begun: int
     epochs: tuple[Epoch, ...]
-    fruitless: bool = False
+    gained: float = math.inf
     proof: float = 0.0
 
 
@@ -379,7 +387,7 @@ class _Run:
         self._state = optimizer.init(self._weights)
         self._examples = np.tile(np.asarray(X0.center), (REMEMBERED, 1))
         self._stage = self._begun = 0
-        self._before, self.proof, self._fruitless = 0.0, 0.0, False
+        self._before, self.proof, self._gained = 0.0, 0.0, math.inf
         self.epochs: list[Epoch] = []
         self.known: Trained | None = None
 
@@ -399,7 +407,7 @@ class _Run:
             return False
         took = (k for k, epoch in enumerate(self.epochs, 1) if epoch.status == "PROVED")
         longest = 2 * next(took, 0)
-        return self._fruitless or len(self.epochs) >= longest
+        return gain >= 1 or self._gained <= gain or len(self.epochs) >= longest
 
     @property
     def _seal(self) -> Seal:
@@ -433,7 +441,9 @@ class _Run:
         asked = asked | {"time_limit": limit if math.isfinite(limit) else None}
         try:
             verdict = decide(*given, **asked, seed=self._seed + after)
-        except UnboundedError:  # over no cell: weights that went astray may come back
+        except UnboundedError as error:  # over no cell: weights that went astray may come back
+            if self.known is None:
+                warnings.warn(f"nothing is known of the controller as given: {error}", stacklevel=3)
             found = Findings(*given, self._spec.start, self._spec.required)
             verdict = found.verdict(asked=Asked(*given, self._spec.start, self._spec.required))
         except Interrupted as error:
@@ -539,8 +549,7 @@ class _Run:
                 self.known, self._weights, least = tried, middle, lower
             else:
                 other = middle
-        little = before.proved and reached - least <= sizes.gain * abs(least)
-        self._fruitless = little or sizes.gain >= 1
+        self._gained = _part(reached - least, least) if before.proved else math.inf
         return self.found.verdict
 
     def keep(self, path: Path) -> None:
@@ -554,7 +563,7 @@ class _Run:
             self._stage,
             self._begun,
             tuple(self.epochs),
-            self._fruitless,
+            self._gained,
             self.proof,
         )
         write(path, kept, outside=ClosedLoop)
@@ -583,6 +592,6 @@ class _Run:
         self._weights = [jnp.asarray(each) for each in kept.weights]
         self._state = jax.tree.unflatten(structure, kept.optimizer)
         self._examples, self._stage, self._begun = kept.examples, kept.stage, kept.begun
-        self._fruitless, self.proof = kept.fruitless, kept.proof
+        self._gained, self.proof = kept.gained, kept.proof
         self.epochs = [*kept.epochs]
         self._before = self.epochs[-1].seconds if self.epochs else 0.0

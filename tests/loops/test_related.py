@@ -130,6 +130,12 @@ def finite_or_zero(x):
     return jnp.where(jnp.isfinite(large), x, 0.0)
 
 
+def moderate_multiple(x):
+    """A sum of exponentials that cannot overflow, and a multiple of one of them that can."""
+    power = jnp.exp(700 * jnp.tanh(x))
+    return 1e10 * power / (1 + power)
+
+
 # a function, where its exponentials overflow or all underflow, and where they do not
 BEYOND = {
     "sigmoid": (lambda x: jnp.exp(x) / (1 + jnp.exp(x)), (700.0, 720.0), (-720.0, 600.0)),
@@ -142,6 +148,11 @@ BEYOND = {
     "zero over zero": (lambda x: jnp.exp(x) / jnp.exp(x).sum(), (-800.0, -700.0), (-9.0, 9.0)),
     "required": (finite_or_zero, (680.0, 700.0), (-9.0, 9.0)),
     "norm": (lambda x: x / jnp.sqrt(1 + x * x), (1e154, 1e156), (-1e6, 1e6)),
+    "long norm": (lambda x: x / jnp.sqrt(1e200 + x * x), (1e154, 1e156), (-1e6, 1e6)),
+    "norm of two": (lambda x: x / jnp.sqrt(1 + x @ x), (1e154, 1e156), (-1e6, 1e6)),
+    "multiple of a norm": (lambda x: 1e250 * x / jnp.sqrt(1 + x * x), (1e60, 1e62), (-9.0, 9.0)),
+    "norm, scaled": (lambda x: (1e250 / jnp.sqrt(1e-200 + x * x)) * x, (0.0, 1e-110), (1.0, 2.0)),
+    "moderate multiple": (moderate_multiple, (5.0, 6.0), (-0.1, 0.1)),
     "largest of some": (of_some, (-500.0, 500.0), (-9.0, 9.0)),
 }
 

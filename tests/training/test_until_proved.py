@@ -148,6 +148,10 @@ def test_what_a_file_says_is_proved_is_not_trained_away(tmp_path, monkeypatch):
     given = {"goal": GOAL, "margin": 0.1, "optimizer": optax.adam(0.05), "path": path}
     first = rj.train(loop, X0, 2, change, **given, epochs=3)
     assert first.proved
+    longer = tmp_path / "longer.training"
+    ended = rj.train(loop, X0, 2, change, **given | {"path": longer}, gain=1.0)
+    more = rj.train(loop, X0, 2, change, **given | {"path": longer}, gain=1e-6)
+    assert len(more.history) > len(ended.history)  # the gain is that of the call
     kept = path.read_bytes()
     blank = dataclasses.replace(first.verdict, status=rj.VerdictStatus.UNKNOWN)
     asked = []
@@ -190,7 +194,8 @@ def test_a_controller_whose_bounds_leave_a_domain_is_trained_all_the_same():
     with pytest.raises(UnboundedError):
         rj.decide(loop, X0, 2, **asked)
     learning = {"steps": 25, "optimizer": optax.adam(2e-2), "stages": [rj.Stage(rj.Simulated())]}
-    found = rj.train(loop, X0, 2, task, **asked, **learning)
+    with pytest.warns(UserWarning, match="nothing is known of the controller as given: .*bounds"):
+        found = rj.train(loop, X0, 2, task, **asked, **learning)
     assert found.history.epochs[0].margin == -np.inf
     assert found.proved
 

@@ -95,13 +95,19 @@ class Recorder:
                 found[place] = step.apply(unit, *(found[parent] for parent in step.parents))
         return numbers.where_known(found[wanted.place], [found[place] for place in self.required])
 
-    def require(self, operand: Operand) -> None:
-        """Let numbers be real ones: units that they depend on must have bounds."""
+    def require(self, operand: Operand, sums: bool = False) -> None:
+        """Let numbers be real ones: units that they depend on must have bounds.
+
+        Args:
+            operand: the numbers.
+            sums: whether they must have bounds too where all these units have some everywhere, as
+                sums, multiples and squares overflow.
+        """
         if not isinstance(operand, Value):
             return
         before = self.between(operand)
         units = [step.unit for place in before if (step := self.steps[place]) is not None]
-        if any(unit is not None and _has_limits(unit) for unit in units):
+        if sums or any(unit is not None and _has_limits(unit) for unit in units):
             self.required[operand.place] = operand
 
     def between(

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from reachjax.loops.units.base import AbstractActivation, AtUnit
 from reachjax.loops.units.powers import Exp, Reciprocal, Sqrt, Square
-from reachjax.loops.units.smooth import ENDLESS, POLE, SLACK, SmoothUnit, farthest, nearest
+from reachjax.loops.units.smooth import POLE, SLACK, SmoothUnit, farthest, nearest
 from reachjax.numerics.rounding import TINY, larger, namespace, smaller
 
 
@@ -317,10 +317,6 @@ class ISRU(SmoothUnit):
         """`y / sqrt(1 + y^2)`."""
         y = smaller(larger(y, -LARGE), LARGE)
         return y / namespace(y).sqrt(1 + y * y)
-
-    def defined(self, lower: Array, upper: Array) -> Bool[Array, " k"]:
-        """Where squares do not overflow: beyond, a user's function divides by infinity."""
-        return (abs(lower) < ENDLESS) & (abs(upper) < ENDLESS)
 
     def derivative(self, y: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """`(1 + y^2)^(-3/2)`."""

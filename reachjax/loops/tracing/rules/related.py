@@ -110,6 +110,10 @@ def over_norm(recorder: Recorder, one: Value, other: Value) -> Value | None:
         for number, more in one.levels():
             found = _without_own(recorder, squares, _entries(number))
             if found is not None:
+                # as JAX computes it, squares overflow long before the quotient would
+                recorder.require(other if scales else inner.value, sums=True)
+                if more:
+                    recorder.require(one, sums=True)
                 number = recorder.reshaped(number, one.shape)
                 inverse = recorder.reshaped(inverse, one.shape)
                 unit = _normalised(recorder, number, inverse, *found)
@@ -204,10 +208,11 @@ def over_sum(recorder: Recorder, one: Any, other: Value) -> Value | None:
     columns = _columns(rows)
     if columns is None:
         return None
-    if isinstance(one, Value) and not _is_moderate(recorder, other, terms):
-        _require_sum(recorder, other, Reciprocal())
+    if isinstance(one, Value) and not _are_shifted(recorder, terms):
+        if not _is_moderate(recorder, other):
+            _require_sum(recorder, other, Reciprocal())
         if more:  # factors may be large
-            recorder.require(one)
+            recorder.require(one, sums=True)
     first, logarithm = _logarithm(recorder, columns, other.shape)
     for place in mine.parts | first.parts:  # of what cancels
         recorder.require(recorder.values[place])
@@ -226,7 +231,7 @@ def of_sum(recorder: Recorder, value: Value) -> Value | None:
     columns = None if terms is None else _columns(terms)
     if terms is None or columns is None or len(columns) < 2:
         return None
-    if not _is_moderate(recorder, value, terms):
+    if not (_are_shifted(recorder, terms) or _is_moderate(recorder, value)):
         _require_sum(recorder, value, Log())
     first, logarithm = _logarithm(recorder, columns, value.shape)
     return recorder.added(first.recorded(recorder, value.shape), logarithm)
@@ -264,18 +269,22 @@ def _exponents(recorder: Recorder, value: Value) -> list[list[Exponent]] | None:
     return found
 
 
-def _is_moderate(recorder: Recorder, value: Value, terms: list[list[Exponent]]) -> bool:
-    """Whether sums of exponentials are neither near zero nor large, whatever the inputs are."""
+def _is_moderate(recorder: Recorder, value: Value) -> bool:
+    """Whether numbers are neither near zero nor overflow, whatever the inputs are."""
     limits = recorder.limits(value, ConstantLimits)
-    if np.all(limits.least >= TINY) and np.all(limits.most < np.inf):
-        return True
+    return bool(np.all(limits.least >= TINY) and np.all(limits.most < np.inf))
+
+
+def _are_shifted(recorder: Recorder, terms: list[list[Exponent]]) -> bool:
+    """Whether the largest of all exponents is taken from each, in all sums: none overflows."""
     return all(_has_one(recorder, each) for each in terms)
 
 
 def _require_sum(recorder: Recorder, value: Value, unit: AbstractUnit) -> None:
     """Let a sum be a number, of which a unit has a value unless the sum is never near zero."""
     limits = recorder.limits(value, ConstantLimits)
-    recorder.require(value if np.all(limits.least >= TINY) else recorder.unit(unit, value))
+    number = value if np.all(limits.least >= TINY) else recorder.unit(unit, value)
+    recorder.require(number, sums=True)
 
 
 def _has_one(recorder: Recorder, terms: list[Exponent]) -> bool:

@@ -274,8 +274,7 @@ def next_factor(factor: float, *, proved: bool) -> float:
 def grown(loop: rj.ClosedLoop, region: rj.Box, settings: Settings) -> tuple[rj.ClosedLoop, rj.Box]:
     """A loop of which a larger box is proved, box by box, and the last one.
 
-    What is not proved in time is trained on, for a box that is not as wide. A task's loss of zero
-    cannot be lowered, so that a round ends with the epoch after its first proof.
+    What is not proved in time is trained on, for a box that is not as wide.
     """
     optimizer, factor, latest = optax.adam(settings.learning_rate), WIDER, loop
     with bar() as shown:

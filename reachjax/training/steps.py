@@ -10,15 +10,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.numerics.checks import described
 from reachjax.numerics.compilations import compiler_options
-from reachjax.sets import PolyhedralSet
 from reachjax.training.objectives import TrainingBatch
-from reachjax.verdicts.specification import Requirement
+from reachjax.verdicts.specification import Requirement, bits_of
 
 TaskLoss = Callable[[ClosedLoop, Array], Array]
 """One number from a loop under the controller as it is, and initial states `(b, n_x)`."""
@@ -43,12 +41,8 @@ class Specification:
     @functools.cached_property
     def key(self) -> tuple[Any, ...]:
         """Plain data that say the same."""
-
-        def bits(region: PolyhedralSet) -> bytes:
-            return b"".join(np.asarray(part).tobytes() for part in region.facets)
-
         each = [
-            (item.name, item.time, item.inside, item.throughout, bits(item.region))
+            (item.name, item.time, item.inside, item.throughout, bits_of(item.region))
             for item in self.required
         ]
         return self.horizon, self.start, self.margin, *each

@@ -444,8 +444,8 @@ class _Run:
         except UnboundedError as error:  # over no cell: weights that went astray may come back
             if self.known is None:
                 warnings.warn(f"nothing is known of the controller as given: {error}", stacklevel=3)
-            found = Findings(*given, self._spec.start, self._spec.required)
-            verdict = found.verdict(asked=Asked(*given, self._spec.start, self._spec.required))
+            about = Asked(*given, self._spec.start, self._spec.required)
+            verdict = Findings(*about).verdict(asked=about)
         except Interrupted as error:
             self.known = self.known or Trained(loop, error.found, TrainingHistory())
             raise

@@ -149,7 +149,8 @@ def delayed(loop: ClosedLoop, periods: int = 1) -> ClosedLoop:
     """The loop whose inputs act so many periods after the measurement that they come from.
 
     Its states are those of the loop, and behind them the inputs on their way, of which the first
-    acts next. `with_inputs` puts these beside sets.
+    acts next. `with_inputs` puts these beside sets. They move up when a period begins, so that what
+    is required of one period by its number (`avoid={k: ...}`) is meant after that, and at its end.
 
     Args:
         loop: without noise, that does not vary in time.

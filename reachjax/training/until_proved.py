@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     import optax
 
 STAGES = (
-    Stage(Simulated(), epochs=5),
+    Stage(Simulated(), cells=16, epochs=5),
     Stage(Certified(), cells=16),
     Stage(Certified(), cells=128),
     Stage(Certified(), cells=1024),
@@ -95,12 +95,12 @@ QUIET = 5
 
 LEAST, FIRST = 1.0, 10.0
 """Seconds that a decision may take at least, else it may take as long as the epoch did; and those
-of the first one, or a tenth of all."""
+of the first one, or a quarter of all."""
 
 FOR_STEPS = 0.5
 """The part of the time left that the steps of an epoch may take: the rest is for its decision."""
 
-PATIENCE = 3.0
+PATIENCE = 2.0
 """Where the objective is zero it may take so many times as long; and so many times as long as the
 last proof, where one is known."""
 
@@ -267,7 +267,7 @@ def train(
     asked = {"goal": goal, "safe": safe, "avoid": avoid, "cells": cells, "start": start}
     sizes = _Sizes(batch, samples, steps, weight)
     try:
-        first = min(FIRST, budget.left / 10) if budget.timed else FIRST
+        first = min(FIRST, budget.left / 4) if budget.timed else FIRST
         seconds = math.inf if run.proof else max(LEAST, first)
         run.decide(budget, seconds, asked, after=len(run.epochs))
         if run.proof and not run.found.proved:

@@ -413,7 +413,6 @@ def asked_again(
         own = bits_of(item.ball or item.region)
         if item.name != "goal" and own != meant.setdefault(item.name, own):
             raise ValueError(f"{item.name} must be one set, the same at all times")
-    for item in said:
         names = NAMES_INSIDE if item.inside else NAMES_OUTSIDE
         if re.fullmatch(names, item.name, re.ASCII) is None:
             raise ValueError(f"{item.name!r} is no part of a specification")

@@ -96,7 +96,8 @@ class Tape:
             else:
                 _require_no_jump(step)
                 found[place] = step.unit.on_tape(self, parents, step.apply)
-        self.result = self._where_known(found[wanted.place], [found[one.place] for one in besides])
+        required = [found[place] for place in recorder.required]
+        self.result = self._where_known(found[wanted.place], required)
         self.needed = self._of_values()
 
     def _where_known(self, wanted: int, others: Sequence[int]) -> int:

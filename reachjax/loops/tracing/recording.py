@@ -35,15 +35,11 @@ from reachjax.loops.units import (
     Square,
     UnboundedError,
 )
-from reachjax.loops.units.smooth import SmoothUnit
 from reachjax.numerics import numbers
 from reachjax.numerics.rounding import TINY, UNIT, Ball, larger, namespace
 
 NONE = Limits.of(0.0)
 """Limits of the number zero."""
-
-FAR = 1e3
-"""Units that have bounds between its negative and it are taken to have some everywhere."""
 
 
 Entry = tuple[int, int]
@@ -103,12 +99,14 @@ class Recorder:
             sums: whether they must have bounds too where all these units have some everywhere, as
                 sums, multiples and squares overflow.
         """
-        if not isinstance(operand, Value):
-            return
-        before = self.between(operand)
-        units = [step.unit for place in before if (step := self.steps[place]) is not None]
-        if sums or any(unit is not None and _has_limits(unit) for unit in units):
+        if isinstance(operand, Value) and (sums or self._is_limited(operand)):
             self.required[operand.place] = operand
+
+    def _is_limited(self, value: Value) -> bool:
+        """Whether a value depends on a unit that says nothing of some inputs."""
+        steps = (self.steps[place] for place in self.between(value))
+        units = (step.unit for step in steps if step is not None)
+        return any(unit is not None and unit.limited for unit in units)
 
     def between(
         self, wanted: Value, first: Value | None = None, done: Container[int] = ()
@@ -529,18 +527,3 @@ def _flat(plain: Any, value: Value) -> Any:
     if isinstance(plain, Parameter):
         return np.broadcast_to(plain, value.shape, subok=True).reshape(-1)
     return namespace(plain).broadcast_to(plain, value.shape).reshape(-1)
-
-
-def _has_limits(unit: AbstractUnit) -> bool:
-    """Whether a unit has a domain, or overflows: of some inputs it says nothing.
-
-    Others than smooth ones, rectifiers and products, have bounds of all of them.
-    """
-    if not isinstance(unit, SmoothUnit):
-        return False
-    ends: Any = np.full(1, -FAR), np.full(1, FAR)
-    with np.errstate(all="ignore"):
-        try:
-            return not (unit.defined(*ends).all() and np.isfinite(unit.interval(*ends)).all())
-        except UnboundedError:
-            return True

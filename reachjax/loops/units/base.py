@@ -160,6 +160,11 @@ class AbstractUnit(AbstractActivation):
     line: str = ""
 
     @property
+    def limited(self) -> bool:
+        """Whether it has a domain, or overflows: of some inputs it says nothing."""
+        return False
+
+    @property
     def kind(self) -> AbstractUnit:
         """The unit without what it may know of numbers."""
         return self

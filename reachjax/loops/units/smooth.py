@@ -48,6 +48,9 @@ digits that a derivative in the middle is the better slope, and no quadratic bea
 SQUARES = 1e-100
 """Half widths below this, or above its inverse, have squares next to underflow or overflow."""
 
+FAR = 1e3
+"""Units that have bounds between its negative and it are taken to have some everywhere."""
+
 POLE = 1e-60
 """Nearer to a pole, third derivatives are taken to be infinite: powers of it would overflow."""
 
@@ -169,6 +172,16 @@ class SmoothUnit(AbstractUnit):
         if self.most < math.inf:
             lower, upper = smaller(lower, self.most), smaller(upper, self.most)
         return lower, upper
+
+    @property
+    def limited(self) -> bool:
+        """Whether it has a domain, or overflows: of some inputs it says nothing."""
+        ends: Any = np.full(1, -FAR), np.full(1, FAR)
+        with np.errstate(all="ignore"):
+            try:
+                return not (self.defined(*ends).all() and np.isfinite(self.interval(*ends)).all())
+            except UnboundedError:
+                return True
 
     def knowing(self, ends: Callable[[], tuple[float, float]]) -> SmoothUnit:
         """The unit with what its inputs are known never to be below, or above."""

@@ -282,7 +282,7 @@ def _changed(
     passing = {}
     for place in recorder.between(operand, y):
         step = recorder.steps[place]
-        if place != y.place and step is not None and isinstance(step.unit, ReLU):
+        if place != y.place and step is not None and step.unit == ReLU():
             rises = _rises(recorder.values[step.parents[0]], y, kink)
             if rises is not None:
                 passing[place] = rises == above

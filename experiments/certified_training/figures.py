@@ -35,9 +35,9 @@ NOTE = {
     "cells, s": "cells and seconds of the decision after training; medians over the networks that "
     "it proved, and a dash where it proved none. Seconds are fewer after a training whose own "
     "decisions compiled the call for many cells, so ways are to be compared by cells.",
-    "first": "seconds to the first proof, compilation included; the median over the networks that "
-    "are proved. Plain training is decided at its end only. A network that is proved as it was "
-    "given needs the seconds of that decision at most.",
+    "first": "seconds to the end of the epoch of the first proof, compilation included; the median "
+    "over the networks that are proved. Plain training is decided at its end only. A network that "
+    "is proved as it was given needs the seconds of that decision at most.",
     "built": "the part of these that compiles, from empty caches, measured before clocks run.",
     "step": "milliseconds of training a step, decisions in between included; the median.",
     "box": "the volume of the largest box of initial states that is proved, over that after plain "
@@ -84,7 +84,9 @@ def table(loop: str, group: dict[str, list[Outcome]]) -> Table:
                 median((100 * np.sqrt(each.error) for each in outcomes), 2),
                 median(each.cells for each in decided),
                 median((each.deciding for each in decided), 1),
-                median(each.first + each.compiling for each in outcomes),
+                median(
+                    each.first + each.compiling for each in outcomes if each.verdict == "PROVED"
+                ),
                 median(each.compiling for each in outcomes),
                 median((1e3 * each.training / each.steps for each in outcomes if each.steps), 1),
                 median(larger(outcomes, group.get("plain")), 2),
@@ -106,24 +108,26 @@ def draw(found: dict[str, dict[str, list[Outcome]]], path: Path) -> None:
         for way, outcomes in group.items():
             if way == "given":
                 continue
-            error = report.ratios(outcomes, group.get("plain") or next(iter(group.values())))
+            error = report.ratios(outcomes, group.get("plain") or group["given"])
             proved = np.array([each.verdict == "PROVED" for each in outcomes])
             first = np.array([each.first for each in outcomes])
             end = np.array([each.training for each in outcomes])
             compiling = np.array([each.compiling for each in outcomes])
-            at = error, np.where(np.isnan(first), end, first) + compiling
+            at = error, np.where(proved & ~np.isnan(first), first, end) + compiling
             report.draw_networks(above, at, proved, way, COLOURS[way])
             decided = np.array([each.decision == "PROVED" for each in outcomes])
             at = error, np.array([each.cells for each in outcomes])
             report.draw_networks(below, at, decided, way, COLOURS[way])
         report.over_plain(above, loop, "")
-        report.over_plain(below, "", "error / that of plain training")
+        base = "plain training" if "plain" in group else "the given network"
+        report.over_plain(below, "", f"error / that of {base}")
         below.set_yscale("log")
         below.yaxis.set_major_formatter("{x:g}")
         below.yaxis.set_minor_formatter("")
     axes[1, 0].set_ylim(0.8, max(12.0, 1.3 * axes[1, 0].get_ylim()[1]))
     axes[0, 0].set_ylabel("seconds to the first proof")
     axes[1, 0].set_ylabel("cells of the decision")
-    title, columns = "way (filled: proved, hollow: not)", len(COLOURS) if len(found) > 1 else 2
+    title = "way (filled: proved, below: by the decision after training; hollow: not)"
+    columns = len(COLOURS) if len(found) > 1 else 2
     report.legend_below(figure, title=title, ncols=columns)
     report.save(figure, path)

@@ -11,10 +11,11 @@ is looked for into which all states of it come back, and then cells from which a
 it, by `rj.winning_set`. These cells are a certified region of attraction.
 """
 
+import hashlib
+import itertools
 import os
 import time
 from dataclasses import dataclass, fields
-from itertools import product
 from pathlib import Path
 from typing import Any, Self
 
@@ -211,7 +212,7 @@ def simulated_box(loop: rj.ClosedLoop, count: int = 21) -> rj.Box:
     fine = np.asarray(safe().contains(runs.reshape(-1, 2))).reshape(runs.shape[:2]).all(axis=1)
     fine = (fine & np.asarray(goal().contains(runs[:, -1]))).reshape(count, count)
     middle, most = count // 2, (0, 0)
-    for i, j in product(range(middle + 1), repeat=2):
+    for i, j in itertools.product(range(middle + 1), repeat=2):
         within = fine[middle - i : middle + i + 1, middle - j : middle + j + 1]
         if within.all() and i * j > most[0] * most[1]:
             most = i, j
@@ -325,12 +326,21 @@ def trained(plain: Layers, begun: Size, settings: Settings) -> Layers:
 def size_of(name: str, layers: Layers, settings: Settings) -> Size:
     """What is proved of a network, from its file where it is there."""
     path = settings.output / f"grown_{name}.npz"
-    kept = stored.load(path, settings.key)
+    key = settings.key | {"network": fingerprint(layers)}
+    kept = stored.load(path, key)
     if kept is None:
         size = Size.of(closed(layers, settings), settings)
         kept = {field.name: getattr(size, field.name) for field in fields(Size)}
-        stored.save(path, settings.key, **kept)
+        stored.save(path, key, **kept)
     return Size(**kept)
+
+
+def fingerprint(layers: Layers) -> str:
+    """A short word that differs where weights do."""
+    found = hashlib.sha256()
+    for part in itertools.chain.from_iterable(layers):
+        found.update(np.asarray(part).tobytes())
+    return found.hexdigest()[:16]
 
 
 NOTE = (

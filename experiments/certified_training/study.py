@@ -9,10 +9,11 @@ what is proved at the least loss. All are judged alike: imitation error on held-
 verdict of `decide`, how many cells and seconds that takes, and for some networks the largest box of
 initial states that is proved.
 
-Compilation takes from ten seconds to more than a minute, longer than some trainings would. So all
-is compiled before a clock runs, from empty caches: a decision, and a step of each stage's
-objective. How many seconds that takes is kept by itself, for each way of what it needs, and added
-to those to the first proof: no way gains by what another one has compiled.
+Compilation takes from ten seconds to more than a minute, longer than some trainings would. So a
+decision and a step of each stage's objective are compiled before a clock runs, from empty caches.
+How many seconds that takes is kept by itself, for each way of what it needs, and added to those to
+the first proof: no way gains by a step that another one has compiled. What only some networks need,
+such as the call that bounds many cells at once, is compiled within the clock of the first of them.
 
 All five loops with ten seeds take about two hours in one process: half a minute a network and
 way. Processes may share the loops by `--only`, with the same `--output`: each writes what all have
@@ -144,7 +145,8 @@ class Outcome:
         cells: that it looked at.
         proved: how many of them are proved.
         deciding: its seconds.
-        first: seconds to the first proof, compilation excluded; NaN where there is none.
+        first: seconds to the end of the epoch that found the first proof, or of the decision
+            that did, compilation excluded; NaN where the network is not proved.
         compiling: seconds for a decision and for a step of each stage, from empty caches.
         training: seconds of the training.
         steps: of the training.
@@ -252,7 +254,7 @@ class Study:
         if judged["verdict"] == "PROVED" and np.isnan(first):
             first = training + judged["deciding"]
         before = None if way in (GIVEN, "plain") else self.run(GIVEN, seed)
-        if before is not None and before.verdict == "PROVED":
+        if before is not None and "PROVED" == before.verdict == judged["verdict"]:
             first = float(np.nanmin([first, before.deciding]))
         clocks = {"first": first, "compiling": compiling, "training": training}
         return Outcome(**judged, **clocks, steps=steps)

@@ -26,7 +26,7 @@ from reachjax.loops.units import UnboundedError
 from reachjax.methods.cell_tree import Node
 from reachjax.methods.problem import AbstractMethod, Problem, ReachSet, at
 from reachjax.methods.steps import boxed, overflow
-from reachjax.numerics.checks import is_concrete, owned
+from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.derivatives import moved_by
 from reachjax.numerics.host import in_numpy
 from reachjax.programs.held import Attained, Facets, Source, held_bounds, sources
@@ -204,7 +204,7 @@ def spans_by_forms(
         begun = (region.support(rows) for region, rows in zip(sets[:-1], directions, strict=True))
         found = [jnp.maximum(*each) for each in zip(found, begun, strict=True)]
     pairs = zip(shapes, found, strict=True)
-    return tuple(shape.polytope(owned(offsets)) for shape, offsets in pairs)
+    return tuple(shape.polytope(offsets) for shape, offsets in pairs)
 
 
 def _spans(
@@ -310,7 +310,7 @@ class AffineForms(AbstractMethod):
                 k=k,
                 start=start,
             )
-            region = shaped.polytope(owned(step.offsets))
+            region = shaped.polytope(step.offsets)
             states = np.asarray(step.corners) if is_concrete(step.corners) else np.zeros((0, 0))
             if scenarios is not None:
                 states = scenarios.of_units(states, step.drawn)

@@ -22,7 +22,7 @@ FOREVER = 2**31 - 1
 
 
 def skip_failures(
-    optimizer: optax.GradientTransformation, limit: int = 10
+    optimizer: optax.GradientTransformation, limit: int | None = 10
 ) -> optax.GradientTransformationExtraArgs:
     """An optimiser that skips, and counts, the steps whose gradient is not finite.
 
@@ -36,7 +36,7 @@ def skip_failures(
 
     Args:
         optimizer: any optax optimiser.
-        limit: how many steps in a row may be skipped.
+        limit: how many steps in a row may be skipped; None for any number.
 
     Raises:
         ImportError: optax is not installed.
@@ -52,19 +52,11 @@ def skip_failures(
         >>> updates.tolist(), failures(state)
         ([0.0, 0.0], 1)
     """
-    try:
-        import optax
-    except ImportError:
-        raise ImportError(
-            'skip_failures wraps optax optimisers: pip install "reachjax[training]"'
-        ) from None
-    if not (hasattr(optimizer, "init") and hasattr(optimizer, "update")):
-        raise TypeError(
-            "optimizer must be an optax optimiser, such as optax.adam(1e-3), "
-            f"but {described(optimizer)} arrived"
-        )
+    optax = optax_or_error("skip_failures")
+    skipping = optax.apply_if_finite(require_optimizer(optimizer), max_consecutive_errors=FOREVER)
+    if limit is None:
+        return skipping
     limit = whole_number("limit", limit, 0)
-    skipping = optax.apply_if_finite(optimizer, max_consecutive_errors=FOREVER)
 
     def update(updates, state, params=None, **extra_args):
         found: Any = skipping.update(updates, state, params, **extra_args)
@@ -73,6 +65,35 @@ def skip_failures(
         return updates, state._replace(notfinite_count=_checked(limit, state.notfinite_count))
 
     return optax.GradientTransformationExtraArgs(skipping.init, update)
+
+
+def optax_or_error(name: str) -> Any:
+    """The module `optax`, for a function of this name.
+
+    Raises:
+        ImportError: it is not installed.
+    """
+    try:
+        import optax
+    except ImportError:
+        raise ImportError(
+            f'{name} takes optax optimisers: pip install "reachjax[training]"'
+        ) from None
+    return optax
+
+
+def require_optimizer(optimizer: Any) -> Any:
+    """An optimiser, if it is one of optax.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if not (hasattr(optimizer, "init") and hasattr(optimizer, "update")):
+        raise TypeError(
+            "optimizer must be an optax optimiser, such as optax.adam(1e-3), "
+            f"but {described(optimizer)} arrived"
+        )
+    return optimizer
 
 
 def _checked(limit: int, count: Array) -> Array:

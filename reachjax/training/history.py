@@ -19,16 +19,16 @@ class Epoch(NamedTuple):
     """Some steps of training, and what was decided after them.
 
     Attributes:
-        stage: the number of the stage.
+        stage: the number of the stage, from 0.
         steps: how many there were.
         skipped: how many of these had no finite gradient.
         task: the mean of the task's loss.
         penalty: the mean of the objective.
         status: of the verdict on the controller that is kept after the epoch.
         margin: the smallest certified margin; minus infinity where none is known.
-        cells: how many the decision looked at.
+        cells: how many that verdict is of.
         proved: how many of these are proved.
-        seconds: since training began, of all runs together.
+        seconds: since training began, of all runs together, at the end of the epoch.
     """
 
     stage: int
@@ -58,10 +58,12 @@ class TrainingHistory:
         return len(self.epochs)
 
     def __str__(self) -> str:
-        lines = ["epoch stage      task   penalty    margin  proved/cells  seconds  verdict"]
+        headings = "epoch stage skipped/steps      task   penalty    margin  proved/cells  seconds"
+        lines = [f"{headings}  verdict"]
         for k, e in list(enumerate(self.epochs))[-SIZE:]:
             lines.append(
-                f"{k:5d} {e.stage:5d} {e.task:9.3g} {e.penalty:9.3g} {e.margin:9.3g}  "
+                f"{k:5d} {e.stage:5d} {e.skipped:7d}/{e.steps:<5d} {e.task:9.3g} "
+                f"{e.penalty:9.3g} {e.margin:9.3g}  "
                 f"{e.proved:5d}/{e.cells:<5d} {e.seconds:9.1f}  {e.status}"
             )
         return "\n".join(lines)

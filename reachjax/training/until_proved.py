@@ -45,11 +45,17 @@ from reachjax.numerics.checks import (
 from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
-from reachjax.numerics.seals import Seal, seal_of
-from reachjax.numerics.storage import read, write
 from reachjax.sets import Box
-from reachjax.training.failures import FOREVER, failures, skip_failures
+from reachjax.training.failures import failures, optax_or_error, require_optimizer, skip_failures
 from reachjax.training.history import Epoch, TrainingHistory
+from reachjax.training.kept import (
+    Kept,
+    numbers_of,
+    read_kept,
+    state_from,
+    training_seal,
+    write_kept,
+)
 from reachjax.training.objectives import Certified, Simulated, Stage
 from reachjax.training.steps import (
     Program,
@@ -195,17 +201,19 @@ def train(
         steps: of an epoch.
         epochs: at most.
         cells: into how many cells `decide` may cut the initial set: few make a controller that is
-            proved quickly.
+            proved quickly. After an epoch it takes about as long as its steps did, twice as long
+            where the objective is zero; then, without `time_limit`, as long as it needs.
         start: the time of `X0`, for time-varying loops.
         seed: of all that is drawn.
         gain: a part of the task's loss. What is proved is trained on for as many epochs as its
             first proof took, or until one lowers its loss by less than that. 1 ends training with
-            the first proof. 0 leaves the end to `epochs` and `time_limit`, also of a controller
-            that is proved as it was given, which is not trained else.
+            the epoch of the first proof. 0 leaves the end to `epochs` and `time_limit`, also of a
+            controller that is proved as it was given, which is not trained else.
         time_limit: seconds for the whole call, decisions and compiling included; a compilation that
             has begun is waited for.
-        path: of a file that is written after each epoch; if it is there, training goes on from it.
-            What was proved there is decided anew: where the time is too short for that, nothing is
+        path: of a file that is written after each epoch, and with the first proof; if it is there,
+            the same call goes on from it; for another loss, name another file. What was proved is
+            decided anew: where the time is too short for that, or `cells` are too few, nothing is
             trained, and the file stays as it is.
         progress: wraps the iteration over epochs to show a progress bar, such as `tqdm.tqdm`.
 
@@ -242,9 +250,11 @@ def train(
     )
     loop.check_horizon(horizon, start)
     require_loss(task_loss)
-    if not stages or not all(isinstance(stage, Stage) for stage in stages):
+    chosen = () if isinstance(stages, Stage) else tuple(stages)
+    if not chosen or not all(isinstance(stage, Stage) for stage in chosen):
         raise TypeError(
-            f"stages must be some of type Stage, such as Stage(Certified()), but {stages} arrived"
+            f"stages must be a sequence of type Stage, such as [Stage(Certified())], but {stages} "
+            "arrived"
         )
     counts = {"batch": batch, "samples": samples, "steps": steps, "epochs": epochs, "cells": cells}
     for name, count in counts.items():
@@ -258,26 +268,23 @@ def train(
     )
     spec = Specification(horizon, start, required, real_number("margin", margin, 0.0))
     gain = real_number("gain", gain, 0.0)
-    chosen = _skipping(_adam() if optimizer is None else optimizer, FOREVER - 1)
-    run = _Run(loop, X0, spec, task_loss, chosen, tuple(stages), seed)
-    kept = None if path is None else writable("path", path)
-    if kept is not None and kept.exists():
-        run.resume(kept)
+    optimizer = _adam() if optimizer is None else require_optimizer(optimizer)
+    file = None if path is None else writable("path", path)
+    run = _Run(loop, X0, spec, task_loss, _skipping(optimizer, None), chosen, seed, file)
     budget = Budget.of(time_limit)
     asked = {"goal": goal, "safe": safe, "avoid": avoid, "cells": cells, "start": start}
     sizes = _Sizes(batch, samples, steps, weight)
     try:
         first = min(FIRST, budget.left / 4) if budget.timed else FIRST
-        seconds = math.inf if run.proof else max(LEAST, first)
-        run.decide(budget, seconds, asked, after=len(run.epochs))
-        if run.proof and not run.found.proved:
+        seconds = math.inf if run.proof_seconds else max(LEAST, first)
+        run.begin(budget, seconds, asked)
+        if run.proof_seconds and not run.found.proved:
             return run.found  # it is proved, as the file says: there is nothing to train
         for _ in wrapped(progress, range(len(run.epochs), epochs)):
             if budget.late or run.over(gain):
                 break
             run.epoch(sizes, budget, asked)
-            if kept is not None:
-                run.keep(kept)
+            run.keep()
         return run.found
     except KeyboardInterrupt:
         if run.known is None:
@@ -288,10 +295,12 @@ def train(
 
 @functools.lru_cache(maxsize=1)
 def _adam() -> Any:
-    """The optimizer where none is given; the same one, so that steps are compiled once."""
-    import optax
+    """The optimizer where none is given; the same one, so that steps are compiled once.
 
-    return optax.adam(1e-3)
+    Raises:
+        ImportError: optax is not installed.
+    """
+    return optax_or_error("train").adam(1e-3)
 
 
 _skipping = functools.lru_cache(maxsize=64)(skip_failures)
@@ -319,32 +328,6 @@ def _mean(losses: Float[np.ndarray, " s"]) -> float:
     return float(known.mean()) if len(known) else float("nan")
 
 
-class _Kept(NamedTuple):
-    """What a file holds of a training.
-
-    Attributes:
-        seal: of the loop as it was given, the initial set and what is required.
-        weights: the controller's arrays.
-        optimizer: the arrays of the optimizer's state.
-        examples: initial states of counterexamples.
-        stage: the number of the stage.
-        begun: the epoch that it began with.
-        epochs: so far.
-        gained: by what part of it the last one of a proved controller lowered its loss.
-        proof: the seconds that the last proof took; zero before.
-    """
-
-    seal: Any
-    weights: tuple[Any, ...]
-    optimizer: tuple[Any, ...]
-    examples: Any
-    stage: int
-    begun: int
-    epochs: tuple[Epoch, ...]
-    gained: float = math.inf
-    proof: float = 0.0
-
-
 class _Run:
     """A training as far as it has come.
 
@@ -356,11 +339,16 @@ class _Run:
         optimizer: which skips failures.
         stages: of the training.
         seed: of all that is drawn.
+        path: of its file, from which it goes on if it is there; None of one that has none.
 
     Attributes:
         epochs: so far.
         known: the controller that is kept, with its verdict; None before the first decision.
-        proof: the seconds that the last proof took; zero before.
+        proof_seconds: those that the last proof took; zero before.
+
+    Raises:
+        UnreadableError: the file is none of such.
+        ValueError: the file is of another training, or the controller has no arrays.
     """
 
     def __init__(
@@ -372,8 +360,9 @@ class _Run:
         optimizer: Any,
         stages: tuple[Stage, ...],
         seed: int,
+        path: Path | None,
     ):
-        self._loop, self._X0, self._spec, self._seed = loop, X0, spec, seed
+        self._loop, self._X0, self._spec, self._seed, self._path = loop, X0, spec, seed, path
         self._task_loss, self._optimizer, self._stages = hashable(task_loss), optimizer, stages
         # no controller changes whether the initial set is where it should be
         later = tuple(item for item in spec.required if item.time > 0)
@@ -387,9 +376,12 @@ class _Run:
         self._state = optimizer.init(self._weights)
         self._examples = np.tile(np.asarray(X0.center), (REMEMBERED, 1))
         self._stage = self._begun = 0
-        self._before, self.proof, self._gained = 0.0, 0.0, math.inf
+        self._before, self.proof_seconds, self._gained = 0.0, 0.0, math.inf
         self.epochs: list[Epoch] = []
         self.known: Trained | None = None
+        self._seal = training_seal(loop, X0, spec, self._state)
+        if path is not None and path.exists():
+            self._resume(read_kept(path, self._seal, len(stages)))
 
     @property
     def found(self) -> Trained:
@@ -406,25 +398,24 @@ class _Run:
         if not self.found.proved or gain == 0:
             return False
         took = (k for k, epoch in enumerate(self.epochs, 1) if epoch.status == "PROVED")
-        longest = 2 * next(took, 0)
+        longest = 2 * next(took, len(self.epochs))
         return gain >= 1 or self._gained <= gain or len(self.epochs) >= longest
 
-    @property
-    def _seal(self) -> Seal:
-        asked = np.frombuffer(repr(self._spec.key).encode(), np.uint8)
-        return seal_of(self._loop, self._X0, asked)
+    def begin(self, budget: Budget, seconds: float, asked: dict[str, Any]) -> None:
+        """Decide on the controller as it was given, or as the file has it."""
+        self.known = self._found(budget, seconds, asked, after=len(self.epochs))
 
-    def decide(self, budget: Budget, seconds: float, asked: dict[str, Any], after: int) -> Verdict:
-        """The verdict on the controller as it is, whose counterexample is remembered.
+    def _found(self, budget: Budget, seconds: float, asked: dict[str, Any], after: int) -> Trained:
+        """The controller as it is with its verdict, whose counterexample is remembered.
 
-        After so many epochs it is the same, also where a file was gone on from.
+        One that the file knows of already is not remembered twice.
         """
-        self.known = self._decided(self._weights, budget, seconds, asked, after)
-        verdict = self.known.verdict
-        if verdict.counterexample is not None and (after == 0 or after > len(self.epochs)):
-            begun = np.asarray(verdict.counterexample.states[0])[None]
+        found = self._decided(self._weights, budget, seconds, asked, after)
+        seen = found.verdict.counterexample
+        if seen is not None and (after == 0 or after > len(self.epochs)):
+            begun = np.asarray(seen.states[0])[None]
             self._examples = np.concatenate([self._examples[1:], begun])
-        return verdict
+        return found
 
     def _decided(
         self,
@@ -441,16 +432,17 @@ class _Run:
         asked = asked | {"time_limit": limit if math.isfinite(limit) else None}
         try:
             verdict = decide(*given, **asked, seed=self._seed + after)
-        except UnboundedError as error:  # over no cell: weights that went astray may come back
+        except UnboundedError as error:  # over no cell, which training may change
             if self.known is None:
-                warnings.warn(f"nothing is known of the controller as given: {error}", stacklevel=3)
+                which = "the controller as given" if not self.epochs else "the file's controller"
+                warnings.warn(f"nothing is known of {which}: {error}", stacklevel=3)
             about = Asked(*given, self._spec.start, self._spec.required)
             verdict = Findings(*about).verdict(asked=about)
         except Interrupted as error:
             self.known = self.known or Trained(loop, error.found, TrainingHistory())
             raise
         if verdict.proved:
-            self.proof = clock.elapsed
+            self.proof_seconds = clock.elapsed
         return Trained(loop, verdict, TrainingHistory())
 
     def epoch(self, sizes: _Sizes, budget: Budget, asked: dict[str, Any]) -> None:
@@ -483,9 +475,15 @@ class _Run:
         seconds = clock.elapsed * (PATIENCE if quiet else 1.0)
         if share.late:  # it may be the last one
             seconds = max(seconds, share.elapsed)
-        before, verdict = self.found, self.decide(budget, max(LEAST, seconds), asked, number + 1)
-        if verdict.proved or before.proved:
-            verdict = self._lowest(before, sizes, budget, asked, number + 1)
+        if quiet and not budget.timed:
+            seconds = math.inf
+        before = self.found
+        now = self._found(budget, max(LEAST, seconds), asked, number + 1)
+        if now.proved or before.proved:
+            self._lower(before, now, sizes, budget, asked, number + 1)
+        else:
+            self.known = now
+        verdict = self.found.verdict
         proved = sum(cell.status is VerdictStatus.PROVED for cell in verdict.cells)
         self.epochs.append(
             Epoch(
@@ -501,97 +499,84 @@ class _Run:
                 seconds=self._before + budget.elapsed,
             )
         )
-        over = quiet or skipped == len(losses) or number + 1 - self._begun >= stage.epochs
-        if over and not verdict.proved and self._stage + 1 < len(self._stages):
+        ended = quiet or skipped == len(losses) or number + 1 - self._begun >= stage.epochs
+        if ended and not verdict.proved and self._stage + 1 < len(self._stages):
             self._stage, self._begun = self._stage + 1, number + 1
 
-    def _lowest(
+    def _lower(
         self,
         before: Trained,
+        now: Trained,
         sizes: _Sizes,
         budget: Budget,
         asked: dict[str, Any],
         after: int,
-    ) -> Verdict:
-        """The verdict on the proved controller of least loss that is found after an epoch.
+    ) -> None:
+        """Keep the proved controller of least loss that is found after an epoch.
 
         Args:
             before: the controller that the epoch began with.
+            now: the one that it ended with; one of the two is proved.
             sizes: how many states the loss is of.
             budget: of the whole call.
             asked: of `decide`.
             after: how many epochs.
         """
+        if not before.proved:
+            self.known = now
+            self.keep()  # what follows may take longer than all so far
         states = self._X0.sample(jax.random.key(self._seed), sizes.samples)
-        now = self.found
-        first, given = weights_of(before.controller), weights_of(self._loop.controller)
 
         def loss(weights: Sequence[Array]) -> float:
             return float(compiled_loss()(self._task_loss, self._loop, [*weights], states))
 
-        reached, other = math.inf, given
+        reached, other = math.inf, weights_of(self._loop.controller)
         if before.proved:
-            other = self._weights
-            self.known, self._weights = before, first  # a proof is kept, whoever interrupts
+            first, other = weights_of(before.controller), self._weights
             reached = loss(first)
             if now.proved and loss(other) < reached:
-                self.known, self._weights = now, other
+                self.known = now
+            else:
+                self._weights = first
         least = loss(self._weights)
         for _ in range(HALVINGS):
             pairs = zip(self._weights, other, strict=True)
             middle = [(one + another) / 2 for one, another in pairs]
-            lower = loss(middle)
-            if budget.late or not lower < least:
+            if budget.late or not (lower := loss(middle)) < least:
                 break
-            limit = max(LEAST, PATIENCE * self.proof)
+            limit = max(LEAST, PATIENCE * self.proof_seconds)
             tried = self._decided(middle, budget, limit, asked, after)
             if tried.proved:
                 self.known, self._weights, least = tried, middle, lower
             else:
                 other = middle
         self._gained = _part(reached - least, least) if before.proved else math.inf
-        return self.found.verdict
 
-    def keep(self, path: Path) -> None:
-        """Write what has been done to a file."""
-        state = tuple(jax.tree.leaves(self._state))
-        kept = _Kept(
+    def keep(self) -> None:
+        """Write what has been done to the file, if there is one."""
+        if self._path is None:
+            return
+        kept = Kept(
             np.asarray(self._seal),
             tuple(self._weights),
-            state,
+            numbers_of(self._state),
             self._examples,
             self._stage,
             self._begun,
             tuple(self.epochs),
             self._gained,
-            self.proof,
+            self.proof_seconds,
         )
-        write(path, kept, outside=ClosedLoop)
+        try:
+            write_kept(self._path, kept)
+        except OSError as error:  # of a full disk: what is known is worth more than its file
+            warnings.warn(f"{self._path} was not written, training goes on: {error}", stacklevel=3)
 
-    def resume(self, path: Path) -> None:
-        """Go on from a file.
-
-        Raises:
-            UnreadableError: it is none of such files.
-            ValueError: it is of another training.
-        """
-        kept = read(path, None, "holds no training")
-        structure = jax.tree.structure(self._state)
-        fits = (
-            isinstance(kept, _Kept)
-            and np.array_equal(kept.seal, self._seal)
-            and len(kept.optimizer) == structure.num_leaves
-            and kept.stage < len(self._stages)
-        )
-        if not fits:
-            raise ValueError(
-                f"path must be that of a training of this loop, from this X0, for these "
-                f"requirements, by this optimizer in these stages, but {path} is of another one: "
-                "name another file, or remove it"
-            )
+    def _resume(self, kept: Kept) -> None:
+        """Go on from what a file holds."""
         self._weights = [jnp.asarray(each) for each in kept.weights]
-        self._state = jax.tree.unflatten(structure, kept.optimizer)
+        self._state = state_from(self._state, kept.optimizer)
         self._examples, self._stage, self._begun = kept.examples, kept.stage, kept.begun
-        self._gained, self.proof = kept.gained, kept.proof
+        self._gained, self.proof_seconds = kept.gained, kept.proof_seconds
         self.epochs = [*kept.epochs]
         self._before = self.epochs[-1].seconds if self.epochs else 0.0

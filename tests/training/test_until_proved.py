@@ -141,6 +141,73 @@ def test_a_training_goes_on_from_its_file_after_a_proof(tmp_path):
     assert change(whole.loop, states) <= change(first.loop, states)
 
 
+OPTIMIZERS = {
+    "of half precision": lambda: optax.adam(0.05, mu_dtype=jnp.float32),
+    "with keys": lambda: optax.chain(optax.add_noise(1e-3, 0.5, jax.random.key(0)), optax.sgd(0.1)),
+}
+
+
+@pytest.mark.parametrize("kind", OPTIMIZERS)
+def test_states_of_any_optimizer_are_kept(kind, tmp_path):
+    loop, change = gained(-0.1)
+    given = {"goal": GOAL, "margin": 0.1, "steps": 2, "optimizer": OPTIMIZERS[kind](), "gain": 0.0}
+    whole = rj.train(loop, X0, 2, change, **given, epochs=4)
+    for count in (2, 4):
+        kept = rj.train(loop, X0, 2, change, **given, epochs=count, path=tmp_path / "any.training")
+    np.testing.assert_array_equal(leaves(kept.loop)[0], leaves(whole.loop)[0])
+    other = {**given, "optimizer": optax.rmsprop(0.1)}
+    with pytest.raises(ValueError, match="by an optimizer of this kind"):
+        rj.train(loop, X0, 2, change, **other, path=tmp_path / "any.training")
+
+
+def test_a_proof_is_in_the_file_before_it_is_led_back(tmp_path, monkeypatch):
+    """A process that ends while a proved controller is led back loses nothing."""
+    loop, change = gained(-0.1)
+    path, asked = tmp_path / "gain.training", until_proved.decide
+    given = {"goal": GOAL, "margin": 0.1, "optimizer": optax.adam(0.05), "path": path}
+    proofs = []
+
+    def ended(*each, **options):
+        if proofs:
+            raise MemoryError
+        verdict = asked(*each, **options)
+        proofs.extend([verdict] * verdict.proved)
+        return verdict
+
+    monkeypatch.setattr(until_proved, "decide", ended)
+    with pytest.raises(MemoryError):
+        rj.train(loop, X0, 2, change, **given)
+    monkeypatch.setattr(until_proved, "decide", asked)
+    assert rj.train(loop, X0, 2, change, **given, epochs=1).proved
+
+
+def test_a_file_that_cannot_be_written_does_not_end_a_training(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(until_proved, "write_kept", full)
+    loop, change = gained(-0.1)
+    given = {"goal": GOAL, "margin": 0.1, "optimizer": optax.adam(0.05)}
+    with pytest.warns(UserWarning, match="was not written, training goes on: no space left"):
+        found = rj.train(loop, X0, 2, change, **given, path=tmp_path / "gain.training")
+    assert found.proved
+
+
+def test_without_a_limit_a_decision_has_the_time_that_it_needs(monkeypatch):
+    """Where the objective is zero; here no decision ends within a limit."""
+    asked = until_proved.decide
+
+    def endless(*each, time_limit=None, **options):
+        verdict = asked(*each, **options)
+        unknown = dataclasses.replace(verdict, status=rj.VerdictStatus.UNKNOWN)
+        return verdict if time_limit is None else unknown
+
+    monkeypatch.setattr(until_proved, "decide", endless)
+    learning = {"optimizer": optax.adam(2e-2), "gain": 1.0}
+    assert trained(loop_of(), X0, **learning).proved
+    assert not trained(loop_of(), X0, **learning, time_limit=5.0).proved
+
+
 def test_what_a_file_says_is_proved_is_not_trained_away(tmp_path, monkeypatch):
     """Where there is no time to prove it anew, the controller and its file stay."""
     loop, change = gained(-0.1)
@@ -331,7 +398,13 @@ def test_a_history_is_told_and_drawn():
         ({"task_loss": 3.0}, TypeError, "task_loss must be a function"),
         ({"task_loss": lambda loop: 0.0}, TypeError, r"one of \(loop\) arrived.* too many"),
         ({"task_loss": lambda loop, states: states}, ValueError, "task_loss must give one number"),
-        ({"stages": (rj.Certified(),)}, TypeError, "stages must be some of type Stage"),
+        ({"stages": (rj.Certified(),)}, TypeError, "stages must be a sequence of type Stage"),
+        (
+            {"stages": rj.Stage(rj.Certified())},
+            TypeError,
+            "stages must be a sequence of type Stage",
+        ),
+        ({"optimizer": {}}, TypeError, "optimizer must be an optax optimiser"),
         ({"X0": rj.Polytope([[1.0], [-1.0]], [2.0, -1.0])}, TypeError, "X0 must be a Box"),
         ({"margin": -1.0}, ValueError, "margin must be finite and at least 0"),
         ({"steps": 0}, ValueError, "steps must be at least 1"),

@@ -99,7 +99,7 @@ REMEMBERED = 16
 QUIET = 5
 """The objective is zero if it is in the last one of so many parts of an epoch."""
 
-LEAST, FIRST = 1.0, 10.0
+LEAST, FIRST = 1.0, 30.0
 """Seconds that a decision may take at least, else it may take as long as the epoch did; and those
 of the first one, or a quarter of all."""
 

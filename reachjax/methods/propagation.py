@@ -86,7 +86,7 @@ Progress = Callable[[Iterable[int]], Iterable[int]]
 SAMPLES = 1000
 
 GAP = 1e-4
-"""What may stay open of a facet, as a part of its range."""
+"""What may stay open of a facet, as a part of half its simulated range."""
 
 KINDS = {
     "loop": (ClosedLoop, "a ClosedLoop"),

@@ -45,7 +45,7 @@ class Epoch(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class TrainingHistory:
-    """The epochs of a training, the first of which is the controller as it was given.
+    """The epochs of a training; none where the controller is proved as it was given.
 
     Attributes:
         epochs: one after the other.

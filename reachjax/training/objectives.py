@@ -178,8 +178,8 @@ class Certified(Replaceable):
 class Stage(Replaceable):
     """A part of training: what it lowers, and how finely the initial set is cut for that.
 
-    It ends when its objective is zero and the controller is not proved for all that, or when it has
-    no finite gradient; or after some epochs, where others come.
+    It ends when its objective is zero and the controller is still not proved, when no step of an
+    epoch has a finite gradient, or after some epochs. The last one does not end by itself.
 
     Args:
         objective: of a `TrainingBatch`, one number; such as `Simulated()` or `Certified()`.

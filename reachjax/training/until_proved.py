@@ -201,8 +201,9 @@ def train(
         steps: of an epoch.
         epochs: at most.
         cells: into how many cells `decide` may cut the initial set: few make a controller that is
-            proved quickly. After an epoch it takes about as long as its steps did, twice as long
-            where the objective is zero; then, without `time_limit`, as long as it needs.
+            proved quickly. The first decision takes half a minute at most, or a quarter of
+            `time_limit`; one after an epoch about as long as its steps did. Where the objective is
+            zero it takes twice as long, or without `time_limit` as long as it needs.
         start: the time of `X0`, for time-varying loops.
         seed: of all that is drawn.
         gain: a part of the task's loss. What is proved is trained on for as many epochs as its

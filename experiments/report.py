@@ -119,7 +119,9 @@ def draw_networks(ax, at: tuple, proved: np.ndarray, label: str, colour: str) ->
 def over_plain(ax, title: str, label: str) -> None:
     """Title and axis of errors over those of plain training, and up to where they are as good."""
     ax.axvline(WITHIN, color="black", linewidth=1, linestyle=":")
-    ax.set(title=title, xscale="log", xlabel=label)
+    low, high = ax.get_xlim()
+    scale = "log" if high > 4 * low else "linear"  # a log axis has few ticks within a decade
+    ax.set(title=title, xscale=scale, xlabel=label)
     ax.xaxis.set_major_formatter("{x:g}")
     ax.xaxis.set_minor_formatter("")
 

@@ -33,7 +33,14 @@ from reachjax.numerics.checks import (
     whole_number,
 )
 from reachjax.numerics.host import in_numpy
-from reachjax.numerics.pytrees import Replaceable, converted, is_own, pytree, written_elsewhere
+from reachjax.numerics.pytrees import (
+    Replaceable,
+    converted,
+    is_own,
+    overrides,
+    pytree,
+    written_elsewhere,
+)
 from reachjax.numerics.seals import AbstractSealed
 from reachjax.sets import AbstractSet, Box
 from reachjax.sets.unusable import ThinSetError
@@ -247,8 +254,17 @@ class ClosedLoop(Replaceable, AbstractSealed):
 
     @property
     def varies(self) -> bool:
-        """Whether a step depends on its time."""
-        return self.steps is not None or self.plant.varies
+        """Whether a step may depend on its time.
+
+        A loop or a set of a class of a user's that changes anything of ours may.
+        """
+        sets = (part for _, part in self._parts() if part is not self.plant)
+        return (
+            self.steps is not None
+            or self.plant.varies
+            or overrides(type(self), "varies")
+            or any(overrides(type(part), "steps") for part in sets)
+        )
 
     @property
     def is_disturbed(self) -> bool:

@@ -10,7 +10,6 @@ is exact; one step of the classical Runge-Kutta method is its Taylor polynomial 
 from __future__ import annotations
 
 import abc
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -31,10 +30,7 @@ from reachjax.numerics.checks import (
     within_time_axis,
 )
 from reachjax.numerics.flags import lenient
-from reachjax.numerics.pytrees import Replaceable, converted, pytree
-
-STEPS = "propagate", "at", "flow_at"
-"""What plants step by."""
+from reachjax.numerics.pytrees import Replaceable, converted, overrides, pytree
 
 
 class AbstractPlant(Replaceable, abc.ABC):
@@ -74,15 +70,10 @@ class AbstractPlant(Replaceable, abc.ABC):
     def varies(self) -> bool:
         """Whether a step may depend on its time.
 
-        What a class says of its clock is not believed of one that is derived from it, but steps in
-        a way of its own.
+        What a class says of its clock is not believed of one that is derived from it and changes
+        anything else of what it is.
         """
-        said = _rank(type(self), "clock")
-        return (
-            self.steps is not None
-            or self.clock
-            or any(_rank(type(self), name) < said for name in STEPS)
-        )
+        return self.steps is not None or self.clock or overrides(type(self), "clock")
 
     @property
     @abc.abstractmethod
@@ -134,14 +125,6 @@ def _depth(value: Any) -> int:
     if isinstance(value, tuple | list):
         return 1 + max(map(_depth, value), default=0)
     return np.ndim(value)
-
-
-def _rank(kind: type, name: str) -> float:
-    """How far up among the classes that one is derived from a name is told of."""
-    told = (
-        name in vars(each) or name in vars(each).get("__annotations__", ()) for each in kind.__mro__
-    )
-    return next((k for k, here in enumerate(told) if here), math.inf)
 
 
 @pytree

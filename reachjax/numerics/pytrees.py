@@ -106,6 +106,30 @@ def unchecked(cls: type[T], **values: Any) -> T:
     return made
 
 
+def overrides(kind: type, said: str) -> bool:
+    """Whether a class changes something of that one among those it is derived from which says this.
+
+    Args:
+        kind: the class.
+        said: the name of an attribute or a method.
+
+    Example:
+        >>> class Base:
+        ...     steady = True
+        ...     def value(self, t):
+        ...         return 1
+        >>> class Moving(Base):
+        ...     def value(self, t):
+        ...         return t
+        >>> overrides(Base, "steady"), overrides(Moving, "steady")
+        (False, True)
+    """
+    own = [{*vars(each), *vars(each).get("__annotations__", ())} for each in kind.__mro__]
+    rank = next(k for k, names in enumerate(own) if said in names)
+    above = {name for names in own[rank:] for name in names if not name.startswith(("__", "_abc_"))}
+    return any(name in above for names in own[:rank] for name in names)
+
+
 class Replaceable:
     """Copies with some fields changed, checked as a new object is.
 

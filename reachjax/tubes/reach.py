@@ -140,6 +140,7 @@ class ReachTube(Replaceable):
 
         Raises:
             UnboundedError: forms of a period have no bounds.
+            RuntimeError: JAX's 64-bit floats are off, or the tube was made while they were.
             TypeError: the plant is one in discrete time, which has no states in between.
         """
         if not self.loop.plant.continuous:
@@ -147,6 +148,7 @@ class ReachTube(Replaceable):
                 "a plant in discrete time has no states in between samples: spans are of a "
                 "SampledPlant"
             )
+        require_double_precision(tube=floats_of((self.loop, self.sets, self.template)))
         kept = self.__dict__.get("_spans")
         if kept is None:
             kept = spans_by_forms(self.loop, self.sets, self.template, self.start)

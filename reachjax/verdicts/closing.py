@@ -130,9 +130,9 @@ def closed(
             begun = _decided(found.halfway.before, first, budget)
         except (ThinSetError, ValueError):  # a unit has no bounds from it, or it is no set
             continue
-        except Interrupted as error:
-            cells = getattr(error.found, "cells", ())
-            raise Interrupted(str(error), findings.verdict(cells=cells)) from None
+        except Interrupted:  # its cells are of another set, or for other requirements
+            message = "interrupted: this exception's `found` is the verdict so far"
+            raise Interrupted(message, findings.verdict()) from None
         if begun.proved:
             proof = found.halfway.joined(
                 proof_of(found.halfway.before, begun.margins),

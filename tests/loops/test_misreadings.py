@@ -44,7 +44,27 @@ def written(w, x):
     return kept[...]
 
 
+def chosen_in_few_bits(w, x):
+    """A parameter is picked by an input, and computed with in its own bits."""
+    return jnp.where(x > 0, w, -w) * w
+
+
+def weighed_in_few_bits(w, x):
+    return jnp.stack([(x > 0).astype(w.dtype) @ w, (x > 1).astype(w.dtype) @ w])
+
+
+def large_whole_number(x):
+    places = 2 * jnp.sum(x > 0) + (2**53 + 1) - 2**53
+    return jnp.arange(8.0)[places.astype(jnp.int32)] * x
+
+
 REFUSED = {
+    "parameters picked by an input": Partial(chosen_in_few_bits, SINGLE),
+    "truth values in a parameter's bits": Partial(weighed_in_few_bits, SINGLE),
+    "a product in a parameter's bits": Partial(
+        lambda w, x: jnp.dot(w, x, preferred_element_type=w.dtype) * jnp.ones(2), SINGLE
+    ),
+    "a whole number that is no float": large_whole_number,
     "an array that is written into": Partial(written, jnp.array([1.0, 2.0])),
     "a quotient of whole numbers beside one of reals": quotients,
     "a product that wraps beside one of reals": square_of_eight_bits,
@@ -74,7 +94,23 @@ def powers(w, x):
     return x ** (3 if w.dtype == jnp.float32 else 2) + w
 
 
-@pytest.mark.parametrize("function", [by_precision, least_difference, powers])
+def turned(w, x):
+    return w - x if w.dtype == jnp.float32 else x - w
+
+
+def swapped(w, x):
+    one, other = (w[0], w[1]) if w.dtype == jnp.float32 else (w[1], w[0])
+    return x * one + other
+
+
+def cut_off(w, x):
+    kept = (3.7 * w).astype(int) if w.dtype == jnp.float32 else 3.7 * w
+    return x * kept
+
+
+@pytest.mark.parametrize(
+    "function", [by_precision, least_difference, powers, turned, swapped, cut_off]
+)
 def test_a_function_that_asks_for_a_parameters_precision_is_what_it_computes(function):
     net = rj.Network(Partial(function, SINGLE), 2, 2)
     x = np.array([0.3, -0.4])
@@ -83,6 +119,19 @@ def test_a_function_that_asks_for_a_parameters_precision_is_what_it_computes(fun
     assert (low <= expected).all()
     assert (expected <= high).all()
     np.testing.assert_allclose(net(x), expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize("kind", [jnp.float32, jnp.bfloat16])
+def test_a_weak_parameter_takes_the_precision_of_others(kind):
+    """As a number of Python's does: JAX makes weak arrays of these."""
+    gain = jnp.array(0.3)
+    assert gain.weak_type
+    function = Partial(lambda g, x: x * (g * kind(0.1)), gain)
+    net, x = rj.Network(function, 1, 1), np.ones(1)
+    low, high = interval(net, x, x)
+    expected = np.asarray(function(x), float)
+    assert (low <= expected).all()
+    assert (expected <= high).all()
 
 
 class Gentle(nnx.Module):
@@ -169,6 +218,11 @@ def test_nothing_is_said_for_ever_of_a_plant_that_may_depend_on_the_time():
         (lambda x: jnp.floor(jnp.arcsin(x) / 4 + 0.5), 1.5),
         (lambda x: 0.0 * jnp.sign(jnp.log(x)) + 1.0, -1.0),
         (lambda x: jnp.hypot(0.0 * jnp.log(x), x), -1.0),
+        (lambda x: jnp.where(x > 0, x + 0.0 * jnp.log(x - 5), x), 1.5),
+        (lambda x: jnp.where(x > 0, x + jnp.log(x - 5) - jnp.log(x - 5), x), 1.5),
+        (lambda x: jnp.where(jnp.isfinite(x * x), 0.0, 1.0), 1e200),
+        (lambda x: jnp.where(x * x < jnp.inf, 0.0, 1.0), 1e200),
+        (lambda x: (x * x == x * x).astype(float), 1e200),
         (lambda x: jnp.isfinite(jnp.log(x)).astype(int), -1.0),
         (lambda x: jax.nn.softmax(jnp.stack([x[0] + jnp.log(x[0]), jnp.log(x[0])]))[:1], -1.0),
     ],
@@ -177,7 +231,7 @@ def test_what_rests_on_a_number_says_nothing_where_there_is_none(function, low):
     """Outside of a domain there is no number, whether or not the result is one."""
     net = rj.Network(function, 1, 1)
     loop = rj.ClosedLoop(rj.AffinePlant([[0.0]], [[1.0]]), net)
-    around = rj.Box([low - 0.1], [low + 0.1])
+    around = rj.Box([low - 0.1], [low + 0.1 * max(1.0, low)])
     with pytest.raises((ValueError, ArithmeticError)):
         rj.reach(loop, around, 1, rj.Template.box(1), rj.LinearBounds())
     with contextlib.suppress(ValueError):
@@ -213,6 +267,17 @@ def frozen_of_roots(x):
     )
 
 
+def frozen_at_twice_the_roots(x):
+    A = jnp.diag(1 + x**2)
+    factor = jnp.linalg.cholesky(A)
+    return jax.lax.custom_linear_solve(
+        lambda v: A @ v,
+        jnp.ones(2),
+        lambda mv, b: jax.scipy.linalg.cho_solve((2 * factor, True), b),
+        symmetric=True,
+    )
+
+
 SPREAD = jnp.array([[2.0, 0.3], [-0.1, 1.5]])
 
 
@@ -235,7 +300,9 @@ def test_jaxs_own_solvers_are_read(function):
     assert (function(x) <= high + 1e-9).all()
 
 
-@pytest.mark.parametrize("function", [frozen, frozen_of_known, frozen_of_roots])
+@pytest.mark.parametrize(
+    "function", [frozen, frozen_of_known, frozen_of_roots, frozen_at_twice_the_roots]
+)
 def test_solvers_by_factors_of_another_matrix_are_refused(function):
     with pytest.raises(TypeError, match=r"jnp\.linalg\.solve"):
         rj.Network(function, 2, 2)

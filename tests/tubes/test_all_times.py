@@ -85,6 +85,13 @@ def test_a_plant_in_discrete_time_has_no_spans():
         _ = tube.spans
 
 
+def test_spans_are_not_computed_in_32_bits():
+    tube = rj.reach(loops()[1], X0, 1, rj.Template.box(2), relaxation=rj.LinearBounds())
+    with jax.enable_x64(False), pytest.raises(RuntimeError, match="needs 64-bit floats"):
+        _ = tube.spans
+    assert tube.spans[0].contains(tube.sets[0].center)
+
+
 def test_states_that_are_looked_at_in_between_are_near_the_flow():
     loop = jax.device_get(loops()[0])
     points = np.random.default_rng(0).uniform(X0.lower, X0.upper, size=(5, 2))

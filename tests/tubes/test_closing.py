@@ -159,6 +159,71 @@ class Still(Drifting):
         return False
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Gusty(rj.AffinePlant):
+    """A plant that disturbances enter once it is late."""
+
+    def entering(self, t):
+        return self.E * (t >= 600)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Widening(rj.Box):
+    """Limits of inputs that widen."""
+
+    def at(self, t):
+        return rj.Box(self.lower * (1 + t), self.upper * (1 + t))
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Tired(rj.ClosedLoop):
+    """A loop that sees less and less."""
+
+    def measured(self, x, t=0, unit=evaluate, v=None):
+        return super().measured(x, t, unit, v) * 0.9**t
+
+
+class Named(rj.AffinePlant):
+    """A plant with another name, and no step of its own."""
+
+    def told(self) -> str:
+        return "a plant"
+
+
+def test_what_a_user_derives_from_parts_of_a_loop_may_vary_in_time():
+    """Whatever it changes of them; a name alone is no change."""
+    still = rj.MLP.from_layers([([[0.0]], [0.0])])
+    gust = rj.Box([-1.0], [1.0])
+    gusty = rj.ClosedLoop(Gusty([[0.5]], [[0.0]], E=[[3.0]]), still, disturbance=gust)
+    assert gusty.varies
+    with pytest.raises(ValueError, match="must not vary in time"):
+        rj.delayed(gusty)
+    tube, safe = rj.reach(gusty, rj.Box([-0.1], [0.1]), 3), rj.Box([-9.0], [9.0])
+    with pytest.raises(ValueError, match="var"):
+        rj.verify(tube, safe=safe, forever=True)
+    plant = rj.AffinePlant([[0.5]], [[1.0]])
+    assert rj.ClosedLoop(plant, still, Widening([-1.0], [1.0])).varies
+    assert Tired(plant, still).varies
+    assert not rj.ClosedLoop(Named([[0.5]], [[1.0]]), still, rj.Box([-1.0], [1.0])).varies
+
+
+def test_an_interrupted_search_for_a_set_halfway_tells_nothing_of_its_cells(monkeypatch):
+    """They are of another set, and for other requirements."""
+
+    def interrupted(*_):
+        raise rj.Interrupted("its cells need not be decided again", None)
+
+    monkeypatch.setattr(closing, "_for_ever", interrupted)
+    loop = rj.ClosedLoop(rj.AffinePlant(0.9 * np.eye(2), np.zeros((2, 1))), STILL)
+    with pytest.raises(rj.Interrupted, match="is the verdict so far") as raised:
+        rj.decide(loop, X0, 200, safe=rj.Box([-1.0, -1.0], [1.0, 1.0]))
+    assert raised.value.found.cells == ()
+    assert not raised.value.found.proved
+
+
 def test_a_plant_that_steps_in_a_way_of_its_own_may_have_a_clock():
     """What the class above says is not believed of it; nor are its inputs made late."""
     given = 0.9 * np.eye(2), np.zeros((2, 1))

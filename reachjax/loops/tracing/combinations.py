@@ -119,7 +119,9 @@ class Combination(AbstractNumber):
         self.require_near()
         found: Any = None
         for place, matrix in self.parts.items():
-            if np.any(matrix):
+            if not np.any(matrix):  # what is no number is none times zero either
+                recorder.require(recorder.values[place], sums=True)
+            else:
                 if place in self.errors:  # products take factors of one to be exact
                     rounded = (abs(matrix) == 1) & (self.errors[place] > 0)
                     matrix = np.where(rounded, matrix * (1 - UNIT), matrix)

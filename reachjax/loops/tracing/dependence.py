@@ -7,7 +7,7 @@ makes no difference, and an equation with a jaxpr of its own can be left as it i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -28,6 +28,9 @@ CALLS = (
 
 OWN_SLOPES = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 """Primitives that call one, and have a rule of their own for its derivative."""
+
+Counts = Callable[[Any], bool]
+"""Whether an equation, some operand of which depends on inputs, is one that is asked for."""
 
 BODIES = {"jaxpr", "call_jaxpr", "fun_jaxpr"}
 """Under one of these names it is among their parameters."""
@@ -66,6 +69,36 @@ def rounds(equation: Any) -> bool:
     return name not in EXACT
 
 
+def rounds_to_fewer_bits(jaxpr: Any, varies: Sequence[bool]) -> bool:
+    """Whether numbers that depend on inputs are computed in fewer bits than floats have.
+
+    Args:
+        jaxpr: as it is with parameters of their own precision.
+        varies: which of its arguments depend on inputs.
+    """
+    return _through(jaxpr, varies, _is_in_fewer_bits)[1]
+
+
+def _never(equation: Any) -> bool:
+    """Whether an equation counts: none does."""
+    return False
+
+
+def _is_in_fewer_bits(equation: Any) -> bool:
+    """Whether a result of an equation may be rounded, to fewer bits than floats have."""
+    whole, name = jnp.finfo(float).bits, equation.primitive.name
+    kinds = [each.aval.dtype for each in equation.outvars]
+    narrow = [k for k in kinds if jnp.issubdtype(k, jnp.inexact) and jnp.finfo(k).bits < whole]
+    if not narrow or name in EXACT:
+        return False
+    if name == "convert_element_type":
+        given = equation.invars[0].aval.dtype
+        if jnp.issubdtype(given, jnp.integer):
+            return jnp.iinfo(given).bits - 1 > jnp.finfo(narrow[0]).nmant + 1
+        return not _is_wider(narrow[0], given)
+    return True
+
+
 def _bodies(equation: Any) -> list[Any]:
     name, params = equation.primitive.name, equation.params
     if name in (*CALLS, *OWN_SLOPES):
@@ -95,7 +128,7 @@ def rounds_within(equation: Any, varies: Sequence[bool]) -> bool:
         equation: some operand of which depends on inputs.
         varies: which ones do.
     """
-    return _followed(equation, varies)[1]
+    return _followed(equation, varies, _never)[1]
 
 
 def rounds_plain(jaxpr: Any, varies: Sequence[bool]) -> bool:
@@ -103,15 +136,18 @@ def rounds_plain(jaxpr: Any, varies: Sequence[bool]) -> bool:
     return _through(jaxpr, varies)[1]
 
 
-def _followed(equation: Any, varies: Sequence[bool]) -> tuple[list[bool], bool]:
-    """Which results of an equation vary, and whether plain numbers are rounded in it."""
+def _followed(equation: Any, varies: Sequence[bool], counts: Counts) -> tuple[list[bool], bool]:
+    """Which results of an equation vary, and whether plain numbers are rounded in it.
+
+    Or, where equations of numbers that vary may count, whether one of those does.
+    """
     name, params, varies = equation.primitive.name, equation.params, list(varies)
     if not any(varies):
-        return [False] * len(equation.outvars), rounds(equation)
+        return [False] * len(equation.outvars), counts is _never and rounds(equation)
     if name in (*CALLS, *OWN_SLOPES):
-        return _through(body_of(params), varies)
+        return _through(body_of(params), varies, counts)
     if name == "cond":
-        found = [_through(each, varies[1:]) for each in params["branches"]]
+        found = [_through(each, varies[1:], counts) for each in params["branches"]]
         outs = [varies[0] or any(each) for each in zip(*(outs for outs, _ in found), strict=True)]
         return outs, any(rounded for _, rounded in found)
     if name == "scan":
@@ -119,7 +155,7 @@ def _followed(equation: Any, varies: Sequence[bool]) -> tuple[list[bool], bool]:
         carry = varies[first : first + count]
         while True:
             given = [*varies[:first], *carry, *varies[first + count :]]
-            outs, rounded = _through(params["jaxpr"], given)
+            outs, rounded = _through(params["jaxpr"], given, counts)
             after = [a or b for a, b in zip(carry, outs, strict=False)]
             if after == carry:
                 return [*carry, *outs[count:]], rounded
@@ -128,16 +164,16 @@ def _followed(equation: Any, varies: Sequence[bool]) -> tuple[list[bool], bool]:
         first, second = params["cond_nconsts"], params["body_nconsts"]
         done, carry = varies[first : first + second], varies[first + second :]
         while True:
-            outs, rounded = _through(params["body_jaxpr"], [*done, *carry])
+            outs, rounded = _through(params["body_jaxpr"], [*done, *carry], counts)
             after = [a or b for a, b in zip(carry, outs, strict=True)]
             if after == carry:
-                asked = _through(params["cond_jaxpr"], [*varies[:first], *carry])[1]
+                asked = _through(params["cond_jaxpr"], [*varies[:first], *carry], counts)[1]
                 return carry, rounded or asked
             carry = after
-    return [True] * len(equation.outvars), False
+    return [True] * len(equation.outvars), counts(equation)
 
 
-def _through(body: Any, varies: Sequence[bool]) -> tuple[list[bool], bool]:
+def _through(body: Any, varies: Sequence[bool], counts: Counts = _never) -> tuple[list[bool], bool]:
     """Which results of a jaxpr vary, and whether plain numbers are rounded, as of an equation."""
     jaxpr = _jaxpr(body)
     known = dict.fromkeys(jaxpr.constvars, False)
@@ -148,7 +184,7 @@ def _through(body: Any, varies: Sequence[bool]) -> tuple[list[bool], bool]:
 
     rounded = False
     for equation in jaxpr.eqns:
-        outs, inside = _followed(equation, [read(each) for each in equation.invars])
+        outs, inside = _followed(equation, [read(each) for each in equation.invars], counts)
         rounded = rounded or inside
         known.update(zip(equation.outvars, outs, strict=True))
     return [read(each) for each in jaxpr.outvars], rounded

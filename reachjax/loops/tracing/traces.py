@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from reachjax.loops.tracing.dependence import rounds_plain
+from reachjax.loops.tracing.dependence import rounds_plain, rounds_to_fewer_bits
 from reachjax.numerics.checks import is_concrete
 
 Sizes = tuple[int, ...]
@@ -40,7 +40,8 @@ class Kind(NamedTuple):
     Attributes:
         shape: of the array.
         name: of its precision; None for that of all floats.
-        is_weak: whether it is a number of Python's, which takes the precision of others.
+        is_weak: whether it takes the precision of others, as numbers of Python's do, and arrays
+            that JAX makes of these.
     """
 
     shape: Sizes
@@ -52,7 +53,8 @@ class Kind(NamedTuple):
         """The kind of an array, or of a number."""
         found = jnp.result_type(leaf)
         name = None if found == jnp.result_type(float) else found.name
-        return cls(jnp.shape(leaf), name, type(leaf) is float)
+        is_weak = type(leaf) is float or getattr(leaf, "weak_type", False)
+        return cls(jnp.shape(leaf), name, bool(is_weak))
 
 
 class _Held:
@@ -139,7 +141,7 @@ class Trace:
         if any(names):
             own = jax.make_jaxpr(called)(of(names), *vectors)
             varies = [number >= len(kinds) for number in range(len(own.jaxpr.invars))]
-            if rounds_plain(own, varies) or _narrows(own):
+            if rounds_plain(own, varies) or _narrows(own) or rounds_to_fewer_bits(own, varies):
                 return _owned(jax.make_jaxpr(brought_back)(whole, *vectors))
         found = jax.make_jaxpr(called)(whole, *vectors)
         asks = own is not None and [*_steps(own)] != [*_steps(found)]
@@ -151,7 +153,7 @@ class Trace:
         """The function with these parameters, as it is now."""
         tree, others, kinds, _ = self._parts
         numbers = (
-            float(number) if each.is_weak and is_concrete(number) else number
+            float(number) if each.is_weak and not each.shape and is_concrete(number) else number
             for number, each in zip(parameters, kinds, strict=True)
         )
         leaves = [
@@ -268,15 +270,33 @@ def _steps(closed: core.ClosedJaxpr) -> Iterator[Any]:
     for each in _constants(closed):
         if is_concrete(each) and not jnp.issubdtype(each.dtype, jax.dtypes.extended):
             yield np.asarray(each, bool if each.dtype == bool else float).tobytes()
-    for equation in equations(closed):
+    yield from _wired(closed.jaxpr, {}, itertools.count())
+
+
+def _wired(jaxpr: core.Jaxpr, known: dict[Any, int], count: Iterator[int]) -> Iterator[Any]:
+    """What a jaxpr does, and to which numbers: these are counted, conversions of floats aside."""
+
+    def number(atom: Any) -> Any:
+        is_literal = isinstance(atom, core.Literal)
+        return repr(np.asarray(atom.val).tolist()) if is_literal else known[atom]
+
+    known.update(zip((*jaxpr.constvars, *jaxpr.invars), count, strict=False))
+    for equation in jaxpr.eqns:
+        operands = [number(each) for each in equation.invars]
         if equation.primitive.name == "convert_element_type":
-            continue
-        yield equation.primitive.name
-        numbers = (each.val for each in equation.invars if isinstance(each, core.Literal))
-        yield [repr(np.asarray(number).tolist()) for number in numbers]
+            (operand,), (result,) = equation.invars, equation.outvars
+            if _bits(operand) and _bits(result):
+                known[result] = operands[0]
+                continue
+        yield equation.primitive.name, operands
         for name, value in sorted(equation.params.items()):
-            if name not in NAMES and not any(True for _ in subjaxprs(value)):
+            inner = [*subjaxprs(value)]
+            for each in inner:
+                yield from _wired(getattr(each, "jaxpr", each), known, count)
+            if name not in NAMES and not inner:
                 yield name, re.sub(PRECISION, "float", str(value))
+        known.update(zip(equation.outvars, count, strict=False))
+    yield [number(each) for each in jaxpr.outvars]
 
 
 def _owned(value: Any) -> Any:
@@ -300,8 +320,8 @@ def _owned(value: Any) -> Any:
 def _copied(constant: Any) -> Any:
     if not isinstance(constant, jax.Array):
         return np.array(constant)
-    is_number = jnp.issubdtype(constant.dtype, jnp.number) and is_concrete(constant)
-    return jnp.array(constant, copy=True) if is_number else constant
+    is_key = jnp.issubdtype(constant.dtype, jax.dtypes.extended)
+    return jnp.array(constant, copy=True) if not is_key and is_concrete(constant) else constant
 
 
 def description(closed: core.ClosedJaxpr) -> str | None:

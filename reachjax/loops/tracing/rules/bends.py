@@ -95,7 +95,7 @@ def _compared(recorder: Recorder, equation: Equation, operands: Sequence[Operand
     one, other = operands if equation.name in ("gt", "ge") else reversed(operands)
     for each, sign in ((one, 1), (other, -1)):
         if is_known(each) and np.size(each) and np.all(np.isinf(np.asarray(each))):
-            recorder.require(other if each is one else one)
+            recorder.require(other if each is one else one, sums=True)
             return sign * np.asarray(each) > 0
     return Comparison(recorder.added(one, other, -1), strict=equation.name in ("gt", "lt", "lt_to"))
 
@@ -105,18 +105,18 @@ def _equal(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) 
     """Numbers are equal to themselves, and to no infinity; to others they may be."""
     one, other = operands
     if isinstance(one, Value) and isinstance(other, Value) and one.place == other.place:
-        recorder.require(one)
+        recorder.require(one, sums=True)
         return np.full(equation.shape, equation.name == "eq")
     if any(is_known(each) and np.all(~np.isfinite(np.asarray(each))) for each in (one, other)):
-        recorder.require(one)
-        recorder.require(other)
+        recorder.require(one, sums=True)
+        recorder.require(other, sums=True)
         return np.full(equation.shape, equation.name == "ne")
     return compared_equal(recorder, recorder.added(one, other, -1), equation.name == "eq")
 
 
 def _finite(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> np.ndarray:
     """Real numbers are."""
-    recorder.require(operands[0])
+    recorder.require(operands[0], sums=True)
     return np.full(equation.shape, True)
 
 

@@ -56,7 +56,7 @@ def entries(recorder: Recorder, operand: Operand) -> np.ndarray:
         value, numbers = operand.source or (operand, np.arange(operand.size))
         known = (limits.least == limits.most) & np.isfinite(limits.least)
         if known.any():
-            recorder.require(recorder.picked(operand, np.flatnonzero(known)))
+            recorder.require(recorder.picked(operand, np.flatnonzero(known)), sums=True)
         found = [
             Fraction(end) if same else Entry(value.place, number)
             for end, same, number in zip(
@@ -140,7 +140,7 @@ def sums(recorder: Recorder, rows: Iterable[Iterable[Product]]) -> list[Scalar]:
                 if other:
                     mine.append((1, (one, sign * other)))
                 else:
-                    recorder.require(recorder.values[one.place])
+                    recorder.require(recorder.values[one.place], sums=True)
             else:
                 mine.append((sign, (min(one, other), max(one, other))))
         offsets.append(offset)

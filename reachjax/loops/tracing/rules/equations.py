@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from reachjax.loops.tracing.recording import Recorder
-from reachjax.loops.tracing.values import Operand, Parameter, Value, is_known
+from reachjax.loops.tracing.values import Operand, Parameter, UnsupportedError, Value, is_known
 
 Rule = Callable[[Recorder, "Equation", Sequence[Operand]], Any]
 """From the operands, of which one at least is no plain array, to the value, or to several."""
@@ -58,8 +58,20 @@ def shaped(recorder: Recorder, operand: Operand, shape: tuple[int, ...]) -> Oper
     if isinstance(operand, Value):
         return operand if operand.shape == shape else recorder.broadcast(operand, shape)
     if on_host(operand):
+        require_exact_whole(operand)
         return np.broadcast_to(np.asanyarray(operand, float), shape, subok=True)
     return jnp.broadcast_to(operand, shape)
+
+
+def require_exact_whole(numbers: Any) -> None:
+    """Raise an error for whole numbers that are no floats.
+
+    Raises:
+        UnsupportedError: there is one.
+    """
+    numbers = np.asarray(numbers)
+    if numbers.dtype.kind in "iu" and np.any((numbers > 2**53) | (numbers < -(2**53))):
+        raise UnsupportedError("its whole numbers are too large to be floats: keep them below 2^53")
 
 
 def entrywise(rule: Rule) -> Rule:

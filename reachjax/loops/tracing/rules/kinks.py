@@ -71,12 +71,23 @@ def bent(recorder: Recorder, condition: Value, below: Operand, above: Operand) -
         if found is not None:
             slope, jumps = found
             bend = recorder.added(_times(recorder, recorder.rectified(condition), slope), below)
+            if _has_more(recorder, above, bend):  # which cancels: it is what JAX computes
+                recorder.require(above, sums=True)
             return _loosened(recorder, bend, jumps)
     for y in lines:
         bend = _pieces(recorder, y, condition, below, above)
         if bend is not None:
             return bend
     return None
+
+
+def _has_more(recorder: Recorder, one: Operand, other: Value) -> bool:
+    """Whether units are met on the way to one value that the other does not depend on."""
+    if not isinstance(one, Value):
+        return False
+    rest = {*recorder.between(one)} - {*recorder.between(other)}
+    steps = (recorder.steps[place] for place in rest)
+    return any(step is not None and step.unit is not None for step in steps)
 
 
 def _loosened(recorder: Recorder, value: Value, jumps: list[Fraction]) -> Value:

@@ -19,7 +19,7 @@ import numpy as np
 
 from reachjax.loops.tracing.rationals import Rationals
 from reachjax.loops.tracing.recording import Recorder
-from reachjax.loops.tracing.rules.equations import NOT_FINITE, shaped
+from reachjax.loops.tracing.rules.equations import NOT_FINITE, require_exact_whole, shaped
 from reachjax.loops.tracing.values import (
     Choice,
     Comparison,
@@ -276,10 +276,7 @@ def number(recorder: Recorder, pick: Operand) -> Operand:
     numbers = pick.numbers
     if is_known(numbers):
         own = isinstance(numbers, Parameter)
-        if np.asarray(numbers).dtype.kind in "iu" and np.any(abs(np.asarray(numbers)) > 2**53):
-            raise UnsupportedError(
-                "its whole numbers are too large to be floats: keep them below 2^53"
-            )
+        require_exact_whole(numbers)
         numbers = np.asarray(numbers).astype(float)
         if not np.all(np.isfinite(numbers)):
             raise UnsupportedError(NOT_FINITE)

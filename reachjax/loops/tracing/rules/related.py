@@ -253,6 +253,7 @@ def _exponents(recorder: Recorder, value: Value) -> list[list[Exponent]] | None:
     for place, matrix in sums.parts.items():
         step = recorder.steps[place]
         if not np.any(matrix):
+            recorder.require(recorder.values[place], sums=True)
             continue
         if (
             step is None

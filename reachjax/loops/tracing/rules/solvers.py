@@ -26,6 +26,7 @@ from jax.extend import core
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
 
+from reachjax.loops.tracing.combinations import Combination
 from reachjax.loops.tracing.recording import Recorder
 from reachjax.loops.tracing.rules.entries import (
     ONE,
@@ -82,7 +83,7 @@ def _solved(recorder: Recorder, equation: Equation, operands: Sequence[Operand])
         )
     matrix, b = (entries(recorder, each) for each in (given[0], right[0]))
     if isinstance(factors[0], Value):
-        matrix = _squared(recorder, factors[0]).reshape(matrix.shape)
+        matrix = _squared(recorder, factors[0], bodies.solve).reshape(matrix.shape)
     if not b.size:
         return [as_value(recorder, b)]
     places = _places(bodies.matvec, matrix.shape, b.shape)
@@ -110,14 +111,33 @@ def _is_own_solver(
     )
 
 
-def _squared(recorder: Recorder, factor: Value) -> np.ndarray:
-    """The symmetric matrix of which a triangular one is the factor: of one triangle of it."""
+def _squared(recorder: Recorder, factor: Value, solve: Any) -> np.ndarray:
+    """The symmetric matrix of which a triangular one is the factor: of one triangle of it.
+
+    Args:
+        recorder: of the factor.
+        factor: of which the solver takes one triangle.
+        solve: the jaxpr of the solver.
+    """
     made = [place for place in recorder.between(factor) if place in recorder.factored]
-    if not made:
+    sides = [e.params["lower"] for e in equations(solve) if e.primitive.name == "triangular_solve"]
+    root = recorder.values[made[-1]] if made else None
+    if root is None or not sides or not _is_root(recorder, factor, root, sides[0]):
         raise UnsupportedError("its factor is that of no matrix: use jnp.linalg.solve(A, b)")
-    A = entries(recorder, recorder.factored[made[-1]])
-    lower = np.tri(A.shape[-1], dtype=bool)
-    return np.where(lower, A, A.swapaxes(-1, -2))
+    A = entries(recorder, recorder.factored[root.place])
+    return np.where(np.tri(A.shape[-1], dtype=bool), A, A.swapaxes(-1, -2))
+
+
+def _is_root(recorder: Recorder, factor: Value, root: Value, lower: bool) -> bool:
+    """Whether a triangle of a matrix is that of a Cholesky factor, or of its transpose."""
+    if factor.size != root.size:
+        return False
+    numbers = np.arange(root.size).reshape(factor.shape)
+    below = np.broadcast_to(np.tri(factor.shape[-1], dtype=bool), factor.shape)
+    own = (numbers if lower else numbers.swapaxes(-1, -2))[below]
+    apart = Combination.of(recorder, factor)[own] - Combination.of(recorder, root)[numbers[below]]
+    parts = (*apart.parts.values(), apart.offset)
+    return not apart.errors and not any(map(np.any, parts))
 
 
 @lru_cache(maxsize=256)

@@ -107,7 +107,7 @@ def unchecked(cls: type[T], **values: Any) -> T:
 
 
 def overrides(kind: type, said: str) -> bool:
-    """Whether a class changes something of that one among those it is derived from which says this.
+    """Whether a user's class changes something of that one it is derived from which says this.
 
     Args:
         kind: the class.
@@ -118,16 +118,16 @@ def overrides(kind: type, said: str) -> bool:
         ...     steady = True
         ...     def value(self, t):
         ...         return 1
-        >>> class Moving(Base):
-        ...     def value(self, t):
-        ...         return t
+        >>> Moving = type("Moving", (Base,), {"__module__": "theirs", "value": lambda self, t: t})
         >>> overrides(Base, "steady"), overrides(Moving, "steady")
         (False, True)
     """
-    own = [{*vars(each), *vars(each).get("__annotations__", ())} for each in kind.__mro__]
-    rank = next(k for k, names in enumerate(own) if said in names)
-    above = {name for names in own[rank:] for name in names if not name.startswith(("__", "_abc_"))}
-    return any(name in above for names in own[:rank] for name in names)
+    names = {each: {*vars(each), *vars(each).get("__annotations__", ())} for each in kind.__mro__}
+    rank = next(k for k, each in enumerate(names) if said in names[each])
+    theirs = [each for each in kind.__mro__[:rank] if not is_own(each.__module__)]
+    known = set[str]().union(*(names[each] for each in names if each not in theirs))
+    changed = set[str]().union(*(names[each] for each in theirs)) & known
+    return any(not name.startswith(("__", "_abc_")) for name in changed)
 
 
 class Replaceable:

@@ -120,7 +120,7 @@ def over_plain(ax, title: str, label: str) -> None:
     """Title and axis of errors over those of plain training, and up to where they are as good."""
     ax.axvline(WITHIN, color="black", linewidth=1, linestyle=":")
     low, high = ax.get_xlim()
-    scale = "log" if high > 4 * low else "linear"  # a log axis has few ticks within a decade
+    scale = "log" if high > 20 * low else "linear"  # a log axis has few ticks within a decade
     ax.set(title=title, xscale=scale, xlabel=label)
     ax.xaxis.set_major_formatter("{x:g}")
     ax.xaxis.set_minor_formatter("")

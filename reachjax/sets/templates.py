@@ -8,7 +8,7 @@ from typing import Protocol, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.numerics.checks import (
     Numbers,
@@ -137,7 +137,7 @@ class Template(AbstractTemplate):
         """The number of facets."""
         return self.directions.shape[-2]
 
-    def polytope(self, offsets: Float[Array, " m"]) -> Polytope:
+    def polytope(self, offsets: Float[ArrayLike, " m"]) -> Polytope:
         """The polytope `directions x <= offsets`.
 
         Raises:

@@ -45,6 +45,7 @@ from reachjax.numerics.checks import (
 from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.logs import logged
+from reachjax.numerics.seals import Seal
 from reachjax.sets import Box
 from reachjax.training.failures import failures, optax_or_error, require_optimizer, skip_failures
 from reachjax.training.history import Epoch, TrainingHistory
@@ -380,9 +381,12 @@ class _Run:
         self._before, self.proof_seconds, self._gained = 0.0, 0.0, math.inf
         self.epochs: list[Epoch] = []
         self.known: Trained | None = None
-        self._seal = training_seal(loop, X0, spec, self._state)
         if path is not None and path.exists():
             self._resume(read_kept(path, self._seal, len(stages)))
+
+    @functools.cached_property
+    def _seal(self) -> Seal:
+        return training_seal(self._loop, self._X0, self._spec, self._state)
 
     @property
     def found(self) -> Trained:
@@ -404,9 +408,9 @@ class _Run:
 
     def begin(self, budget: Budget, seconds: float, asked: dict[str, Any]) -> None:
         """Decide on the controller as it was given, or as the file has it."""
-        self.known = self._found(budget, seconds, asked, after=len(self.epochs))
+        self.known = self._judged(budget, seconds, asked, after=len(self.epochs))
 
-    def _found(self, budget: Budget, seconds: float, asked: dict[str, Any], after: int) -> Trained:
+    def _judged(self, budget: Budget, seconds: float, asked: dict[str, Any], after: int) -> Trained:
         """The controller as it is with its verdict, whose counterexample is remembered.
 
         One that the file knows of already is not remembered twice.
@@ -479,7 +483,7 @@ class _Run:
         if quiet and not budget.timed:
             seconds = math.inf
         before = self.found
-        now = self._found(budget, max(LEAST, seconds), asked, number + 1)
+        now = self._judged(budget, max(LEAST, seconds), asked, number + 1)
         if now.proved or before.proved:
             self._lower(before, now, sizes, budget, asked, number + 1)
         else:

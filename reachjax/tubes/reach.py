@@ -148,9 +148,10 @@ class ReachTube(Replaceable):
                 "a plant in discrete time has no states in between samples: spans are of a "
                 "SampledPlant"
             )
-        require_double_precision(tube=floats_of((self.loop, self.sets, self.template)))
+        require_double_precision()
         kept = self.__dict__.get("_spans")
         if kept is None:
+            require_double_precision(tube=floats_of((self.loop, self.sets, self.template)))
             kept = spans_by_forms(self.loop, self.sets, self.template, self.start)
             if is_concrete(kept):
                 object.__setattr__(self, "_spans", kept)

@@ -81,11 +81,7 @@ class Tape:
         self._units: dict[tuple[AbstractUnit, int], int] = {}
         self._waves: dict[int, tuple[int, int]] = {}
         found = {value.place: value.place for value in recorder.inputs}
-        places = {*recorder.between(wanted)}
-        besides = [each for each in recorder.required.values() if each.place not in places]
-        for each in besides:
-            places.update(recorder.between(each, done=places))
-        for place in sorted(places):
+        for place in recorder.needed(wanted):
             step = recorder.steps[place]
             if step is None:
                 continue

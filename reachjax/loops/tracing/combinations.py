@@ -121,12 +121,12 @@ class Combination(AbstractNumber):
         for place, matrix in self.parts.items():
             if not np.any(matrix):  # what is no number is none times zero either
                 recorder.require(recorder.values[place], sums=True)
-            else:
-                if place in self.errors:  # products take factors of one to be exact
-                    rounded = (abs(matrix) == 1) & (self.errors[place] > 0)
-                    matrix = np.where(rounded, matrix * (1 - UNIT), matrix)
-                part = _product(recorder, matrix, recorder.values[place], shape)
-                found = part if found is None else recorder.added(found, part)
+                continue
+            if place in self.errors:  # products take factors of one to be exact
+                rounded = (abs(matrix) == 1) & (self.errors[place] > 0)
+                matrix = np.where(rounded, matrix * (1 - UNIT), matrix)
+            part = _product(recorder, matrix, recorder.values[place], shape)
+            found = part if found is None else recorder.added(found, part)
         offset = self.offset.reshape(shape)
         if found is None:
             if self.errors:

@@ -29,8 +29,8 @@ CALLS = (
 OWN_SLOPES = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 """Primitives that call one, and have a rule of their own for its derivative."""
 
-Counts = Callable[[Any], bool]
-"""Whether an equation, some operand of which depends on inputs, is one that is asked for."""
+Sought = Callable[[Any, bool], bool]
+"""Whether an equation is one that is looked for, and whether operands of it depend on inputs."""
 
 BODIES = {"jaxpr", "call_jaxpr", "fun_jaxpr"}
 """Under one of these names it is among their parameters."""
@@ -76,20 +76,20 @@ def rounds_to_fewer_bits(jaxpr: Any, varies: Sequence[bool]) -> bool:
         jaxpr: as it is with parameters of their own precision.
         varies: which of its arguments depend on inputs.
     """
-    return _through(jaxpr, varies, _is_in_fewer_bits)[1]
+    return _through(jaxpr, varies, _varies_in_fewer_bits)[1]
 
 
-def _never(equation: Any) -> bool:
-    """Whether an equation counts: none does."""
-    return False
+def _plain_rounds(equation: Any, varies: bool) -> bool:
+    """Whether an equation of plain numbers may round."""
+    return not varies and rounds(equation)
 
 
-def _is_in_fewer_bits(equation: Any) -> bool:
-    """Whether a result of an equation may be rounded, to fewer bits than floats have."""
-    whole, name = jnp.finfo(float).bits, equation.primitive.name
+def _varies_in_fewer_bits(equation: Any, varies: bool) -> bool:
+    """Whether a result that depends on inputs may be rounded, to fewer bits than floats have."""
+    whole, name = jnp.finfo(jnp.result_type(float)).bits, equation.primitive.name
     kinds = [each.aval.dtype for each in equation.outvars]
     narrow = [k for k in kinds if jnp.issubdtype(k, jnp.inexact) and jnp.finfo(k).bits < whole]
-    if not narrow or name in EXACT:
+    if not varies or not narrow or name in EXACT:
         return False
     if name == "convert_element_type":
         given = equation.invars[0].aval.dtype
@@ -128,53 +128,50 @@ def rounds_within(equation: Any, varies: Sequence[bool]) -> bool:
         equation: some operand of which depends on inputs.
         varies: which ones do.
     """
-    return _followed(equation, varies, _never)[1]
+    return _followed(equation, varies, _plain_rounds)[1]
 
 
 def rounds_plain(jaxpr: Any, varies: Sequence[bool]) -> bool:
     """Whether a jaxpr, some arguments of which depend on inputs, rounds numbers that do not."""
-    return _through(jaxpr, varies)[1]
+    return _through(jaxpr, varies, _plain_rounds)[1]
 
 
-def _followed(equation: Any, varies: Sequence[bool], counts: Counts) -> tuple[list[bool], bool]:
-    """Which results of an equation vary, and whether plain numbers are rounded in it.
-
-    Or, where equations of numbers that vary may count, whether one of those does.
-    """
+def _followed(equation: Any, varies: Sequence[bool], sought: Sought) -> tuple[list[bool], bool]:
+    """Which results of an equation vary, and whether it is what is looked for, or holds it."""
     name, params, varies = equation.primitive.name, equation.params, list(varies)
     if not any(varies):
-        return [False] * len(equation.outvars), counts is _never and rounds(equation)
+        return [False] * len(equation.outvars), sought(equation, False)
     if name in (*CALLS, *OWN_SLOPES):
-        return _through(body_of(params), varies, counts)
+        return _through(body_of(params), varies, sought)
     if name == "cond":
-        found = [_through(each, varies[1:], counts) for each in params["branches"]]
+        found = [_through(each, varies[1:], sought) for each in params["branches"]]
         outs = [varies[0] or any(each) for each in zip(*(outs for outs, _ in found), strict=True)]
-        return outs, any(rounded for _, rounded in found)
+        return outs, any(holds for _, holds in found)
     if name == "scan":
         first, count = params["num_consts"], params["num_carry"]
         carry = varies[first : first + count]
         while True:
             given = [*varies[:first], *carry, *varies[first + count :]]
-            outs, rounded = _through(params["jaxpr"], given, counts)
+            outs, holds = _through(params["jaxpr"], given, sought)
             after = [a or b for a, b in zip(carry, outs, strict=False)]
             if after == carry:
-                return [*carry, *outs[count:]], rounded
+                return [*carry, *outs[count:]], holds
             carry = after
     if name == "while":
         first, second = params["cond_nconsts"], params["body_nconsts"]
         done, carry = varies[first : first + second], varies[first + second :]
         while True:
-            outs, rounded = _through(params["body_jaxpr"], [*done, *carry], counts)
+            outs, holds = _through(params["body_jaxpr"], [*done, *carry], sought)
             after = [a or b for a, b in zip(carry, outs, strict=True)]
             if after == carry:
-                asked = _through(params["cond_jaxpr"], [*varies[:first], *carry], counts)[1]
-                return carry, rounded or asked
+                asked = _through(params["cond_jaxpr"], [*varies[:first], *carry], sought)[1]
+                return carry, holds or asked
             carry = after
-    return [True] * len(equation.outvars), counts(equation)
+    return [True] * len(equation.outvars), sought(equation, True)
 
 
-def _through(body: Any, varies: Sequence[bool], counts: Counts = _never) -> tuple[list[bool], bool]:
-    """Which results of a jaxpr vary, and whether plain numbers are rounded, as of an equation."""
+def _through(body: Any, varies: Sequence[bool], sought: Sought) -> tuple[list[bool], bool]:
+    """Which results of a jaxpr vary, and whether it holds what is looked for."""
     jaxpr = _jaxpr(body)
     known = dict.fromkeys(jaxpr.constvars, False)
     known.update(zip(jaxpr.invars, varies, strict=True))
@@ -182,9 +179,9 @@ def _through(body: Any, varies: Sequence[bool], counts: Counts = _never) -> tupl
     def read(atom: Any) -> bool:
         return not isinstance(atom, core.Literal) and known[atom]
 
-    rounded = False
+    holds = False
     for equation in jaxpr.eqns:
-        outs, inside = _followed(equation, [read(each) for each in equation.invars], counts)
-        rounded = rounded or inside
+        outs, inside = _followed(equation, [read(each) for each in equation.invars], sought)
+        holds = holds or inside
         known.update(zip(equation.outvars, outs, strict=True))
-    return [read(each) for each in jaxpr.outvars], rounded
+    return [read(each) for each in jaxpr.outvars], holds

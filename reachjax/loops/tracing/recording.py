@@ -82,14 +82,19 @@ class Recorder:
         What it does not depend on is left out, but for what is required: units there add no columns
         and need no bounds. Where what is required has none, as sums overflow, nor has the value.
         """
-        found, places = dict(enumerate(given)), {*self.between(wanted)}
-        for each in self.required.values():
-            places.update(self.between(each, done=places))
-        for place in sorted(places):
+        found = dict(enumerate(given))
+        for place in self.needed(wanted):
             step = self.steps[place]
             if step is not None:
                 found[place] = step.apply(unit, *(found[parent] for parent in step.parents))
         return numbers.where_known(found[wanted.place], [found[place] for place in self.required])
+
+    def needed(self, wanted: Value) -> list[int]:
+        """Places of all that a value, and what is required, depends on, in their order."""
+        places = {*self.between(wanted)}
+        for each in self.required.values():
+            places.update(self.between(each, done=places))
+        return sorted(places)
 
     def require(self, operand: Operand, sums: bool = False) -> None:
         """Let numbers be real ones: units that they depend on must have bounds.

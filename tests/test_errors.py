@@ -1,5 +1,7 @@
 """Bad input, each with its own error: it names the argument, what was expected and what arrived."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -176,6 +178,15 @@ def test_what_was_built_from_32_bit_floats_is_named(name):
     leftover = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), built)
     with pytest.raises(RuntimeError, match=f"{name} holds float32, but float64 is needed"):
         reach(**{name: leftover})
+
+
+@pytest.mark.parametrize("name", ["goal", "safe", r"avoid\[0\]"])
+def test_what_is_required_must_not_be_built_from_32_bit_floats(name):
+    kind, inside = re.match(r"[a-z]+", name)[0], rj.Box([-9.0, -9.0], [9.0, 9.0])
+    built = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), inside)
+    required = {kind: {1: [built]} if kind == "avoid" else built}
+    with pytest.raises(RuntimeError, match=f"{name} holds float32, but float64 is needed"):
+        rj.decide(LOOP, X0, 1, **required)
 
 
 FLAT = {

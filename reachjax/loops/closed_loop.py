@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -122,6 +122,12 @@ class ClosedLoop(Replaceable, AbstractSealed):
         require_kind("ClosedLoop.plant", self.plant, AbstractPlant, PLANT)
         require_kind("ClosedLoop.controller", self.controller, AbstractNetwork, NETWORK)
         plant, net = self.plant, self.controller
+        if plant.continuous and not is_own(type(plant).propagate.__module__):
+            raise TypeError(
+                f"{type(plant).__name__} must not define 'propagate', as it is a plant in "
+                "continuous time: nothing would be known of it in between samples. Change its "
+                "differential equation, or describe its samples alone by a NonlinearPlant"
+            )
         same_size(
             "the plant's number of states is",
             "the controller's number of inputs is",
@@ -160,6 +166,12 @@ class ClosedLoop(Replaceable, AbstractSealed):
                 continue
             expected = "a set such as Box(lower, upper), Polytope(A, b) or Ellipsoid(center, shape)"
             require_kind(f"ClosedLoop.{name}", W, AbstractSet, expected)
+            at = getattr(type(W), "at", None)
+            if at is not None and not is_own(at.__module__):
+                raise TypeError(
+                    f"ClosedLoop.{name} must not define 'at', as {type(W).__name__} does, for what "
+                    "is drawn is not asked for it: give Box(lower, upper) of arrays (N, n)"
+                )
             if is_concrete(W) and W.steps is None:
                 try:
                     W.bounding_box()
@@ -296,11 +308,13 @@ class ClosedLoop(Replaceable, AbstractSealed):
         box = box.at(t)
         return clipped(u, box.lower, box.upper, unit)
 
+    @final
     def input(self, x: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, v: Any = None) -> Any:
         """The projected input, for any kind of number; arguments are those of `measured`."""
         u = self.controller.propagate(self.measured(x, t, unit, v), unit)
         return self.projected(u, t, unit)
 
+    @final
     def moved(
         self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
     ) -> Any:
@@ -323,6 +337,7 @@ class ClosedLoop(Replaceable, AbstractSealed):
             return ()
         return (drawn(self.disturbance, x, self.states, t, unit) if w is None else w,)
 
+    @final
     def step(
         self,
         x: Any,

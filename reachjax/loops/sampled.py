@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import abc
-from typing import Any
+import dataclasses
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from reachjax.loops.tracing.functions import Function
 from reachjax.loops.tracing.values import UnsupportedError, Value
 from reachjax.loops.units import AtUnit, UnboundedError, evaluate
 from reachjax.numerics.checks import Numbers, is_concrete, real_number, require_kind, whole_number
-from reachjax.numerics.pytrees import converted, pytree, static
+from reachjax.numerics.pytrees import converted, pytree, static, unchecked
 from reachjax.numerics.rounding import is_counted, namespace
 
 NAME = "SampledPlant"
@@ -262,11 +263,21 @@ class SampledPlant(AbstractSampledPlant):
         except UnsupportedError as error:
             raise TypeError(f"{NAME}.f has no Taylor series: {error}") from None
 
-    def replace(self, **changes: Any) -> SampledPlant:
-        """A copy with some of the constructor's arguments changed."""
+    def replace(self, **changes: Any) -> Self:
+        """A copy with some of the constructor's arguments changed.
+
+        Raises:
+            ValueError: `f` would have other arguments, but is the same.
+        """
+        if "f" not in changes:
+            for name in ("states", "inputs", "disturbances", "clock"):
+                if name in changes and changes[name] != getattr(self, name):
+                    raise ValueError(
+                        f"{name} cannot be replaced alone, as f has its arguments by it: give f too"
+                    )
         names = "states", "inputs", "disturbances", "f", "period", "order", "held", "clock"
         given = {name: getattr(self, name) for name in names}
-        return SampledPlant(**{**given, "steps": self.fewest, **changes})
+        return type(self)(**{**given, "steps": self.fewest, **changes})
 
     def __repr__(self) -> str:
         more = f", disturbances={self.disturbances}" if self.disturbances else ""
@@ -288,18 +299,19 @@ class SampledPlant(AbstractSampledPlant):
         """The number `n_w` of disturbances."""
         return sum(self.f.structure.inputs[2:])
 
-    def shortened(self, part: float) -> SampledPlant:
+    def shortened(self, part: float) -> Self:
         """The plant of a part of each period, whose clock goes on by whole ones."""
-        found = self.replace(period=part * self.period)
-        found._set(part=part * self.part)
-        return found
+        return self._copied(period=_period(part * self.period), part=part * self.part)
 
     @property
-    def finer(self) -> SampledPlant:
+    def finer(self) -> Self:
         """The plant as it is simulated in twice as many steps."""
-        found = self.replace(steps=2 * max(self.fewest, LEAST_STEPS))
-        found._set(part=self.part)
-        return found
+        return self._copied(fewest=2 * max(self.fewest, LEAST_STEPS))
+
+    def _copied(self, **changes: Any) -> Self:
+        """A copy of whatever class, with some fields changed that need no check."""
+        held = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return unchecked(type(self), **{**held, **changes})
 
     def flow_at(self, t: int | jax.Array) -> AbstractFlow:
         """Its flow over the period that begins at a sample."""

@@ -135,10 +135,21 @@ class Replaceable:
 
     Public methods of what inherits from it heed none of JAX's strict flags (`flags`), but for
     forms, programs and scenarios, which nobody holds who is not called by something public.
+
+    A class must not change a method that is `typing.final`: bounds do without it, so what is proved
+    would be of another loop or set.
     """
 
     def __init_subclass__(cls, **given: Any):
         super().__init_subclass__(**given)
+        for name in vars(cls):
+            for base in cls.__mro__[1:]:
+                if getattr(vars(base).get(name), "__final__", False):
+                    raise TypeError(
+                        f"{cls.__name__} must not define {name!r}, as bounds of a {base.__name__} "
+                        "do not ask for it and would be of another one: change the parts that it "
+                        "is made of, or what these compute"
+                    )
         if not cls.__module__.startswith(INNER):
             made_lenient(cls)
 

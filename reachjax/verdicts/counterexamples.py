@@ -332,10 +332,31 @@ def deviates(
 ) -> bool:
     """Whether a simulated trajectory leaves the enclosure of a step by more than rounding.
 
-    Then what was simulated is another loop than what is bounded.
+    Then what was simulated is another loop than what is bounded. So it is if of a step intervals
+    and forms have no successor in common.
     """
     _, *drawn = scenario
-    return any(departures(loop, Scenario(states[:-1], *drawn), states[1:], start))
+    if any(departures(loop, Scenario(states[:-1], *drawn), states[1:], start)):
+        return True
+    return any(
+        _is_torn(
+            loop, Scenario(x, *(None if part is None else part[[t]] for part in drawn)), start + t
+        )
+        for t, x in enumerate(states[:-1])
+    )
+
+
+def _is_torn(loop: ClosedLoop, scenario: Scenario, t: int) -> bool:
+    """Whether intervals and forms enclose the step of a scenario by boxes that do not meet."""
+    x, *drawn = scenario
+    now = (None if part is None else part[0] for part in drawn)
+    try:
+        one = successor_box(loop, Box(x, x), t, *now, doubt=TOLERATED)
+        (other,) = boxes_from_point(loop, scenario, 1, t)
+    except UnboundedError:
+        return False
+    nearest = np.clip(one.lower, other.lower, other.upper)
+    return bool(_excess(one, np.asarray(nearest), np.zeros(0)).any())
 
 
 def most_room(item: Requirement, reached: Box) -> float:

@@ -23,7 +23,13 @@ from jaxtyping import Array, Float
 
 from reachjax.loops import ClosedLoop
 from reachjax.methods.problem import Span, at
-from reachjax.numerics.checks import described, is_concrete, real_number, require_kind
+from reachjax.numerics.checks import (
+    described,
+    is_concrete,
+    real_number,
+    require_double_precision,
+    require_kind,
+)
 from reachjax.numerics.deprecations import once_positional
 from reachjax.numerics.flags import lenient
 from reachjax.sets import AbstractSet, Ellipsoid, PolyhedralSet
@@ -454,6 +460,7 @@ def _checked(item: Requirement, states: int) -> Requirement:
     """A requirement of a set that can be decided.
 
     Raises:
+        RuntimeError: it was built while 64-bit floats were off.
         TypeError: it is of another kind.
         ValueError: its dimension is another one, it is empty, or it is an ellipsoid that cannot be
             decided.
@@ -466,6 +473,7 @@ def _checked(item: Requirement, states: int) -> Requirement:
         raise ValueError(
             f"{item.name} has dimension {region.dimension}, but the loop has {states} states"
         )
+    require_double_precision(**{item.name: region})
     flat, ball = region.parts
     if flat is not None and flat.needs_programs and is_concrete(flat):
         A, b = (np.asarray(part, float) for part in region.facets)

@@ -438,6 +438,17 @@ def test_a_matlab_file_without_a_network(layers, tmp_path):
         rj.Network.from_file(path)
 
 
+@pytest.mark.parametrize("name", ["means_for_scaling", "Maximum_of_Inputs", "x_min", "std"])
+def test_a_matlab_file_with_scaling_is_refused(name, layers, tmp_path):
+    """The file does not say how it is applied."""
+    W, b = zip(*layers, strict=True)
+    held = {"W": cells(W), "b": cells(b), "act_fcns": ["relu"] * len(W), name: np.ones(3)}
+    path = tmp_path / "scaled.mat"
+    scipy.io.savemat(path, held)
+    with pytest.raises(ValueError, match=f"it also holds {name}, and whether that scales"):
+        rj.Network.from_file(path)
+
+
 def test_a_row_of_weights_is_of_one_neuron_or_of_one_input(tmp_path):
     """Four numbers for two neurons may be two of each, but which ones the file does not say."""
     path = tmp_path / "row.mat"

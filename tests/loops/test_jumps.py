@@ -142,6 +142,11 @@ REFUSED = {
     "bits of any number": lambda x: lax.reduce_or(jnp.where(bits(x), jnp.array([1, 2]), 0), (0,))
     * x,
     "bits of all numbers": lambda x: lax.reduce_and(jnp.where(bits(x), 2, 1), (0,)) * x,
+    "a case by a count": lambda x: lax.select_n(jnp.sum(x > 0), 0.5 * x, 0.9 * x, 1.5 * x),
+    "constants by a count": lambda x: lax.select_n(jnp.sum(x > 0), T, 2 * T, 3 * T)[:2] * x,
+    "a case by a sum of counts": lambda x: lax.select_n(
+        jnp.full(2, jnp.sum(x > 0) + jnp.sum(x > 1)), x, -x, x, x, x
+    ),
     "cases by a parameter": Partial(lambda t, x: jnp.where(t[jnp.argmax(W @ x)] > 0, x, -x), T),
     "a condition of a parameter": Partial(
         lambda t, x: jnp.select([x[0] > 0, t[0] > 0], [1.0, 2.0], 3.0) * x, T
@@ -150,7 +155,8 @@ REFUSED = {
 
 
 REASONS = (
-    r"cannot be certified: .*(range of|counting|parameter|too large|truth values JAX|bit by bit)"
+    r"cannot be certified: "
+    r".*(range of|chooses by a number|counting|parameter|too large|truth values JAX|bit by bit)"
 )
 
 

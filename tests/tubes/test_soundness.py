@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from reachjax.loops.closed_loop import Scenario
 from reachjax.numerics.pytrees import pytree
 from reachjax.programs.affine import AffineForms
+from reachjax.verdicts import counterexamples
 from reachjax.verdicts.compiled import is_telling
+from reachjax.verdicts.counterexamples import deviates
 
 X0 = rj.Box([0.5], [1.0])
 INSIDE = rj.Box([-0.2], [1.2])
@@ -231,3 +234,65 @@ def test_at_a_tie_each_winner_is_right_also_where_something_is_refuted(f):
     loop = free_loop(f)
     start = rj.Box([0.4], [0.4])
     assert rj.decide(loop, start, 1, goal=rj.Box([20.0], [30.0])).refuted
+
+
+@pytest.mark.parametrize("name", ["input", "moved", "step"])
+def test_a_loop_must_not_change_a_method_that_bounds_do_without(name):
+    with pytest.raises(TypeError, match=f"must not define '{name}'.*parts that it is made of"):
+        type("Biased", (rj.ClosedLoop,), {name: lambda self, *given: given[0] + 1.0})
+
+
+def test_what_is_drawn_must_be_all_that_its_set_says():
+    class Growing(rj.Box):
+        def at(self, t):
+            return rj.Box(self.lower * (1 + t), self.upper * (1 + t))
+
+    plant = rj.AffinePlant([[0.5]], [[1.0]], E=[[1.0]])
+    net = rj.MLP.from_layers([([[0.0]], [0.0])])
+    gusts = {"disturbance": rj.Box([-0.1], [0.1])}
+    for name in ("disturbance", "noise"):
+        with pytest.raises(TypeError, match=f"ClosedLoop.{name} must not define 'at', as Growing"):
+            rj.ClosedLoop(plant, net, **{**gusts, name: Growing([-0.1], [0.1])})
+
+
+def test_a_derived_differential_equation_keeps_its_class_when_it_is_changed():
+    @pytree
+    class Pushed(rj.SampledPlant):
+        __init__ = rj.SampledPlant.__init__
+
+        def flow_at(self, t):
+            return super().flow_at(t)
+
+    plant = Pushed(lambda x, u: u - x, 1, 1, 0.1)
+    for each in (plant.replace(period=0.2), plant.shortened(0.5), plant.finer):
+        assert type(each) is Pushed
+    for change in ({"clock": True}, {"states": 2}, {"disturbances": 1}):
+        with pytest.raises(ValueError, match="cannot be replaced alone"):
+            plant.replace(**change)
+
+
+def test_a_derived_differential_equation_must_not_step_in_a_way_of_its_own():
+    """Half of two flows of a period would be looked at in between samples, or none of a jump."""
+
+    @pytree
+    class Twice(rj.SampledPlant):
+        __init__ = rj.SampledPlant.__init__
+
+        def propagate(self, x, u, t=0, unit=None, w=None):
+            return super().propagate(super().propagate(x, u, t, unit), u, t, unit)
+
+    plant = Twice(lambda x, u: u - x, 1, 1, 0.1)
+    with pytest.raises(TypeError, match=r"Twice must not define 'propagate'.*in between samples"):
+        rj.ClosedLoop(plant, rj.MLP.from_layers([([[0.0]], [0.0])]))
+
+
+def test_a_trajectory_contradicts_what_forms_read_otherwise_than_intervals(monkeypatch):
+    """Also where what forms say of the trajectory is what they say of all."""
+    loop, states = sound_loop(1.5), np.array([[0.8], [1.2], [1.8]])
+    given = Scenario(states[0], None, None), states, 0
+    assert not deviates(loop, *given)
+    read = counterexamples.boxes_from_point
+    monkeypatch.setattr(
+        counterexamples, "boxes_from_point", lambda loop, *rest: read(sound_loop(0.5), *rest)
+    )
+    assert deviates(loop, *given)

@@ -143,6 +143,10 @@ def _is_line(W: np.ndarray, b: np.ndarray) -> bool:
     return W.size > 0 and W.size == max(W.shape) and len(b) in (1, W.size)
 
 
+SCALING = re.compile(r"mean|range|scal|minim|maxim|normali|(^|_)(min|max|std|mu|sigma)(_|$)", re.I)
+"""What variables are called by which tools scale what goes into a network, or comes out."""
+
+
 def _matlab(content: bytes) -> Chain:
     """Variables `W`, `b` and `act_fcns`, or what other tools call these, perhaps in a struct."""
     found = read_variables(content)
@@ -153,6 +157,12 @@ def _matlab(content: bytes) -> Chain:
             if twice:
                 raise ValueError(f"{', '.join(twice)} stand in it at two places")
             held |= value
+    scaling = sorted(name for name in held if SCALING.search(name))
+    if scaling:
+        raise ValueError(
+            f"it also holds {', '.join(scaling)}, and whether that scales inputs or outputs is not "
+            "said: write a file of W, b and act_fcns alone, and scale by reachjax.Network(f, ...)"
+        )
     weights = _named(held, "W", "weights", "Weights")
     biases = _named(held, "b", "bias", "biases", "Biases")
     names = [

@@ -99,6 +99,12 @@ class Limits(AbstractNumber):
     def __rmul__(self, factor: Any) -> Limits:
         return self * factor
 
+    def nearly_times(self, factor: Any) -> Limits:
+        """Products with numbers that factors are near, which even powers of two are not."""
+        found = factor * self
+        sizes = (gamma(3) * abs(end) + TINY * (end != 0) for end in (found.least, found.most))
+        return self._outward(found.least, found.most, *sizes)
+
     @np.errstate(invalid="ignore", over="ignore")
     def __rmatmul__(self, matrix: Any) -> Limits:
         """A plain matrix times the numbers; where it only picks them nothing is rounded.

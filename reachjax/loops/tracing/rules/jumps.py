@@ -516,7 +516,7 @@ def _one_hot(recorder: Recorder, scores: Value) -> Value:
 def _remainder(recorder: Recorder, equation: Equation, operands: Sequence[Operand]) -> Operand:
     """`y - d trunc(y / d)`."""
     value, divisor = operands
-    if not isinstance(value, Value) or not _is_float(equation):
+    if not isinstance(value, Value) or not is_plain(divisor) or not _is_float(equation):
         raise UnsupportedError("what it divides by must be a plain number")
     value, divisor = (shaped(recorder, each, equation.shape) for each in operands)
     quotient = recorder.divided(value, divisor)

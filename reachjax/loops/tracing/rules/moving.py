@@ -13,7 +13,7 @@ import numpy as np
 
 from reachjax.loops.tracing.recording import Recorder
 from reachjax.loops.tracing.rules.equations import NOT_FINITE, Equation, Rule, shape_of
-from reachjax.loops.tracing.values import Operand, UnsupportedError, Value, is_known
+from reachjax.loops.tracing.values import Operand, UnsupportedError, Value, is_known, is_plain
 from reachjax.numerics.rounding import namespace
 
 NONE = -1
@@ -201,7 +201,16 @@ def _multiplied(recorder: Recorder, equation: Equation, operands: Sequence[Opera
 
 
 def chosen(recorder: Recorder, which: Any, cases: Sequence[Operand]) -> Operand:
-    """Entries of several operands, by known numbers; or weighed, by traced ones."""
+    """Entries of several operands, by known numbers; or weighed, by traced ones.
+
+    Raises:
+        UnsupportedError: the numbers depend on inputs.
+    """
+    if not is_plain(which):
+        raise UnsupportedError(
+            "it chooses by a number that depends on inputs, as a sum of comparisons does: compare "
+            "that number, as jnp.where(k == 1, a, b), or choose by jnp.argmax"
+        )
     if is_known(which):
         which = np.broadcast_to(np.asarray(which, int), shape_of(cases[0]))
         if which.size and np.all(which == which.flat[0]):

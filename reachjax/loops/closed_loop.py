@@ -93,7 +93,9 @@ class ClosedLoop(Replaceable, AbstractSealed):
         noise: the set of `v[t]`, of the same kinds; `None`: states are measured exactly.
 
     Raises:
-        TypeError: an argument is of another kind, or normals of an input polytope are traced.
+        TypeError: an argument is of another kind, or normals of an input polytope are traced; a
+            plant in continuous time of a user's class defines `propagate`, or a box of disturbances
+            or noise defines `at`.
         ValueError: numbers of states, inputs, disturbances or time steps disagree; a plant has
             disturbances, but there is no set of them; a set is empty or unbounded; or an input
             polytope has too many facets.
@@ -124,9 +126,9 @@ class ClosedLoop(Replaceable, AbstractSealed):
         plant, net = self.plant, self.controller
         if plant.continuous and not is_own(type(plant).propagate.__module__):
             raise TypeError(
-                f"{type(plant).__name__} must not define 'propagate', as it is a plant in "
-                "continuous time: nothing would be known of it in between samples. Change its "
-                "differential equation, or describe its samples alone by a NonlinearPlant"
+                f"ClosedLoop.plant must step by its flow alone, but {type(plant).__name__}, in "
+                "continuous time, defines propagate, of which nothing is known in between samples: "
+                "give a SampledPlant, or its samples alone by a NonlinearPlant"
             )
         same_size(
             "the plant's number of states is",
@@ -167,10 +169,11 @@ class ClosedLoop(Replaceable, AbstractSealed):
             expected = "a set such as Box(lower, upper), Polytope(A, b) or Ellipsoid(center, shape)"
             require_kind(f"ClosedLoop.{name}", W, AbstractSet, expected)
             at = getattr(type(W), "at", None)
-            if at is not None and not is_own(at.__module__):
+            if W.intervals is not None and callable(at) and not is_own(at.__module__):
                 raise TypeError(
-                    f"ClosedLoop.{name} must not define 'at', as {type(W).__name__} does, for what "
-                    "is drawn is not asked for it: give Box(lower, upper) of arrays (N, n)"
+                    f"ClosedLoop.{name} must have the at of Box, but {type(W).__name__} defines "
+                    "its own, which nobody asks who draws from it: give Box(lower, upper) of "
+                    "arrays (N, n)"
                 )
             if is_concrete(W) and W.steps is None:
                 try:

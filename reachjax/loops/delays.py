@@ -20,7 +20,7 @@ from reachjax.loops.sampled import AbstractSampledPlant, SampledAffinePlant, Sam
 from reachjax.loops.units import AtUnit, evaluate
 from reachjax.numerics.checks import Numbers, described, require_kind, whole_number
 from reachjax.numerics.flags import lenient
-from reachjax.numerics.pytrees import pytree, static
+from reachjax.numerics.pytrees import is_own, pytree, static
 from reachjax.sets import AbstractSet, Box, PolyhedralSet, Polytope
 
 
@@ -157,7 +157,8 @@ def delayed(loop: ClosedLoop, periods: int = 1) -> ClosedLoop:
         periods: how many.
 
     Raises:
-        TypeError: the plant is of a kind that is not delayed.
+        TypeError: the plant is of a kind that is not delayed, or it or the loop is of a user's
+            class, whose own steps would be lost.
         ValueError: the loop varies in time, or has noise.
 
     Example:
@@ -171,6 +172,13 @@ def delayed(loop: ClosedLoop, periods: int = 1) -> ClosedLoop:
     periods = whole_number("periods", periods, 1)
     if loop.varies or loop.noise is not None:
         raise ValueError("loop must not vary in time, nor have noise, for its inputs to be late")
+    for name, part in (("loop", loop), ("loop.plant", loop.plant)):
+        if not is_own(type(part).__module__):
+            raise TypeError(
+                f"{name} must be of a class of reachjax for its inputs to be late, but "
+                f"{described(part)} arrived, whose own steps would be lost: make the inputs on "
+                "their way states of a plant of your own"
+            )
     more = periods * loop.plant.inputs
     return ClosedLoop(
         DelayedPlant(_with_rest(loop.plant, more), loop.states),

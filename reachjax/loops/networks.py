@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from reachjax.loops.tracing.functions import Function
+from reachjax.loops.tracing.functions import Function, require_own_sizes
 from reachjax.loops.units import AbstractActivation, AtUnit, ReLU, evaluate
 from reachjax.numerics.archives import existing_file
 from reachjax.numerics.checks import Numbers, described, require_kind, same_size, whole_number
@@ -208,6 +208,7 @@ class Network(AbstractNetwork):
             sizes = (whole_number("Network.inputs", inputs, 1),)
             f = Function.of(f, sizes, whole_number("Network.outputs", outputs, 1), "Network.f")
         self._set(f=f)
+        require_own_sizes(self, inputs=inputs, outputs=outputs)
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Network:

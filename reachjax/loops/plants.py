@@ -20,7 +20,7 @@ from jax.scipy.linalg import expm
 from jaxtyping import Array, ArrayLike, Float
 
 from reachjax.loops.flows.clock import successor_at, timed
-from reachjax.loops.tracing.functions import Function
+from reachjax.loops.tracing.functions import Function, require_own_sizes
 from reachjax.loops.units import AtUnit, evaluate
 from reachjax.numerics.checks import (
     Numbers,
@@ -282,6 +282,7 @@ class NonlinearPlant(AbstractPlant):
             d = whole_number(f"{name}.disturbances", disturbances, 0)
             f = Function.of(*self._traced(f, (n, m, d) if d else (n, m)), n, f"{name}.f")
         self._set(f=f)
+        require_own_sizes(self, states=states, inputs=inputs, disturbances=disturbances or None)
 
     def _traced(self, f: Any, sizes: tuple[int, ...]) -> tuple[Any, tuple[int, ...]]:
         """What is traced, and with vectors of which sizes."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from typing import Any, Self
+from typing import Any, Self, final
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from reachjax.loops.flows.linear import LinearFlow
 from reachjax.loops.flows.series import Tape
 from reachjax.loops.flows.steps import Settings
 from reachjax.loops.plants import AbstractPlant, AffinePlant
-from reachjax.loops.tracing.functions import Function
+from reachjax.loops.tracing.functions import Function, require_own_sizes
 from reachjax.loops.tracing.values import UnsupportedError, Value
 from reachjax.loops.units import AtUnit, UnboundedError, evaluate
 from reachjax.numerics.checks import Numbers, is_concrete, real_number, require_kind, whole_number
@@ -61,6 +61,7 @@ class AbstractSampledPlant(AbstractPlant):
         """Its flow over the period that begins at a sample; of an equation without clock any."""
         return self.flow
 
+    @final
     def beginning(self, x: Any, u: Any) -> tuple[Any, Any]:
         """What a period begins with, the state and the input that acts: these, if none is late."""
         return x, u
@@ -89,6 +90,7 @@ class AbstractSampledPlant(AbstractPlant):
         """Whether its successors bend smoothly, whatever its units are."""
         return True
 
+    @final
     def propagate(
         self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None
     ) -> Any:
@@ -257,6 +259,7 @@ class SampledPlant(AbstractSampledPlant):
         order = None if order is None else whole_number(f"{NAME}.order", order, 1)
         steps = 1 if steps is None else whole_number(f"{NAME}.steps", steps, 1)
         self._set(f=f, period=_period(period), order=order, held=bool(held), clock=clock, part=1.0)
+        require_own_sizes(self, states=states, inputs=inputs, disturbances=disturbances or None)
         self._set(fewest=1 << (steps - 1).bit_length())  # parts of a period are exact
         try:
             jax.eval_shape(lambda plant: plant.period * len(plant.flow.tape.nodes), self)
@@ -264,20 +267,17 @@ class SampledPlant(AbstractSampledPlant):
             raise TypeError(f"{NAME}.f has no Taylor series: {error}") from None
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with some of the constructor's arguments changed.
+        """A copy, of the same class, with some of the constructor's arguments changed.
 
         Raises:
-            ValueError: `f` would have other arguments, but is the same.
+            TypeError: as the constructor.
+            ValueError: as the constructor; or numbers or the clock would be others without `f`.
         """
-        if "f" not in changes:
-            for name in ("states", "inputs", "disturbances", "clock"):
-                if name in changes and changes[name] != getattr(self, name):
-                    raise ValueError(
-                        f"{name} cannot be replaced alone, as f has its arguments by it: give f too"
-                    )
         names = "states", "inputs", "disturbances", "f", "period", "order", "held", "clock"
         given = {name: getattr(self, name) for name in names}
-        return type(self)(**{**given, "steps": self.fewest, **changes})
+        found = SampledPlant(**{**given, "steps": self.fewest, **changes})
+        fields = dataclasses.fields(SampledPlant)
+        return self._copied(**{field.name: getattr(found, field.name) for field in fields})
 
     def __repr__(self) -> str:
         more = f", disturbances={self.disturbances}" if self.disturbances else ""

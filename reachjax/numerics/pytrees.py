@@ -136,19 +136,19 @@ class Replaceable:
     Public methods of what inherits from it heed none of JAX's strict flags (`flags`), but for
     forms, programs and scenarios, which nobody holds who is not called by something public.
 
-    A class must not change a method that is `typing.final`: bounds do without it, so what is proved
-    would be of another loop or set.
+    A class must not change a method that is `typing.final`, by its own or by another class that it
+    is derived from: what is proved would not be about it. (Of a property that mark is lost.)
     """
 
     def __init_subclass__(cls, **given: Any):
         super().__init_subclass__(**given)
-        for name in vars(cls):
-            for base in cls.__mro__[1:]:
-                if getattr(vars(base).get(name), "__final__", False):
+        for base in cls.__mro__[1:]:
+            for name, method in vars(base).items():
+                if getattr(method, "__final__", False) and getattr(cls, name) is not method:
                     raise TypeError(
-                        f"{cls.__name__} must not define {name!r}, as bounds of a {base.__name__} "
-                        "do not ask for it and would be of another one: change the parts that it "
-                        "is made of, or what these compute"
+                        f"{cls.__name__}.{name} must be that of {base.__name__}, which is final: "
+                        f"what is proved would not be about {cls.__name__}. Change what {name} "
+                        "calls, or the parts that it is made of"
                     )
         if not cls.__module__.startswith(INNER):
             made_lenient(cls)

@@ -330,24 +330,24 @@ def _excess(
 def deviates(
     loop: ClosedLoop, scenario: Scenario, states: Float[np.ndarray, "t n_x"], start: int
 ) -> bool:
-    """Whether a simulated trajectory leaves the enclosure of a step by more than rounding.
+    """Whether a simulated trajectory tells that what is bounded is another loop.
 
-    Then what was simulated is another loop than what is bounded. So it is if of a step intervals
-    and forms have no successor in common.
+    A step is beside its enclosure by more than rounding; or intervals and affine forms enclose one
+    step by boxes that are apart by more than that.
     """
     _, *drawn = scenario
     if any(departures(loop, Scenario(states[:-1], *drawn), states[1:], start)):
         return True
     return any(
-        _is_torn(
+        _enclosures_disagree(
             loop, Scenario(x, *(None if part is None else part[[t]] for part in drawn)), start + t
         )
         for t, x in enumerate(states[:-1])
     )
 
 
-def _is_torn(loop: ClosedLoop, scenario: Scenario, t: int) -> bool:
-    """Whether intervals and forms enclose the step of a scenario by boxes that do not meet."""
+def _enclosures_disagree(loop: ClosedLoop, scenario: Scenario, t: int) -> bool:
+    """Whether intervals and affine forms enclose one step by boxes apart by more than rounding."""
     x, *drawn = scenario
     now = (None if part is None else part[0] for part in drawn)
     try:

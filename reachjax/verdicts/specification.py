@@ -25,6 +25,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.methods.problem import Span, at
 from reachjax.numerics.checks import (
     described,
+    floats_of,
     is_concrete,
     real_number,
     require_double_precision,
@@ -473,7 +474,7 @@ def _checked(item: Requirement, states: int) -> Requirement:
         raise ValueError(
             f"{item.name} has dimension {region.dimension}, but the loop has {states} states"
         )
-    require_double_precision(**{item.name: region})
+    require_double_precision(**{item.name: floats_of(region)})
     flat, ball = region.parts
     if flat is not None and flat.needs_programs and is_concrete(flat):
         A, b = (np.asarray(part, float) for part in region.facets)

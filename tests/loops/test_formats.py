@@ -438,15 +438,40 @@ def test_a_matlab_file_without_a_network(layers, tmp_path):
         rj.Network.from_file(path)
 
 
-@pytest.mark.parametrize("name", ["means_for_scaling", "Maximum_of_Inputs", "x_min", "std"])
-def test_a_matlab_file_with_scaling_is_refused(name, layers, tmp_path):
-    """The file does not say how it is applied."""
+BESIDE = {
+    "means_for_scaling": np.ones(4),
+    "Maximum_of_Inputs": 1.0,
+    "xoffset": np.zeros((2, 1)),
+    "limits": np.ones(3),
+}
+HARMLESS = {
+    "dt": 0.1,
+    "mu": 2.0,
+    "max_iter": 100,
+    "number_of_inputs": 2,
+    "layer_sizes": np.array([4, 3, 1]),
+    "history": np.zeros((7, 9)),
+    "author": "a name",
+}
+
+
+def with_more(layers, path, **more):
     W, b = zip(*layers, strict=True)
-    held = {"W": cells(W), "b": cells(b), "act_fcns": ["relu"] * len(W), name: np.ones(3)}
-    path = tmp_path / "scaled.mat"
-    scipy.io.savemat(path, held)
-    with pytest.raises(ValueError, match=f"it also holds {name}, and whether that scales"):
-        rj.Network.from_file(path)
+    held = {"W": cells(W), "b": cells(b), "act_fcns": ["relu"] * len(W)}
+    scipy.io.savemat(path, held | more)
+    return rj.Network.from_file(path)
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_a_matlab_file_with_what_may_be_scaling_is_refused(name, layers, tmp_path):
+    """The file does not say how it is applied."""
+    with pytest.raises(ValueError, match=f"it also holds {name}, and does not say whether"):
+        with_more(layers, tmp_path / "scaled.mat", **{name: BESIDE[name]})
+
+
+def test_a_matlab_file_with_what_scales_nothing_is_read(layers, points, tmp_path):
+    net = with_more(layers, tmp_path / "more.mat", **HARMLESS)
+    same(net, forward(layers, ["relu"] * 3, points), points)
 
 
 def test_a_row_of_weights_is_of_one_neuron_or_of_one_input(tmp_path):

@@ -142,11 +142,6 @@ REFUSED = {
     "bits of any number": lambda x: lax.reduce_or(jnp.where(bits(x), jnp.array([1, 2]), 0), (0,))
     * x,
     "bits of all numbers": lambda x: lax.reduce_and(jnp.where(bits(x), 2, 1), (0,)) * x,
-    "a case by a count": lambda x: lax.select_n(jnp.sum(x > 0), 0.5 * x, 0.9 * x, 1.5 * x),
-    "constants by a count": lambda x: lax.select_n(jnp.sum(x > 0), T, 2 * T, 3 * T)[:2] * x,
-    "a case by a sum of counts": lambda x: lax.select_n(
-        jnp.full(2, jnp.sum(x > 0) + jnp.sum(x > 1)), x, -x, x, x, x
-    ),
     "cases by a parameter": Partial(lambda t, x: jnp.where(t[jnp.argmax(W @ x)] > 0, x, -x), T),
     "a condition of a parameter": Partial(
         lambda t, x: jnp.select([x[0] > 0, t[0] > 0], [1.0, 2.0], 3.0) * x, T
@@ -155,9 +150,16 @@ REFUSED = {
 
 
 REASONS = (
-    r"cannot be certified: "
-    r".*(range of|chooses by a number|counting|parameter|too large|truth values JAX|bit by bit)"
+    r"cannot be certified: .*(range of|counting|parameter|too large|truth values JAX|bit by bit)"
 )
+
+BY_COUNTS = {
+    "a case": lambda x: lax.select_n(jnp.sum(x > 0), 0.5 * x, 0.9 * x, 1.5 * x),
+    "constants": lambda x: lax.select_n(jnp.sum(x > 0), T, 2 * T, 3 * T)[:2] * x,
+    "a case of each entry": lambda x: lax.select_n(
+        jnp.full(2, jnp.sum(x > 0) + jnp.sum(x > 1)), x, -x, x, x, x
+    ),
+}
 
 
 @pytest.mark.parametrize("name", JUMPS)
@@ -184,6 +186,18 @@ def test_values_on_the_surfaces_are_within_the_bounds_of_a_point(name):
 def test_what_would_be_read_otherwise_than_it_is_computed_is_refused(name):
     with pytest.raises(TypeError, match=REASONS):
         network(REFUSED[name])
+
+
+@pytest.mark.parametrize("name", BY_COUNTS)
+def test_a_case_is_not_chosen_by_a_count(name):
+    """It depends on inputs, and is no decision whose cases are listed."""
+    with pytest.raises(TypeError, match="it chooses by a number that depends on inputs"):
+        network(BY_COUNTS[name])
+
+
+def test_a_remainder_is_by_a_plain_number():
+    with pytest.raises(TypeError, match="the remainder by a number that depends on inputs"):
+        network(lambda x: jnp.fmod(x, 1.0 + x**2))
 
 
 def test_known_and_traced_tables_are_gated_by_the_same_events():

@@ -10,7 +10,7 @@ import pytest
 
 import reachjax as rj
 from reachjax.loops.closed_loop import Scenario
-from reachjax.numerics.pytrees import pytree
+from reachjax.numerics.pytrees import pytree, static
 from reachjax.programs.affine import AffineForms
 from reachjax.verdicts import counterexamples
 from reachjax.verdicts.compiled import is_telling
@@ -237,57 +237,109 @@ def test_at_a_tie_each_winner_is_right_also_where_something_is_refuted(f):
 
 
 @pytest.mark.parametrize("name", ["input", "moved", "step"])
-def test_a_loop_must_not_change_a_method_that_bounds_do_without(name):
-    with pytest.raises(TypeError, match=f"must not define '{name}'.*parts that it is made of"):
-        type("Biased", (rj.ClosedLoop,), {name: lambda self, *given: given[0] + 1.0})
+@pytest.mark.parametrize("mixed", [False, True])
+def test_a_loop_must_not_change_a_method_that_bounds_do_without(name, mixed):
+    own = {name: lambda self, *given: given[0] + 1.0}
+    bases = (type("Biasing", (), own), rj.ClosedLoop) if mixed else (rj.ClosedLoop,)
+    with pytest.raises(TypeError, match=f"Biased.{name} must be that of ClosedLoop.*parts"):
+        type("Biased", bases, {} if mixed else own)
+
+
+@pytree
+class Growing(rj.Box):
+    def at(self, t):
+        return rj.Box(self.lower * (1 + t), self.upper * (1 + t))
+
+
+@pytree
+class Cornered(rj.Polytope):
+    """A polytope with a method that is called as one of a box is."""
+
+    def at(self, i):
+        return self.vertices()[i]
 
 
 def test_what_is_drawn_must_be_all_that_its_set_says():
-    class Growing(rj.Box):
-        def at(self, t):
-            return rj.Box(self.lower * (1 + t), self.upper * (1 + t))
-
     plant = rj.AffinePlant([[0.5]], [[1.0]], E=[[1.0]])
     net = rj.MLP.from_layers([([[0.0]], [0.0])])
     gusts = {"disturbance": rj.Box([-0.1], [0.1])}
     for name in ("disturbance", "noise"):
-        with pytest.raises(TypeError, match=f"ClosedLoop.{name} must not define 'at', as Growing"):
+        with pytest.raises(TypeError, match=f"{name} must have the at of Box, but Growing"):
             rj.ClosedLoop(plant, net, **{**gusts, name: Growing([-0.1], [0.1])})
+        rj.ClosedLoop(plant, net, **{**gusts, name: Cornered([[1.0], [-1.0]], [0.1, 0.1])})
 
 
-def test_a_derived_differential_equation_keeps_its_class_when_it_is_changed():
-    @pytree
-    class Pushed(rj.SampledPlant):
-        __init__ = rj.SampledPlant.__init__
+@pytree
+class Windy(rj.SampledPlant):
+    """A differential equation of a user's class, with a field of its own."""
 
-        def flow_at(self, t):
-            return super().flow_at(t)
+    wind: float = static(default=0.0)
 
-    plant = Pushed(lambda x, u: u - x, 1, 1, 0.1)
-    for each in (plant.replace(period=0.2), plant.shortened(0.5), plant.finer):
-        assert type(each) is Pushed
-    for change in ({"clock": True}, {"states": 2}, {"disturbances": 1}):
-        with pytest.raises(ValueError, match="cannot be replaced alone"):
+    def __init__(self, wind: float):
+        super().__init__(lambda x, u: u - x + wind, 1, 1, 0.1)
+        self._set(wind=wind)
+
+
+def test_a_derived_differential_equation_keeps_its_class_and_fields_when_it_is_changed():
+    plant = Windy(0.3)
+    changed = plant.replace(period=0.2), plant.shortened(0.5), plant.finer
+    assert all(type(each) is Windy and each.wind == 0.3 for each in changed)
+    assert [float(each.period) for each in changed] == [0.2, 0.05, 0.1]
+    assert changed[1].part == 0.5
+    assert changed[2].fewest > plant.fewest
+
+
+@pytest.mark.parametrize("change", [{"clock": True}, {"states": 2}, {"disturbances": 1}])
+def test_sizes_of_a_function_that_has_been_read_stay(change):
+    plants = [
+        rj.SampledPlant(lambda x, u: u - x, 1, 1, 0.1),
+        rj.NonlinearPlant(lambda x, u: u - x, 1, 1),
+        rj.Network(lambda x: -x, 1, 1),
+    ]
+    (name,) = change
+    own = {"clock": plants[:1], "states": plants[:2], "disturbances": plants[:2]}[name]
+    for plant in own:
+        with pytest.raises(ValueError, match="as f has been read with so many"):
             plant.replace(**change)
+    with pytest.raises(ValueError, match=r"Network.outputs must be 1"):
+        plants[2].replace(outputs=3)
 
 
-def test_a_derived_differential_equation_must_not_step_in_a_way_of_its_own():
+def test_a_plant_in_continuous_time_must_not_step_in_a_way_of_its_own():
     """Half of two flows of a period would be looked at in between samples, or none of a jump."""
 
+    def twice(self, x, u, t=0, unit=None, w=None):
+        return x
+
+    with pytest.raises(TypeError, match=r"Twice\.propagate must be that of AbstractSampledPlant"):
+        type("Twice", (rj.SampledPlant,), {"propagate": twice})
+    plant = rj.AffinePlant([[0.5]], [[1.0]])
+    kind = type("Always", (rj.AffinePlant,), {"continuous": True, "propagate": twice})
+    with pytest.raises(TypeError, match="must step by its flow alone, but Always"):
+        rj.ClosedLoop(kind(plant.A, plant.B), rj.MLP.from_layers([([[0.0]], [0.0])]))
+
+
+def test_inputs_of_a_users_plant_or_loop_are_not_made_late():
+    """Its own steps would be lost."""
+    net = rj.MLP.from_layers([([[0.0]], [0.0])])
+    with pytest.raises(TypeError, match=r"loop\.plant must be of a class of reachjax"):
+        rj.delayed(misread_loop())
+
     @pytree
-    class Twice(rj.SampledPlant):
-        __init__ = rj.SampledPlant.__init__
+    class Tired(rj.ClosedLoop):
+        @property
+        def varies(self):
+            return False
 
-        def propagate(self, x, u, t=0, unit=None, w=None):
-            return super().propagate(super().propagate(x, u, t, unit), u, t, unit)
+        def measured(self, x, t=0, unit=None, v=None):
+            return 0.5 * x
 
-    plant = Twice(lambda x, u: u - x, 1, 1, 0.1)
-    with pytest.raises(TypeError, match=r"Twice must not define 'propagate'.*in between samples"):
-        rj.ClosedLoop(plant, rj.MLP.from_layers([([[0.0]], [0.0])]))
+    with pytest.raises(TypeError, match="loop must be of a class of reachjax"):
+        rj.delayed(Tired(rj.AffinePlant([[0.5]], [[1.0]]), net))
 
 
 def test_a_trajectory_contradicts_what_forms_read_otherwise_than_intervals(monkeypatch):
-    """Also where what forms say of the trajectory is what they say of all."""
+    """Both enclose the trajectory of what they read: where they are apart, that is two loops."""
     loop, states = sound_loop(1.5), np.array([[0.8], [1.2], [1.8]])
     given = Scenario(states[0], None, None), states, 0
     assert not deviates(loop, *given)

@@ -143,8 +143,42 @@ def _is_line(W: np.ndarray, b: np.ndarray) -> bool:
     return W.size > 0 and W.size == max(W.shape) and len(b) in (1, W.size)
 
 
-SCALING = re.compile(r"mean|range|scal|minim|maxim|normali|(^|_)(min|max|std|mu|sigma)(_|$)", re.I)
-"""What variables are called by which tools scale what goes into a network, or comes out."""
+VARIABLES = (
+    ("W", "weights", "Weights"),
+    ("b", "bias", "biases", "Biases"),
+    ("act_fcns", "activation_fcns", "activations", "act_fns", "activation"),
+)
+"""What tools call the weights, biases and activations of all layers."""
+
+COUNTS = "layer_sizes", "layers", "sizes", "number_of_neurons", "number_of_layers"
+"""Variables with one number for each layer."""
+
+SCALING = re.compile(
+    r"(^|_)(means?|ranges?|scales?|scaling|minimum|maximum|normali[sz]ation)(_|$)", re.I
+)
+"""Words in the names of what scales numbers, by which single numbers are recognised."""
+
+
+def _require_unscaled(held: dict[str, Any], chain: Chain) -> None:
+    """Raise an error where a file may hold what scales inputs or outputs: it does not say how.
+
+    Raises:
+        ValueError: a variable has as many numbers as inputs, outputs or both, or is called so.
+    """
+    sizes = {*chain.sizes, sum(chain.sizes)} - {1}
+    found = [
+        name
+        for name, value in sorted(held.items())
+        if isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and name not in COUNTS
+        if not any(name in names for names in VARIABLES)
+        if value.size in sizes or SCALING.search(name)
+    ]
+    if found:
+        raise ValueError(
+            f"it also holds {', '.join(found)}, and does not say whether they scale inputs or "
+            "outputs: delete them from the file if they do not; if they do, scale in a function, "
+            "reachjax.Network(lambda x: ..., inputs, outputs)"
+        )
 
 
 def _matlab(content: bytes) -> Chain:
@@ -157,20 +191,8 @@ def _matlab(content: bytes) -> Chain:
             if twice:
                 raise ValueError(f"{', '.join(twice)} stand in it at two places")
             held |= value
-    scaling = sorted(name for name in held if SCALING.search(name))
-    if scaling:
-        raise ValueError(
-            f"it also holds {', '.join(scaling)}, and whether that scales inputs or outputs is not "
-            "said: write a file of W, b and act_fcns alone, and scale by reachjax.Network(f, ...)"
-        )
-    weights = _named(held, "W", "weights", "Weights")
-    biases = _named(held, "b", "bias", "biases", "Biases")
-    names = [
-        _known(name)
-        for name in _rows(
-            _named(held, "act_fcns", "activation_fcns", "activations", "act_fns", "activation")
-        )
-    ]
+    weights, biases, activations = (_named(held, *names) for names in VARIABLES)
+    names = [*map(_known, _rows(activations))]
     weights, biases = (_cells(each, len(names)) for each in (weights, biases))
     if len(weights) != len(biases) or len(names) != len(weights) or not names:
         counts = f"{len(weights)} weights, {len(biases)} biases and {len(names)} activations"
@@ -179,7 +201,9 @@ def _matlab(content: bytes) -> Chain:
         (_real(W, f"weights {k + 1}"), _vector(_real(b, f"bias {k + 1}"), f"bias {k + 1}"))
         for k, (W, b) in enumerate(zip(weights, biases, strict=True))
     ]
-    return Chain(_joined(pairs), tuple(names))
+    chain = Chain(_joined(pairs), tuple(names))
+    _require_unscaled(held, chain)
+    return chain
 
 
 def _named(held: dict[str, Any], *names: str) -> Any:

@@ -255,6 +255,25 @@ class Function:
         return self.parameters, (recorder, wanted)
 
 
+def require_own_sizes(made: Any, **said: int | None) -> None:
+    """Raise an error where what is made of a function is said to have other sizes than it has.
+
+    Args:
+        made: a plant or a network, whose function may have been read before.
+        said: the sizes that users give, by their names; None for those that they leave out.
+
+    Raises:
+        ValueError: one is another.
+    """
+    for name, size in said.items():
+        own = getattr(made, name)
+        if size is not None and size != own:
+            raise ValueError(
+                f"{type(made).__name__}.{name} must be {own}, as f has been read with so many, but "
+                f"{size!r} arrived: give f as a function to change that"
+            )
+
+
 def with_constants(tree: Any) -> Any:
     """A tree in which functions have computed what depends on their parameters alone.
 

@@ -99,8 +99,12 @@ class Limits(AbstractNumber):
     def __rmul__(self, factor: Any) -> Limits:
         return self * factor
 
+    @np.errstate(invalid="ignore", over="ignore")
     def nearly_times(self, factor: Any) -> Limits:
-        """Products with numbers that factors are near, which even powers of two are not."""
+        """The products with numbers that these factors are off by a few roundings.
+
+        Those with powers of two are rounded too.
+        """
         found = factor * self
         sizes = (gamma(3) * abs(end) + TINY * (end != 0) for end in (found.least, found.most))
         return self._outward(found.least, found.most, *sizes)

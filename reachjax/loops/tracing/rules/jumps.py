@@ -517,7 +517,10 @@ def _remainder(recorder: Recorder, equation: Equation, operands: Sequence[Operan
     """`y - d trunc(y / d)`."""
     value, divisor = operands
     if not isinstance(value, Value) or not is_plain(divisor) or not _is_float(equation):
-        raise UnsupportedError("what it divides by must be a plain number")
+        raise UnsupportedError(
+            "it takes the remainder by a number that depends on inputs, or of whole numbers: use "
+            "y - d * jnp.floor(y / d) of real numbers"
+        )
     value, divisor = (shaped(recorder, each, equation.shape) for each in operands)
     quotient = recorder.divided(value, divisor)
     ends = _range(recorder, quotient)

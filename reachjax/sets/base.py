@@ -582,12 +582,13 @@ def _support(
     chosen = jnp.where(directions > 0, upper, lower)
     (D, powers), (ends, others) = _normalised(directions), _normalised(chosen)
     terms, logs = D * ends, powers + others
-    by = jnp.max(jnp.where(terms != 0, logs, -LOWEST), axis=1)
+    some = terms != 0  # also what becomes zero beside the largest one
+    by = jnp.max(jnp.where(some, logs, -LOWEST), axis=1)
     by = jnp.where(by > -LOWEST, by, 0)
     terms = shifted(terms, logs - by[:, None])
     # products of powers of two are exact, and where there is one term nothing is added
-    rounded = (terms != 0) & (abs(D) != 1) & (abs(ends) != 1)
-    inexact = jnp.any(rounded, axis=1) | (jnp.sum(terms != 0, axis=1) > 1)
+    rounded = some & (abs(D) != 1) & (abs(ends) != 1)
+    inexact = jnp.any(rounded, axis=1) | (jnp.sum(some, axis=1) > 1)
     rounding = gamma(len(lower)) * jnp.sum(abs(terms), axis=1) + len(lower) * TINY
     return raised(jnp.sum(terms, axis=1) + jnp.where(inexact, rounding, 0.0), by)
 

@@ -7,7 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from reachjax.numerics.checks import Numbers, is_concrete, require_double_precision, same_size
+from reachjax.numerics.checks import (
+    Numbers,
+    is_concrete,
+    require_double_precision,
+    require_exact,
+    same_size,
+)
 from reachjax.numerics.pytrees import converted, pytree
 from reachjax.sets import hulls, supports
 from reachjax.sets.base import Box, PolyhedralSet
@@ -58,13 +64,20 @@ class Polytope(PolyhedralSet):
             upper: `(n,)`; infinity where there is none.
 
         Raises:
-            ValueError: sizes differ, an entry is NaN, `lower > upper` in a coordinate, an infinite
-                side leaves no point, or no side is finite.
+            TypeError: an entry is no real number.
+            ValueError: float64 does not hold an entry, sizes differ, an entry is NaN,
+                `lower > upper` in a coordinate, an infinite side leaves no point, or no side is
+                finite.
 
         Example:
             >>> Polytope.between([0.0, -np.inf], [1.0, np.inf]).contains([0.5, 1e9]).item()
             True
         """
+        for name, end in (("lower", lower), ("upper", upper)):
+            try:
+                require_exact(end, name)
+            except TypeError as error:
+                raise TypeError(f"{name} must be real numbers, but {error}") from None
         ends = [np.asarray(each, float) for each in (lower, upper)]
         if ends[0].ndim != 1 or ends[0].shape != ends[1].shape:
             raise ValueError(

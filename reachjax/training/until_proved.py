@@ -187,10 +187,9 @@ def train(
         X0: the box of initial states.
         horizon: the number of steps.
         task_loss: of a loop and initial states `(b, n_x)` one number, in functions of JAX.
-        goal: as of `decide`; of a loop in continuous time, what is required is meant at all times
-            as there.
-        safe: as of `decide`.
-        avoid: as of `decide`.
+        goal: as of `decide`, at the horizon or at the times that it names.
+        safe: as of `decide`; of a loop in continuous time it is meant at all times.
+        avoid: the same.
         optimizer: of optax, for the list of the controller's arrays; None for Adam with a rate of
             1e-3. Steps without a finite gradient are skipped.
         stages: what is lowered beside the task's loss, one after the other.

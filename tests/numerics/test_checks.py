@@ -111,6 +111,8 @@ def test_a_number_that_float64_does_not_hold_is_refused_and_named(value, message
         pytest.skip("a longdouble is a float64 here")
     with pytest.raises(ValueError, match=rf"Box\.lower must hold numbers of float64.*{message}"):
         rj.Box(value, value)
+    with pytest.raises(ValueError, match=rf"upper must hold numbers of float64.*{message}"):
+        rj.Polytope.between([-np.inf] * np.size(value), value)
 
 
 HELD = {
@@ -139,6 +141,12 @@ def test_a_number_that_float64_holds_is_taken_as_it_is(value, expected):
 def test_text_is_no_number(value):
     with pytest.raises(TypeError, match=r"Box\.lower must be an array .* arrived: .*(text|<U|S1)"):
         rj.Box(value, [1.0])
+
+
+def test_sides_of_a_polytope_are_real_numbers():
+    for value, said in ((["1.5"], "it is text"), (np.array([1j]), "complex")):
+        with pytest.raises(TypeError, match=f"lower must be real numbers, but .*{said}"):
+            rj.Polytope.between(value, [np.inf])
 
 
 def test_dates_and_ragged_lists_are_no_numbers():

@@ -153,6 +153,15 @@ def test_supports_are_upper_bounds_whatever_underflows_or_overflows():
         assert float(value) <= float(exact) * (1 + 1e-12) + 1e-307
 
 
+def test_a_term_that_is_lost_beside_another_is_rounded_up():
+    """The largest one is exact, and the other by more than all powers of two smaller."""
+    box = rj.Box([0.0, 0.0], [2.0**300, 2.0**-800])
+    (value,) = np.asarray(box.support([[1.0, 1.0]]))
+    assert Fraction(2**300) + Fraction(2.0**-800) <= Fraction(float(value))
+    assert value <= 2.0**300 * (1 + 1e-12)
+    assert float(box.support([[1.0, 0.0]])[0]) == 2.0**300
+
+
 def test_a_point_beside_a_set_by_less_than_products_can_tell_is_not_in_it():
     region = rj.Polytope([[1e-170, 0.0]], [0.0])
     assert not region.surely_contains([1e-170, 0.0])

@@ -247,3 +247,12 @@ def test_no_state_of_a_polynomial_is_outside_in_exact_arithmetic():
                 for k, i in np.ndindex(most.shape)
             ]
             assert all(held), seed
+
+
+@pytest.mark.parametrize("factor", [2.0, -0.5, 0.3])
+def test_limits_of_products_with_rounded_factors_hold_those_with_what_was_rounded(factor):
+    """Also of powers of two, products with which are exact where the factor is."""
+    x, off = 1.7, Fraction(3, 2**53)
+    found = Limits(np.array([x]), np.array([x])).nearly_times(factor)
+    for true in (Fraction(factor) * (1 - off), Fraction(factor) * (1 + off)):
+        assert Fraction(found.least[0]) <= true * Fraction(x) <= Fraction(found.most[0])

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from reachjax.loops.units import AtUnit, Constraint, Disturbance, evaluate
 from reachjax.numerics.checks import within_time_axis
-from reachjax.numerics.rounding import Ball, counting, gamma, namespace
+from reachjax.numerics.rounding import Ball, counting, gamma, namespace, settled
 from reachjax.sets import AbstractSet
 
 EDGES = 16
@@ -104,7 +104,7 @@ def _settled(W: AbstractSet, *parts: Any) -> Any:
     """One rounding of numbers for all that is made of them; on the host if the set is there."""
     if namespace(*jax.tree.leaves(W)) is np:
         return jax.device_get(parts)
-    return jax.lax.optimization_barrier(parts)
+    return settled(parts)
 
 
 def touching(n: int) -> Float[np.ndarray, "r n"]:

@@ -341,7 +341,7 @@ def _smooth(
     own, rest = start.norms(rows[:, :w]), y.rest(w) + y.off
     model = unit.quadratic(lower, upper, line)
     lost = abs(model.curvature) * (2 * own + rest) * rest
-    better = model.gap + lost <= line.gap
+    better = settled(model.gap + lost <= line.gap)  # one choice, whoever uses it
     model = Quadratic(*(select(better, *pair) for pair in zip(model, line, strict=True)))
     lost = select(better, lost, 0.0)
     model, lost, own, rest, values = settled((model, lost, own, rest, values))
@@ -394,7 +394,7 @@ def _bilinear(
     lost = start.mixed_norms(one, other) + S * r_other + S_other * r + R * R_other
     lost = lost + errors(lambda: gamma(w + 8) * (S * R_other + S_other * R))
     lost = lost * (1 + gamma((w + 1) * size + 16))  # compiled, all is one sum
-    better = lost <= gap
+    better = settled(lost <= gap)  # one choice, whoever uses it
     slope = select(xp.concatenate([better, better]), unit.derivative(center), planes)
     offset = folded(select(better, -(center[:half] * center[half:]), offset), count)
     slope, offset = settled((slope, offset))

@@ -27,7 +27,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units import Facts
 from reachjax.numerics.pytrees import Replaceable, pytree, static
-from reachjax.numerics.rounding import Ball
+from reachjax.numerics.rounding import Ball, settled
 from reachjax.programs.basis import Rows, columns, loop_rows, picking
 from reachjax.programs.bounds import LoopBounds, loop_bounds
 from reachjax.programs.lmi import Origin, Program
@@ -50,7 +50,7 @@ def scaled_states(box: Box, ball: Ellipsoid | None) -> Float[Array, "n_x+1 n_x+1
     T = jnp.diag(jnp.append(around.rad, 1.0)).at[:-1, -1].set(around.mid)
     if ball is not None:
         T = T.at[:n, :n].set(ball.from_ball()).at[:n, -1].set(ball.center)
-    return jax.lax.optimization_barrier(T)
+    return settled(T)
 
 
 def scaled_units(
@@ -68,7 +68,7 @@ def scaled_units(
     mid, rad = _ranges(bounds, prune)
     T = T.at[:, -1].add(mid @ here) + jnp.diag(rad @ here)
     # one rounding of it for all rows, whatever the compiler fuses
-    return jax.lax.optimization_barrier(T)
+    return settled(T)
 
 
 def _ranges(bounds: LoopBounds, prune: bool) -> tuple[Float[Array, " k"], Float[Array, " k"]]:

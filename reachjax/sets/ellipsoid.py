@@ -25,6 +25,7 @@ from reachjax.numerics.checks import (
     whole_number,
 )
 from reachjax.numerics.pytrees import converted, pytree
+from reachjax.numerics.rounding import settled
 from reachjax.sets import outlines, outward
 from reachjax.sets.base import Box, Matrix, NormalForm, RoundSet, Vector
 
@@ -113,7 +114,7 @@ class Ellipsoid(RoundSet):
         inverse = jnp.linalg.inv(A)
         q, Q = -inverse @ b, inverse @ inverse.T
         # one rounding of both, whatever the compiler fuses: it is these that are proved
-        q, Q = jax.lax.optimization_barrier((q, (Q + Q.T) / 2))
+        q, Q = settled((q, (Q + Q.T) / 2))
         return cls(q, Q * outward.inflation(A, b, q, Q, jnp.asarray(level)))
 
     def from_ball(self) -> Float[Array, "n n"]:

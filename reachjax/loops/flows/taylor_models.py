@@ -278,7 +278,7 @@ class TaylorModels(AbstractNumber):
         Raises:
             UnboundedError: known inputs leave the domain.
         """
-        xp, (lower, upper) = namespace(self.rows), self.ends()
+        xp, (lower, upper) = namespace(self.rows), settled(self.ends())
         if not unit.curved:
             return self._bent(unit, lower, upper)
         unit = cast(SmoothUnit, unit)
@@ -289,7 +289,7 @@ class TaylorModels(AbstractNumber):
             return (line.slope * off + line.offset).widened(line.gap)
         model, square = unit.quadratic(lower, upper, line), off.times(off)
         # both are about the middle of the inputs
-        better = model.gap + abs(model.curvature) * square.radii <= line.gap
+        better = settled(model.gap + abs(model.curvature) * square.radii <= line.gap)
         parts = zip(model[1:], line[1:], strict=True)
         offset, slope, curvature, gap = (xp.where(better, *pair) for pair in parts)
         return (curvature * square + slope * off + offset).widened(gap)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from reachjax.loops.units.active_sets import ActiveSets, Cases, Normals, active_sets
 from reachjax.loops.units.base import AbstractUnit, AtUnit, Block, Facts, Line, Lines, Mark
 from reachjax.loops.units.piecewise import PRODUCTS, ZERO
-from reachjax.numerics.rounding import namespace, smaller
+from reachjax.numerics.rounding import namespace, settled, smaller
 
 ROUNDED = 1e-14
 """Multipliers and slacks that are no more negative than this, in parts of excesses, are not."""
@@ -93,9 +93,9 @@ class ProjectionSlack(AbstractUnit):
         width, steepest = upper - lower, 1 / self._sets.gram.diagonal()
         chord = smaller(most / xp.where(width > 0, width, 1.0), steepest)
         low, high = cases.rest(chord)
-        better = high - low < most - least
+        better = settled(high - low < most - least)
         under, _ = cases.rest(steepest + 0 * chord)
-        rising = steepest * (lower + upper) / 2 + under > least
+        rising = settled(steepest * (lower + upper) / 2 + under > least)
         none = cases.never
         above = Line(xp.where(better, chord, 0.0), xp.where(better, high, most))
         below = Line(xp.where(rising, steepest, 0.0), xp.where(rising, under, least))

@@ -359,7 +359,7 @@ class SmoothUnit(AbstractUnit):
         if not is_counted():
             return Quadratic(middle, offset, slope, curvature, select(wide, between, math.inf))
         gap = settled((between + 2 * off()) * (1 + gamma(4)))
-        better = wide & (gap < linear.gap)
+        better = settled(wide & (gap < linear.gap))
         curved = Quadratic(middle, offset, slope, curvature, gap)
         chosen = settled([select(better, *pair) for pair in zip(curved, linear, strict=True)])
         known = reduce(lambda a, b: a & b, (abs(each) < math.inf for each in chosen))

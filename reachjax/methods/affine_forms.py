@@ -29,6 +29,7 @@ from reachjax.methods.steps import boxed, overflow
 from reachjax.numerics.checks import is_concrete
 from reachjax.numerics.derivatives import moved_by
 from reachjax.numerics.host import in_numpy
+from reachjax.numerics.rounding import namespace
 from reachjax.programs.held import Attained, Facets, Source, held_bounds, sources
 from reachjax.programs.horizon import Horizon
 from reachjax.programs.moving import HeldBounds, Moving, moving
@@ -296,13 +297,14 @@ class AffineForms(AbstractMethod):
             steps = _at_once(unrolled_at_once(*given, start))
         for k, (step, seconds) in enumerate(steps, start=1):
             shaped, facets = problem.facets.at(k), len(problem.facets)
+            bounded = abs(step.offsets) < np.inf
             proof = LinearCertificate(
                 loop=loop,
                 X0=held,
                 directions=shaped.directions,
                 slopes=step.slopes,
                 corners=step.corners,
-                codes=jnp.where(jnp.isfinite(step.offsets), *ENDS),
+                codes=namespace(bounded).where(bounded, *ENDS),
                 bounds=step.offsets,
                 witnesses=np.full(facets, np.nan),
                 witness_states=np.full((facets, 0), np.nan),

@@ -164,7 +164,7 @@ def ways(
         given = {
             "t": t + k,
             "before": k,
-            "slopes": None if slopes is None else np.asarray(slopes[k]),
+            "slopes": None if slopes is None else slopes[k],
             "known": None if known is None else known[k],
         }
         after: list[Way] = []

@@ -176,12 +176,13 @@ def along_ways(
 
     At least one way is given, which says minus infinity should there be no states at all.
     """
-    loop, X0, box, known = map(in_numpy, (loop, X0, box, known))
+    loop, X0, box, directions = map(in_numpy, (loop, X0, box, directions))
+    slopes, known = map(in_numpy, (slopes, known))
     with np.errstate(all="ignore"):  # what overflows ends as infinity or NaN, which is no bound
         start = InitialColumns.of(X0, box, loop.curved)
     given = loop, start, len(directions), t, most, bool(np.any(between)), slopes, known
     for k, found in enumerate(ways(*given)):
-        rows = np.asarray(directions[k])
+        rows = directions[k]
         enough = np.full(len(rows), -np.inf) if wanted is None else wanted[k]
         each = list[ByForms]()
         for way in found:

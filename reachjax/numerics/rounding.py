@@ -185,9 +185,10 @@ def _filled(number: Any, shape: tuple[int, ...], kind: Any) -> Any:
 def settled(parts: Any) -> Any:
     """One rounding of numbers for all that is made of them, whatever a compiler fuses.
 
-    They define what a column stands for, which must be the same wherever it is. On a CPU XLA drops
-    barriers before it fuses, and computes what is behind them again for each of its uses: for each
-    entry of a row, where the row is concatenated. A call that it must not inline is kept.
+    They define what a column stands for, which must be the same wherever it is; a comparison of
+    them chooses between relaxations, whose slope and offset must be those of one. On a CPU XLA
+    drops barriers before it fuses, and computes what is behind them again for each of its uses: for
+    each entry of a row, where the row is concatenated. A call that it must not inline is kept.
     """
     if namespace(*jax.tree.leaves(parts)) is np:
         return parts

@@ -263,7 +263,7 @@ def step_forms(
         ends = met(ends, (known.lower, known.upper))
     if ranges is not None:
         ends = ranges(None, successor, ends, found)
-    return StepForms(successor.within(Ball.between(*ends)), tuple(found), tuple(merged))
+    return StepForms(successor.within(Ball.between(*settled(ends))), tuple(found), tuple(merged))
 
 
 def _is_lost(line: Quadratic, ends: Ends) -> bool:
@@ -341,7 +341,7 @@ def _smooth(
     own, rest = start.norms(rows[:, :w]), y.rest(w) + y.off
     model = unit.quadratic(lower, upper, line)
     lost = abs(model.curvature) * (2 * own + rest) * rest
-    better = settled(model.gap + lost <= line.gap)  # one choice, whoever uses it
+    better = settled(model.gap + lost <= line.gap)
     model = Quadratic(*(select(better, *pair) for pair in zip(model, line, strict=True)))
     lost = select(better, lost, 0.0)
     model, lost, own, rest, values = settled((model, lost, own, rest, values))
@@ -394,7 +394,7 @@ def _bilinear(
     lost = start.mixed_norms(one, other) + S * r_other + S_other * r + R * R_other
     lost = lost + errors(lambda: gamma(w + 8) * (S * R_other + S_other * R))
     lost = lost * (1 + gamma((w + 1) * size + 16))  # compiled, all is one sum
-    better = settled(lost <= gap)  # one choice, whoever uses it
+    better = settled(lost <= gap)
     slope = select(xp.concatenate([better, better]), unit.derivative(center), planes)
     offset = folded(select(better, -(center[:half] * center[half:]), offset), count)
     slope, offset = settled((slope, offset))
@@ -427,17 +427,17 @@ def _unit(
     xp, (lower, upper) = namespace(y.rows), ends
     with rounding(True):  # it is little that these count, and said in many ways
         if slope is None:
-            slope = unit.lines(lower, upper).above.slope
+            slope = settled(unit.lines(lower, upper).above.slope)
         rest, values = (
             Ball.between(*ends)
             for ends in (unit.remainder(slope, lower, upper), unit.interval(lower, upper))
         )
-    slope, offset, gap = settled((slope, rest.mid, rest.rad))
+    offset, gap = settled((rest.mid, rest.rad))
     left = NOTHING if not is_counted() else xp.zeros_like(gap)
     rows = slope[:, None] * y.rows
     constants = xp.stack([rows[:, 0] + offset, values.mid], axis=1)
     if not unit.separable and is_counted():  # what rounding alone leaves of a value is no column
-        small = gap <= SPILL * abs(y.columns).max(axis=1, initial=0.0)
+        small = settled(gap <= SPILL * abs(y.columns).max(axis=1, initial=0.0))
         left, gap = select(small, gap, 0.0), select(small, 0.0, gap)
 
     def size() -> Any:  # products with 0 and 1 are exact

@@ -24,7 +24,7 @@ from reachjax.loops.units import AbstractUnit, Block, Facts, Line, Lines, Mark
 from reachjax.numerics.checks import require_double_precision, require_kind
 from reachjax.numerics.flags import lenient
 from reachjax.numerics.pytrees import pytree
-from reachjax.numerics.rounding import Ball
+from reachjax.numerics.rounding import Ball, settled
 from reachjax.programs.bounds import LoopBounds
 from reachjax.sets import Box
 
@@ -136,7 +136,7 @@ def loop_rows(
             line = Rows.exact(kept.mid.at[:, -1].add(offset)) + unit.combined(slope * y)
             z = line.widened(bounds.excess[here])
         interval = bounds.preactivation[of_inputs]
-        stated = unit.facts(y, z, interval.lower, interval.upper)
+        stated = unit.facts(y, z, *settled((interval.lower, interval.upper)))
         telling = interval.rad > STEADY * abs(interval.mid)
         telling = unit.combined(1.0 * ~telling) == 0
         facts.setdefault(unit, []).append(stated.map(partial(_said, gone=gone, telling=telling)))
@@ -156,7 +156,7 @@ def _said(block: Block, gone: Bool[Array, " k"], telling: Bool[Array, " k"]) -> 
     rounding alone may have left something of a fact of a unit that has left the basis.
     """
     rows = block.rows
-    empty = gone & jnp.all(abs(rows.mid) <= rows.rad, axis=1)
+    empty = settled(gone & jnp.all(abs(rows.mid) <= rows.rad, axis=1))
     return rows.where(~empty & telling if block.mark is Mark.BOUND else ~empty)
 
 

@@ -6,6 +6,7 @@ unit that these bounds call affine is affine.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -18,7 +19,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.units import AbstractUnit, Line, Lines
 from reachjax.numerics.host import in_numpy
 from reachjax.numerics.pytrees import pytree, unchecked
-from reachjax.numerics.rounding import TINY, Ball, gamma
+from reachjax.numerics.rounding import TINY, Ball, gamma, settled
 from reachjax.sets import Box
 
 MARGINAL = 1e-9
@@ -77,8 +78,8 @@ def loop_bounds(
             also = known[done : done + len(y.mid)]
             lower = jnp.maximum(y.lower, also.lower)
             y = Ball.between(lower, jnp.maximum(lower, jnp.minimum(y.upper, also.upper)))
-        y, z = _image(unit, y)
-        lines = unit.lines(y.lower, y.upper)
+        y, (lower, upper), z = _image(unit, y)
+        lines = settled(unit.lines(lower, upper))
         constant = lines.affine & (unit.combined(abs(lines.above.slope)) == 0)
         mid = jnp.where(constant, lines.above.offset, z.mid)
         z = Ball(mid, jnp.where(constant, 0.0, z.rad))
@@ -94,16 +95,17 @@ def loop_bounds(
     return LoopBounds(state, y, z, lines, affine, excess, successor)
 
 
-def _image(unit: AbstractUnit, y: Ball) -> tuple[Ball, Ball]:
-    """What inputs may be, and what a unit makes of them.
+def _image(unit: AbstractUnit, y: Ball) -> tuple[Ball, Sequence[Array], Ball]:
+    """What inputs may be, their ends, and what a unit makes of them.
 
     Ends of inputs may be rounded differently where the midpoint and the radius are formed.
     """
     rounding = gamma(8) * (abs(y.mid) + y.rad)
     if not unit.nonexpansive:
         y = Ball(y.mid, y.rad + 2 * rounding)
-    z = Ball.between(*unit.interval(y.lower, y.upper))
-    return y, Ball(z.mid, z.rad + rounding) if unit.nonexpansive else z
+    y, *ends = settled((y, y.lower, y.upper))
+    z = Ball.between(*settled(unit.interval(*ends)))
+    return y, ends, Ball(z.mid, z.rad + rounding) if unit.nonexpansive else z
 
 
 def _value(doubt: float, unit: AbstractUnit, *given: Ball) -> Ball:
@@ -111,7 +113,7 @@ def _value(doubt: float, unit: AbstractUnit, *given: Ball) -> Ball:
     y = Ball.joined(given)
     if doubt and unit.jumps:
         y = Ball(y.mid, y.rad + doubt * (y.rad + gamma(1) * abs(y.mid)) + TINY)
-    return _image(unit, y)[1]
+    return _image(unit, y)[2]
 
 
 def _settled(unit: AbstractUnit, y: Ball, z: Ball, lines: Lines) -> tuple[Lines, Array, Array]:
@@ -126,8 +128,9 @@ def _settled(unit: AbstractUnit, y: Ball, z: Ball, lines: Lines) -> tuple[Lines,
     if not (unit.separable and unit.nonexpansive):
         return lines, lines.affine, jnp.zeros_like(z.mid)
     spare, surely = MARGINAL * (abs(y.mid) + y.rad), lines.affine
-    from_above = unit.lines(y.lower + spare, jnp.maximum(y.upper, y.lower + spare))
-    from_below = unit.lines(jnp.minimum(y.lower, y.upper - spare), y.upper - spare)
+    least, most = settled((y.lower + spare, y.upper - spare))
+    from_above = settled(unit.lines(least, jnp.maximum(y.upper, least)))
+    from_below = settled(unit.lines(jnp.minimum(y.lower, most), most))
     affine, line = surely, lines.above
     for near in (from_above, from_below):
         line = _chosen(affine, line, near.above)

@@ -18,7 +18,7 @@ from reachjax.loops.flows.flow import AbstractFlow
 from reachjax.loops.flows.taylor_models import Symbols, TaylorModels
 from reachjax.loops.flows.taylor_models import joined as together
 from reachjax.numerics.numbers import split
-from reachjax.numerics.rounding import Ball, gamma, larger, namespace
+from reachjax.numerics.rounding import Ball, gamma, larger, namespace, settled
 from reachjax.programs.affine import AffineForms, joined
 from reachjax.programs.initial import InitialColumns
 
@@ -142,7 +142,7 @@ def flowed_forms(
     """
     forms = joined(given)
     cut = start.cut is not None and not start.cut.needs_programs
-    box = Ball.between(*given[0].ends(start, cut))
+    box = Ball.between(*settled(given[0].ends(start, cut)))
     symbols, models = _condensed(forms, [len(each) for each in given], start)
     found = flow.followed(models, box, between)
     states = [found.state, *(point for each in found.controls for point in each.points)]

@@ -22,7 +22,7 @@ from reachjax.loops import ClosedLoop
 from reachjax.loops.closed_loop import UnitLayer
 from reachjax.loops.tracing.functions import Compiled
 from reachjax.loops.units import AbstractUnit, Line
-from reachjax.numerics.rounding import Ball, gamma
+from reachjax.numerics.rounding import Ball, gamma, settled
 from reachjax.programs.basis import Rows, columns, loop_rows
 from reachjax.programs.bounds import LoopBounds, loop_bounds
 from reachjax.sets import AbstractSet, Box
@@ -80,7 +80,8 @@ def bounds_over(
 def _meet(one: Ball, other: Ball) -> Ball:
     """What both hold, entry by entry."""
     lower = jnp.maximum(one.lower, other.lower)
-    return Ball.between(lower, jnp.maximum(lower, jnp.minimum(one.upper, other.upper)))
+    upper = jnp.maximum(lower, jnp.minimum(one.upper, other.upper))
+    return Ball.between(*settled((lower, upper)))
 
 
 def _ranges(rows: Rows, X: AbstractSet, bounds: LoopBounds, layers: tuple[UnitLayer, ...]) -> Ball:

@@ -67,7 +67,6 @@ def scaled_units(
     here = picking(places, len(T)).mid
     mid, rad = _ranges(bounds, prune)
     T = T.at[:, -1].add(mid @ here) + jnp.diag(rad @ here)
-    # one rounding of it for all rows, whatever the compiler fuses
     return settled(T)
 
 

@@ -195,3 +195,18 @@ def test_compiled_ranges_narrower_than_all_normal_numbers_are_held():
     mid, rad = np.asarray(mid), np.asarray(rad)
     assert np.all((mid - rad <= lower) & (upper <= mid + rad))
     assert rad[2] == 0.0
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="other compilers keep barriers")
+def test_what_is_settled_is_chosen_once_for_all_its_uses():
+    x = jnp.arange(1.0, 4.0) / 3
+
+    def chosen(x):
+        better = settled(x * x + 1.0 <= 2.0 * x + 0.1)
+        return jnp.where(better, x, 1.0), jnp.where(better, x * x, 0.0)
+
+    compiled = jax.jit(chosen).lower(x).compile()
+    assert compiled.as_text().count(" call(") == 1
+    slopes = jax.grad(lambda x: sum(part.sum() for part in chosen(x)))(x)
+    np.testing.assert_allclose(slopes, np.where(x == 1, 1 + 2 * x, 0.0))
+    np.testing.assert_array_equal(jax.vmap(chosen)(x)[0], compiled(x)[0])

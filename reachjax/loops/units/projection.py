@@ -89,14 +89,13 @@ class ProjectionSlack(AbstractUnit):
     def lines(self, lower: Array, upper: Array) -> Lines:
         """Zero of a facet that surely is inactive; else the better of a chord and a constant."""
         xp, cases = namespace(lower, upper), self._cases(lower, upper)
-        least, most = cases.interval
+        (least, most), none = settled((cases.interval, cases.never))
         width, steepest = upper - lower, 1 / self._sets.gram.diagonal()
-        chord = smaller(most / xp.where(width > 0, width, 1.0), steepest)
+        chord = settled(smaller(most / xp.where(width > 0, width, 1.0), steepest))
         low, high = cases.rest(chord)
         better = settled(high - low < most - least)
         under, _ = cases.rest(steepest + 0 * chord)
         rising = settled(steepest * (lower + upper) / 2 + under > least)
-        none = cases.never
         above = Line(xp.where(better, chord, 0.0), xp.where(better, high, most))
         below = Line(xp.where(rising, steepest, 0.0), xp.where(rising, under, least))
         return Lines(

@@ -78,12 +78,12 @@ def loop_bounds(
             also = known[done : done + len(y.mid)]
             lower = jnp.maximum(y.lower, also.lower)
             y = Ball.between(lower, jnp.maximum(lower, jnp.minimum(y.upper, also.upper)))
-        y, (lower, upper), z = _image(unit, y)
-        lines = settled(unit.lines(lower, upper))
+        y, ends, z = _image(unit, y)
+        lines = settled(unit.lines(*ends))
         constant = lines.affine & (unit.combined(abs(lines.above.slope)) == 0)
         mid = jnp.where(constant, lines.above.offset, z.mid)
         z = Ball(mid, jnp.where(constant, 0.0, z.rad))
-        units.append((y, z, *_settled(unit, y, z, lines)))
+        units.append((y, z, *_affine_units(unit, y, ends, z, lines)))
         return z
 
     state = Ball.between(box.lower, box.upper)
@@ -98,12 +98,13 @@ def loop_bounds(
 def _image(unit: AbstractUnit, y: Ball) -> tuple[Ball, Sequence[Array], Ball]:
     """What inputs may be, their ends, and what a unit makes of them.
 
-    Ends of inputs may be rounded differently where the midpoint and the radius are formed.
+    What inputs were made of may be rounded differently where each of their parts was formed.
     """
     rounding = gamma(8) * (abs(y.mid) + y.rad)
     if not unit.nonexpansive:
         y = Ball(y.mid, y.rad + 2 * rounding)
-    y, *ends = settled((y, y.lower, y.upper))
+    y = settled(y)
+    ends = settled((y.lower, y.upper))
     z = Ball.between(*settled(unit.interval(*ends)))
     return y, ends, Ball(z.mid, z.rad + rounding) if unit.nonexpansive else z
 
@@ -116,7 +117,9 @@ def _value(doubt: float, unit: AbstractUnit, *given: Ball) -> Ball:
     return _image(unit, y)[2]
 
 
-def _settled(unit: AbstractUnit, y: Ball, z: Ball, lines: Lines) -> tuple[Lines, Array, Array]:
+def _affine_units(
+    unit: AbstractUnit, y: Ball, ends: Sequence[Array], z: Ball, lines: Lines
+) -> tuple[Lines, Array, Array]:
     """Lines, which units are affine, and by how much the lines of these may be off.
 
     Affine is also a unit that would be if its inputs ended next to nothing sooner, below or above.
@@ -127,10 +130,10 @@ def _settled(unit: AbstractUnit, y: Ball, z: Ball, lines: Lines) -> tuple[Lines,
     """
     if not (unit.separable and unit.nonexpansive):
         return lines, lines.affine, jnp.zeros_like(z.mid)
-    spare, surely = MARGINAL * (abs(y.mid) + y.rad), lines.affine
-    least, most = settled((y.lower + spare, y.upper - spare))
-    from_above = settled(unit.lines(least, jnp.maximum(y.upper, least)))
-    from_below = settled(unit.lines(jnp.minimum(y.lower, most), most))
+    spare, surely, (lower, upper) = MARGINAL * (abs(y.mid) + y.rad), lines.affine, ends
+    least, most = settled((lower + spare, upper - spare))
+    from_above = settled(unit.lines(least, jnp.maximum(upper, least)))
+    from_below = settled(unit.lines(jnp.minimum(lower, most), most))
     affine, line = surely, lines.above
     for near in (from_above, from_below):
         line = _chosen(affine, line, near.above)

@@ -349,6 +349,7 @@ def _highest(rows: Rows, pairs: tuple[np.ndarray, np.ndarray]) -> Any:
         linear = linear - smaller(taken(spare, number), least)
     q = taken(products, np.flatnonzero(~mixed))
     inside = (q < 0) & (linear < -4 * q)
+    inside = settled(inside) if is_counted() else inside
     depth = select(inside, -q, 1.0)
     alone = select(inside, linear * (linear / (8 * depth)) + depth, linear + q)
     return abs(taken(products, np.flatnonzero(mixed))).sum(axis=1) + alone.sum(axis=1)

@@ -15,7 +15,16 @@ import numpy as np
 from jaxtyping import Array
 
 from reachjax.loops.flows.series import Series, Tape
-from reachjax.numerics.rounding import TINY, Ball, constant, gamma, larger, namespace, smaller
+from reachjax.numerics.rounding import (
+    TINY,
+    Ball,
+    constant,
+    gamma,
+    larger,
+    namespace,
+    settled,
+    smaller,
+)
 
 TRIES = 12
 """Candidates on the host; a step that needs more of them is better halved."""
@@ -79,7 +88,7 @@ def enclosed(tape: Tape, X: Ball, others: list[Ball], h: Any) -> tuple[Ball, Arr
     def tried(_: int, carry: tuple[Ball, Array]) -> tuple[Ball, Array]:
         B, proved = carry
         found = image(B)
-        proved = proved | _holds(B, found)
+        proved = settled(proved | _holds(B, found))
         candidate = _inflated(X, found)
         parts = zip((found.mid, found.rad), (candidate.mid, candidate.rad), strict=True)
         return Ball(*(jax.numpy.where(proved, *pair) for pair in parts)), proved

@@ -46,6 +46,7 @@ from reachjax.numerics.rounding import (
     is_counted,
     larger,
     namespace,
+    settled,
     smaller,
 )
 
@@ -440,6 +441,6 @@ def _exponential_less_one(M: Float[Array | np.ndarray, "n n"]) -> Any:
         term = term @ M / k
         total = total + term
     norm = M.sum(axis=1).max() * (1 + gamma(len(M)))
-    small = norm < TERMS / 2
+    small = settled(norm < TERMS / 2)
     rest = xp.where(small, norm, 1.0) ** (TERMS + 1) / math.factorial(TERMS + 1) * 2
     return (total + xp.where(small, rest, xp.inf)) * (1 + gamma(TERMS * (len(M) + 4)))

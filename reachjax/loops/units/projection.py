@@ -89,7 +89,7 @@ class ProjectionSlack(AbstractUnit):
     def lines(self, lower: Array, upper: Array) -> Lines:
         """Zero of a facet that surely is inactive; else the better of a chord and a constant."""
         xp, cases = namespace(lower, upper), self._cases(lower, upper)
-        (least, most), none = settled((cases.interval, cases.never))
+        (least, most), none = settled(cases.interval), settled(cases.never)
         width, steepest = upper - lower, 1 / self._sets.gram.diagonal()
         chord = settled(smaller(most / xp.where(width > 0, width, 1.0), steepest))
         low, high = cases.rest(chord)
@@ -116,7 +116,7 @@ class ProjectionSlack(AbstractUnit):
         blocks = (
             Block(z, "output", Mark.SECTOR),
             Block(slack, "slack", Mark.SECTOR),
-            Block((-1.0 * cases.always) * slack, "active", Mark.SECTOR),
+            Block((-1.0 * settled(cases.always)) * slack, "active", Mark.SECTOR),
             Block(cases.interval[1] - z, "output cap", Mark.BOUND),
             Block(cases.largest_slack - slack, "slack cap", Mark.BOUND),
         )

@@ -335,7 +335,7 @@ class SmoothUnit(AbstractUnit):
         lower, upper, middle = (select(fine, y, 1.0) for y in (lower, upper, center))
         radius = larger(upper - middle, middle - lower) * (1 + gamma(2)) + TINY
         wide = fine & (radius > THIN * abs(middle))
-        wide = wide & (radius > SQUARES) & (radius < 1 / SQUARES)
+        wide = settled(wide & (radius > SQUARES) & (radius < 1 / SQUARES))
         radius = select(wide, radius, 1.0)
         step = math.sqrt(0.75) * radius
         away = select(wide, step, 0.0)

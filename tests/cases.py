@@ -341,13 +341,18 @@ SETS = {
 }
 """Initial sets of so many states, beside those of loops."""
 
-RANDOM = np.random.default_rng(0).normal(size=(5, 2))
-VARYING = np.stack([(1.0 + t) * RANDOM for t in range(HORIZON)])
+
+def oblique(n: int) -> np.ndarray:
+    """Random directions of so many states."""
+    return np.random.default_rng(0).normal(size=(5, n))
+
+
+VARYING = np.stack([(1.0 + t) * oblique(2) for t in range(HORIZON)])
 
 TEMPLATES: dict[str, Callable[[rj.ClosedLoop, rj.AbstractSet], rj.AbstractTemplate]] = {
     "axes": lambda loop, X0: rj.Template.box(loop.states),
     "octagonal": lambda loop, X0: rj.Template.octagonal(loop.states),
-    "random": lambda loop, X0: rj.Template(RANDOM),
+    "random": lambda loop, X0: rj.Template(oblique(loop.states)),
     "varying": lambda loop, X0: rj.Template(VARYING),
     "adapted": lambda loop, X0: rj.Template.adapted(loop, X0, HORIZON, 6, samples=300),
     "ellipsoids": lambda loop, X0: rj.EllipsoidTemplate(),
@@ -559,6 +564,13 @@ def _rows() -> Iterator[Case]:
         yield Case("inputs in a pentagon", method)
     for method in ("few programs", "cells of forms", "cells of branches", "cells of programs"):
         yield Case("pushed", method)
+    yield Case("relu", "paper", "ellipsoid", "mixed")
+    yield Case("one state", "paper, plain", "ellipsoid", "ellipsoids")
+    yield Case("disturbed", "paper", "own", "ellipsoids")
+    yield Case("disturbed in a polytope", "windows of two")
+    yield Case("leaky", "default", "ellipsoid")
+    yield Case("oscillator", "forms", "polytope")
+    yield Case("three states", "programs", "own", "random")
 
 
 CASES = tuple(dict.fromkeys(_rows()))
@@ -591,6 +603,7 @@ def each(
     rows: Iterable[Case] = CASES,
     basic: Iterable[Case] = BASIC,
     every: int = 1,
+    longest: pytest.MarkDecorator = pytest.mark.long,
 ) -> pytest.MarkDecorator:
     """The rows of which a law speaks.
 
@@ -599,13 +612,16 @@ def each(
         rows: out of these.
         basic: those that are taken wherever one case of each claim is.
         every: of laws that bound much anew, whose row is taken besides; a person runs the rest by
-            `-m long`, and those that take longest.
+            `-m long`.
+        longest: which mark those have that take longest.
     """
 
     def marks(case: Case, number: int) -> list[pytest.MarkDecorator]:
         if case in basic:
             return [pytest.mark.basic]
-        return [pytest.mark.long] * bool(number % every or case in LONGEST)
+        if number % every:
+            return [pytest.mark.long]
+        return [longest] * (case in LONGEST)
 
     chosen = filter(where, rows)
     found = [

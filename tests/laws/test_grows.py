@@ -14,7 +14,8 @@ def room(case, k):
     """What a bound may be larger by, of a facet at a time."""
     limits = np.asarray(case.tube.sets[k].limits)
     values = np.asarray(case.tube.sets[k].bounded_values(case.runs[:, k]))
-    return case.options.get("gap", GAP) * np.ptp(values, axis=0) + ACCURACY * (1 + abs(limits))
+    gap = 0.0 if case.by.grows else case.options.get("gap", GAP)  # programs search for nothing
+    return gap * np.ptp(values, axis=0) + ACCURACY * (1 + abs(limits))
 
 
 @each(

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 
 import reachjax as rj
+from reachjax.proofs.branches import Rung
 from reachjax.proofs.recheck import interval_offsets
 from tests.cases import HORIZON, ROUNDING, each
 
@@ -48,6 +49,11 @@ def test_a_proof_repeats_the_bounds_of_its_set(case):
         assert np.all(again <= bounds + 1e-9 * sizes)
         assert np.all(again >= least(proof)), "an unsound recheck, or a loose bound"
         assert len(proof.statuses) == len(bounds)
+        if isinstance(proof, rj.LinearCertificate):
+            np.testing.assert_array_equal(again, bounds)
+        elif isinstance(proof, rj.BranchCertificate) and case.of.plain is not None:
+            own = np.asarray(proof.rungs) < Rung.PRODUCTS
+            assert np.all(abs(again - bounds)[own] <= ROUNDING * sizes[own])
 
 
 @each()
@@ -62,15 +68,16 @@ def test_no_witness_exceeds_its_bound(case):
 @each()
 def test_witnesses_are_scenarios_of_the_loop_that_attain_their_values(case):
     tube, loop = case.tube, case.closed_loop
+    near = ROUNDING if case.of.plain is not None else 1e-9
     for k in range(1, HORIZON + 1):
         proof = tube.proof(k)
         states, w, v = loop.split(np.asarray(proof.witness_states))
         drawn = {"disturbances": (loop.disturbance, w), "noises": (loop.noise, v)}
         for X, points in ((tube.sets[0], states), *drawn.values()):
             if X is not None and X.steps is None:
-                assert np.all(X.contains(points, 1e-9))
+                assert np.all(X.contains(points, near))
         given = {name: points for name, (X, points) in drawn.items() if X is not None}
         steps = HORIZON if not given else next(iter(given.values())).shape[1]
         runs = loop.simulate(states, steps, case.of.start, **given)
         values = np.diag(tube.sets[k].bounded_values(runs[:, k]))
-        np.testing.assert_allclose(values, proof.witnesses, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(values, proof.witnesses, rtol=near, atol=1e-12)

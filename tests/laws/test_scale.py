@@ -13,6 +13,8 @@ UNITS = {
     "like ones": np.array([1e3, 1e3]),
     "unlike ones": np.array([1e4, 1e-3]),
     "far ones": np.array([1e-8, 1e6]),
+    "small ones": np.array([1e-10, 1e-10]),
+    "large ones": np.array([1e6, 1e6]),
 }
 """Factors of the two states."""
 

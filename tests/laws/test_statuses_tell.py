@@ -31,7 +31,8 @@ def test_a_gap_that_is_open_is_said(case):
 
 SOLVED = (
     *("relu", "leaky", "hard", "residual", "unlimited", "varying", "one state", "three states"),
-    *("six states", "inputs in a pentagon", "inputs in a cube", "tanh", "sigmoid", "traced"),
+    *("hard, one state", "leaky, six states", "residual, three states", "six states"),
+    *("inputs in a pentagon", "inputs in a cube", "tanh", "sigmoid", "traced"),
     *("sine", "sine, tanh", "oscillator", "oscillator, hard", "tank", "quotient"),
 )
 """Loops whose gaps phases and cells close."""
@@ -41,6 +42,7 @@ SOLVED = (
     rows=(
         *map(Case, SOLVED),
         *(Case("relu", "default", kind) for kind in ("polytope", "ellipsoid")),
+        *(Case("relu", "default", "own", each) for each in ("octagonal", "random")),
     )
 )
 def test_gaps_are_closed_by_default(case):
@@ -50,6 +52,17 @@ def test_gaps_are_closed_by_default(case):
         assert set(proof.statuses) == {rj.SolverStatus.SOLVED}
         room = HALF * case.options.get("gap", 1e-4) * ranges(case, k) + 1e-9
         assert np.all(np.asarray(proof.gaps) <= room)
+
+
+SWITCHING = "relu", "leaky", "hard", "residual", "varying"
+
+
+@each(rows=[Case(loop) for loop in SOLVED if loop in SWITCHING or "state" in loop])
+def test_what_is_closed_by_default_is_open_by_forms(case):
+    """Else units that switch would be said nothing of."""
+    forms = Case(case.loop, "forms").tube
+    pairs = zip(forms.sets[1:], case.tube.sets[1:], strict=True)
+    assert max(np.max(wide.limits - tight.limits) for wide, tight in pairs) > 1e-6
 
 
 @each(rows=[Case("car")])

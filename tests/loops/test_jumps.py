@@ -225,3 +225,10 @@ def test_switched_loops_are_simulated_alike_where_points_stand_for_one_another()
     for alone in (states[:1], states[:2]):  # one point, and branches that nobody takes
         few = trajectories(in_numpy(loop), alone, horizon=4)
         np.testing.assert_allclose(few, found[: len(alone)], rtol=1e-12, atol=1e-13)
+
+
+def test_a_jump_that_is_small_is_in_the_bounds():
+    net, near = network(lambda x: jnp.where(x > 0, x, x + 1e-14)), np.full(2, 1e-16)
+    low, high = interval(net, -near, near)
+    assert np.all(low <= near)
+    assert np.all(high >= 1e-14 - near)

@@ -72,6 +72,18 @@ def test_what_simulations_keep_a_distance_of_is_proved(name, cells, request):
     assert "proved, 0 refuted, 0 undecided" in str(verdict)
 
 
+@pytest.mark.parametrize("name", ["smooth", "rectified"])
+@pytest.mark.costly
+def test_what_is_broken_is_refuted_by_a_trajectory(name, request):
+    loop = request.getfixturevalue(name)
+    region = around(loop, X0, -1e-3)
+    verdict = rj.decide(loop, X0, HORIZON, safe=region, cells=20)
+    assert verdict.status is rj.VerdictStatus.REFUTED
+    states = verdict.counterexample.states
+    np.testing.assert_allclose(loop.simulate(states[0], HORIZON), states, atol=1e-9)
+    assert not region.contains(states[verdict.counterexample.time])
+
+
 @pytest.mark.costly
 def test_a_limit_leaves_cells_undecided_and_margins_that_say_so(smooth):
     region = around(smooth, X0, 1e-4)

@@ -32,6 +32,18 @@ def beyond(tube, states):
     return max(each)
 
 
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.costly
+def test_no_scenario_leaves_a_tube_by_forms_or_branches(n, kind):
+    V = disturbance_set(KINDS[(KINDS.index(kind) + n) % len(KINDS)], n, seed=3)
+    loop, X0 = disturbed_loop(n, disturbance_set(kind, n), V, seed=1), initial(n)
+    states, template = attacked(loop, X0, STEPS), rj.Template.octagonal(n)
+    for relaxation in (rj.LinearBounds(), rj.BranchAndCut()):  # a wide gap: no products
+        tube = rj.reach(loop, X0, STEPS, template, relaxation, samples=100, gap=0.5)
+        assert beyond(tube, states) < ROUNDING
+
+
 @pytest.mark.costly
 def test_time_varying_loops_from_a_later_time():
     W, n = disturbance_set("varying box", 2), 2

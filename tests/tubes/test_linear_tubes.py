@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import reachjax as rj
+from tests.activations import CONTROLLERS, controlled
 from tests.closed_loops import autonomous, closed_loop, initial_set, random_loop
 from tests.networks import directions
 
@@ -35,6 +36,21 @@ def test_plants_may_vary_in_time_without_an_input_box():
     tight = rj.reach(loop, given[0], HORIZON, given[1], start=START)
     for one, other in zip(tube.sets[1:], tight.sets[1:], strict=True):
         assert (one.b >= other.b - 1e-7).all()
+
+
+@pytest.mark.parametrize(("place", "n_x"), [(1, 1), (1, 3), (2, 3), (2, 6), (3, 1), (3, 6)])
+@pytest.mark.costly
+def test_no_trajectory_is_outside_in_oblique_directions(place, n_x):
+    """Controllers and states of which the table of the laws has no row."""
+    loop = controlled(**CONTROLLERS[place], n_x=n_x, seed=n_x).loop
+    assert_holds(tube_of(loop, initial_set("box", n_x, n_x), rj.Template(directions(n_x, 0, 3))))
+
+
+@pytest.mark.parametrize("kind", ["simplex", "ellipsoid", "intersection", "far intersection"])
+@pytest.mark.costly
+def test_no_trajectory_from_any_set_is_outside_in_oblique_directions(kind):
+    loop = closed_loop(random_loop(3, seed=1))
+    assert_holds(tube_of(loop, initial_set(kind, 3, 1), rj.Template(directions(3, 0, 3))))
 
 
 @pytest.mark.parametrize("width", [0.0, 1e-12])

@@ -172,3 +172,13 @@ def test_parts_and_mismatches_are_named():
     apart = rj.Intersection(rj.Box([9.0, 9.0], [10.0, 10.0]), X0)
     with pytest.raises(ValueError, match="X0 cannot be used: the polytope and the ellipsoid have"):
         recursion(loop, apart, 1, rj.Template.box(2))
+
+
+@pytest.mark.costly
+def test_a_compiled_step_from_an_intersection_that_is_traced_is_the_plain_one():
+    loop, X0 = case(1, 0, hidden=(3,))[0], intersection(1)
+
+    def size(X0):
+        return rj.log_volume(recursion(loop, X0, 1, rj.MixedTemplate(FACETS[1])))
+
+    assert float(jax.jit(size)(X0)) == pytest.approx(float(size(X0)), abs=1e-6)

@@ -37,6 +37,13 @@ def partitioned(loop):
     )
 
 
+def test_the_union_holds_every_state(loop, partitioned):
+    states = SETS["box"].sample(jax.random.key(1), 2000)
+    for t, points in enumerate(np.moveaxis(np.asarray(loop.simulate(states, 3)), 1, 0)):
+        inside = np.array([region.contains(points, 1e-9) for region in partitioned.sets(t)])
+        assert inside.any(axis=0).all()
+
+
 @pytest.mark.parametrize("name", SETS)
 @pytest.mark.costly
 def test_cells_cover_the_set(name):

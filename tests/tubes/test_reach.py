@@ -7,7 +7,7 @@ import pytest
 
 import reachjax as rj
 from tests.closed_loops import closed_loop, one_step, random_loop, recursion
-from tests.networks import box_region
+from tests.networks import box_region, simulate
 
 RELAXATIONS = [rj.PaperQC(repeated=False), rj.PaperQC(), rj.LocalBounds()]
 
@@ -48,6 +48,17 @@ def test_without_a_template_sets_are_octagons_in_the_plane_and_boxes_elsewhere(n
     for options in ({}, {"template": None}):
         found = map(jax.tree.leaves, outcomes(relaxation=forms, **options))
         jax.tree.map(np.testing.assert_array_equal, [*found], expected)
+
+
+@pytest.mark.parametrize(("n_x", "boxed"), [(1, True), (3, True), (3, False), (6, False)])
+@pytest.mark.costly
+def test_local_bounds_hold_every_sample_of_loops_that_vary_or_have_no_input_box(n_x, boxed):
+    data, corners, tube = tube_of(n_x, boxed=boxed, steps=3 if boxed else None)
+    weights = np.random.default_rng(0).dirichlet(0.3 * np.ones(len(corners)), size=100_000)
+    for t, reached in enumerate(simulate(data, np.vstack([corners, weights @ corners]), 3)):
+        if t > 0:
+            size = 1e-14 * max(1, abs(reached).max())  # the simulation rounds
+            assert np.all(tube.sets[t].contains(reached, size))
 
 
 @pytest.mark.costly

@@ -55,6 +55,7 @@ def test_gaps_are_closed_by_default(case):
 
 
 SWITCHING = "relu", "leaky", "hard", "residual", "varying"
+"""Of these loops, beside those of other dimensions, units switch on their sets."""
 
 
 @each(rows=[Case(loop) for loop in SOLVED if loop in SWITCHING or "state" in loop])

@@ -39,16 +39,12 @@ class Batch(AbstractNumber):
         return Batch(self._own @ np.asarray(matrix).T, self._rows)
 
     def __add__(self, other: Any) -> Batch:
-        return _together(np.add, self, other)
+        if isinstance(other, Batch):
+            return _together(np.add, self, other)
+        return Batch(self._own + other, self._rows)
 
     def __neg__(self) -> Batch:
         return Batch(-self._own, self._rows)
-
-    def __sub__(self, other: Any) -> Batch:
-        return _together(np.subtract, self, other)
-
-    def __rsub__(self, other: Any) -> Batch:
-        return Batch(other - self._own, self._rows)
 
     def __rmul__(self, factor: Any) -> Batch:
         return Batch(self._own * factor, self._rows)
@@ -81,15 +77,12 @@ class Batch(AbstractNumber):
         return _together(unit, *y)
 
 
-def _together(function: Callable[..., Any], *given: Any) -> Batch:
+def _together(function: Callable[..., Any], *given: Batch) -> Batch:
     """A function of numbers, computed once for points that stand for one another in all of them."""
-    batches = [each for each in given if isinstance(each, Batch)]
-    rows = batches[0]._rows
-    if any(each._rows is not rows for each in batches):
-        batches, rows = [Batch(each.values) for each in batches], None
-    values = iter(each._own for each in batches)
-    parts = (next(values) if isinstance(each, Batch) else each for each in given)
-    return Batch(np.asarray(function(*parts)), rows)
+    rows = given[0]._rows
+    if all(each._rows is rows for each in given):
+        return Batch(np.asarray(function(*[each._own for each in given])), rows)
+    return Batch(np.asarray(function(*[each.values for each in given])))
 
 
 PARTS = tuple(k / 8 for k in range(1, 8))

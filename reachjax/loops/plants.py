@@ -180,10 +180,12 @@ class AffinePlant(AbstractPlant):
                 f"the time axes of AffinePlant must have one length, but these arrived: {times}"
             )
 
+    def _varies(self, name: str) -> bool:
+        array = getattr(self, name)
+        return array is not None and array.ndim > (1 if name == "c" else 2)
+
     def _varying(self) -> dict[str, Any]:
-        constant = {"A": 2, "B": 2, "c": 1, "E": 2}
-        arrays = {name: getattr(self, name) for name in constant}
-        return {name: a for name, a in arrays.items() if a is not None and a.ndim > constant[name]}
+        return {name: getattr(self, name) for name in "ABcE" if self._varies(name)}
 
     @property
     def states(self) -> int:
@@ -234,7 +236,7 @@ class AffinePlant(AbstractPlant):
 
     def _at(self, name: str, t: int | jax.Array) -> Array:
         array = getattr(self, name)
-        return array[t] if name in self._varying() else array
+        return array[t] if self._varies(name) else array
 
     def propagate(
         self, x: Any, u: Any, t: int | jax.Array = 0, unit: AtUnit = evaluate, w: Any = None

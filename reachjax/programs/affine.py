@@ -168,10 +168,9 @@ class AffineForms(AbstractNumber):
         """Sums of so many parts of the columns within a part of a step, each number times one."""
         return self._layers(lambda part: folded(factor[:, None] * part, count), whole=True)
 
-    @property
-    def _there(self) -> Any:
-        """Which numbers are not zero."""
-        return self.sizes + self.radii.sum(axis=1) > 0
+    def _there(self, sizes: Any) -> Any:
+        """Which numbers are not zero, of these sizes."""
+        return sizes + self.radii.sum(axis=1) > 0
 
     def within(self, interval: Ball) -> AffineForms:
         """The same forms with other intervals."""
@@ -183,8 +182,9 @@ class AffineForms(AbstractNumber):
     def __rmatmul__(self, matrix) -> AffineForms:
         """`matrix @ self` for an exact matrix."""
         matrix, count = namespace(self.rows).asarray(matrix), matrix.shape[1]
-        error = errors(lambda: gamma(count) * self.sizes)
-        lost = errors(lambda: underflow(matrix, self._there, self.width + 2))
+        sizes = errors(lambda: self.sizes)
+        error = gamma(count) * sizes
+        lost = errors(lambda: underflow(matrix, self._there(sizes), self.width + 2))
         radii = abs(matrix) @ (self.radii + error[:, None]) + lost[:, None]
         radii = _once(radii * (1 + gamma(count + self.width)))
         inner = self._layers(lambda part: matrix * part if part.ndim == 1 else matrix @ part)
@@ -212,8 +212,9 @@ class AffineForms(AbstractNumber):
         """Each number times an exact one, or all times one."""
         xp = namespace(self.rows)
         factor = xp.broadcast_to(xp.asarray(factor, float), (len(self.rows),))
-        error, count = errors(lambda: gamma(1) * self.sizes), self.width + 2
-        lost = errors(lambda: 2 * TINY * count * ((factor != 0) & self._there))
+        sizes, count = errors(lambda: self.sizes), self.width + 2
+        error = gamma(1) * sizes
+        lost = errors(lambda: 2 * TINY * count * ((factor != 0) & self._there(sizes)))
         radii = abs(factor)[:, None] * (self.radii + error[:, None]) + lost[:, None]
         radii = _once(radii * (1 + gamma(self.width + 4)))
         return AffineForms(factor[:, None] * self.rows, radii, self.scaled_layers(factor))

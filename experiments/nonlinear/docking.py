@@ -1,6 +1,6 @@
 """Spacecraft docking in the plane: is the speed limit kept from every state, in forty steps?
 
-    python -m experiments.nonlinear.docking  # a minute or two on two processes
+    python -m experiments.nonlinear.docking  # one to three minutes on two processes
 
 A chaser of 12 kg moves by the equations of Clohessy and Wiltshire, sampled exactly at a second,
 under `tanh` 4-256-256-4-2, which imitates a law. It begins at 70 to 106 m in both coordinates, at

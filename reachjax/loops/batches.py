@@ -41,10 +41,18 @@ class Batch(AbstractNumber):
     def __add__(self, other: Any) -> Batch:
         if isinstance(other, Batch):
             return _together(np.add, self, other)
-        return Batch(self._own + other, self._rows)
+        return Batch(np.add(self._own, other), self._rows)
 
     def __neg__(self) -> Batch:
         return Batch(-self._own, self._rows)
+
+    def __sub__(self, other: Any) -> Batch:
+        if isinstance(other, Batch):
+            return _together(np.subtract, self, other)
+        return Batch(np.subtract(self._own, other), self._rows)
+
+    def __rsub__(self, other: Any) -> Batch:
+        return Batch(np.subtract(other, self._own), self._rows)
 
     def __rmul__(self, factor: Any) -> Batch:
         return Batch(self._own * factor, self._rows)
@@ -69,20 +77,26 @@ class Batch(AbstractNumber):
         return Batch(values[different], rows)
 
     @staticmethod
-    def evaluated(unit: AbstractUnit, *y: Batch) -> Batch:
+    def evaluated(unit: AbstractUnit, y: Batch, *others: Batch) -> Batch:
         """What a layer of units makes of numbers."""
-        idle = unit.idle(lambda: y[0].values)
+        if others:
+            return _together(unit, y, *others)
+        idle = unit.idle(lambda: y.values)
         if idle is not None and np.count_nonzero(idle) > 1:
-            y = (y[0]._standing(idle),)
-        return _together(unit, *y)
+            y = y._standing(idle)
+        own: Any = y._own
+        return Batch(np.asarray(unit(own)), y._rows)
 
 
-def _together(function: Callable[..., Any], *given: Batch) -> Batch:
+def _together(function: Callable[..., Any], *given: Any) -> Batch:
     """A function of numbers, computed once for points that stand for one another in all of them."""
-    rows = given[0]._rows
-    if all(each._rows is rows for each in given):
-        return Batch(np.asarray(function(*[each._own for each in given])), rows)
-    return Batch(np.asarray(function(*[each.values for each in given])))
+    batches = [each for each in given if isinstance(each, Batch)]
+    rows = batches[0]._rows
+    if any(each._rows is not rows for each in batches):
+        rows = None
+        given = tuple(each.values if isinstance(each, Batch) else each for each in given)
+    parts = [each._own if isinstance(each, Batch) else each for each in given]
+    return Batch(np.asarray(function(*parts)), rows)
 
 
 PARTS = tuple(k / 8 for k in range(1, 8))

@@ -181,8 +181,8 @@ class AffinePlant(AbstractPlant):
             )
 
     def _varies(self, name: str) -> bool:
-        array = getattr(self, name)
-        return array is not None and array.ndim > (1 if name == "c" else 2)
+        array, constant = getattr(self, name), 1 if name == "c" else 2
+        return array is not None and array.ndim > constant
 
     def _varying(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in "ABcE" if self._varies(name)}

@@ -168,8 +168,8 @@ class AffineForms(AbstractNumber):
         """Sums of so many parts of the columns within a part of a step, each number times one."""
         return self._layers(lambda part: folded(factor[:, None] * part, count), whole=True)
 
-    def _there(self, sizes: Any) -> Any:
-        """Which numbers are not zero, of these sizes."""
+    def _nonzero(self, sizes: Any) -> Any:
+        """Which numbers are not zero, from the sizes of their coefficients."""
         return sizes + self.radii.sum(axis=1) > 0
 
     def within(self, interval: Ball) -> AffineForms:
@@ -184,7 +184,7 @@ class AffineForms(AbstractNumber):
         matrix, count = namespace(self.rows).asarray(matrix), matrix.shape[1]
         sizes = errors(lambda: self.sizes)
         error = gamma(count) * sizes
-        lost = errors(lambda: underflow(matrix, self._there(sizes), self.width + 2))
+        lost = errors(lambda: underflow(matrix, self._nonzero(sizes), self.width + 2))
         radii = abs(matrix) @ (self.radii + error[:, None]) + lost[:, None]
         radii = _once(radii * (1 + gamma(count + self.width)))
         inner = self._layers(lambda part: matrix * part if part.ndim == 1 else matrix @ part)
@@ -214,7 +214,7 @@ class AffineForms(AbstractNumber):
         factor = xp.broadcast_to(xp.asarray(factor, float), (len(self.rows),))
         sizes, count = errors(lambda: self.sizes), self.width + 2
         error = gamma(1) * sizes
-        lost = errors(lambda: 2 * TINY * count * ((factor != 0) & self._there(sizes)))
+        lost = errors(lambda: 2 * TINY * count * ((factor != 0) & self._nonzero(sizes)))
         radii = abs(factor)[:, None] * (self.radii + error[:, None]) + lost[:, None]
         radii = _once(radii * (1 + gamma(self.width + 4)))
         return AffineForms(factor[:, None] * self.rows, radii, self.scaled_layers(factor))

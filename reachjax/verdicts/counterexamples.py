@@ -86,7 +86,7 @@ def counterexample(
             scenario = _moved_inwards(scenarios, scenario)
             if not scenarios.surely_contains(scenario):
                 continue
-            states = scenarios.runs(loop, scenario[None], len(states) - 1, start)[0]
+            states = scenarios.runs(on_host, scenario[None], len(states) - 1, start)[0]
         drawn = loop.split(scenario)
         try:
             reached = enclosures(on_host, drawn, item.time, start)

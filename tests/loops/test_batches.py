@@ -1,35 +1,49 @@
 """Many trajectories at once: points that stand for one another, beside those that do not."""
 
+from unittest.mock import Mock
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from reachjax import ReLU
 from reachjax.loops.batches import Batch
+from reachjax.loops.units import Bilinear
 
-ROWS = np.array([0, 2, 2, 1, 2])
+ALIKE = Batch(np.array([[1.0, -2.0], [-3.0, 4.0], [0.5, 0.25]]), np.array([0, 2, 2, 1, 2]))
+"""Five points, three of which are one."""
 
+OTHERS = Batch(np.array([[7.0, 8.0], [-9.0, 10.0], [11.0, 0.1]]), np.array([1, 2, 0, 0, 2]))
+"""Five points, of which others are one."""
 
-@pytest.fixture
-def alike() -> Batch:
-    """Five points, three of which are one."""
-    return Batch(np.array([[1.0, -2.0], [-3.0, 4.0], [0.5, 0.25]]), ROWS)
-
-
-@pytest.fixture
-def apart() -> Batch:
-    """Five other points."""
-    return Batch(np.arange(10.0).reshape(5, 2) - 4.0)
+APART = Batch(np.arange(10.0).reshape(5, 2) - 4.0)
+"""Five points that differ."""
 
 
-def test_sums_and_differences_are_those_of_all_points(alike, apart):
-    np.testing.assert_array_equal((alike + apart).values, alike.values + apart.values)
-    np.testing.assert_array_equal((apart - alike).values, apart.values - alike.values)
-    np.testing.assert_array_equal((alike - alike).values, np.zeros((5, 2)))
+@pytest.mark.parametrize("second", [ALIKE, OTHERS, APART])
+@pytest.mark.parametrize("first", [ALIKE, OTHERS, APART])
+def test_two_batches_meet_point_by_point(first, second):
+    one, other = first.values, second.values
+    product = Batch.evaluated(Bilinear(), first, second)
+    np.testing.assert_array_equal((first + second).values, one + other)
+    np.testing.assert_array_equal((first - second).values, one - other)
+    np.testing.assert_array_equal(product.values, one * other)
 
 
-def test_constants_and_units_keep_points_that_are_one(alike):
-    moved = np.array([1.0, 2.0]) - (alike - 3.0)
-    np.testing.assert_array_equal(moved.values, np.array([1.0, 2.0]) - (alike.values - 3.0))
-    ramp = Batch.evaluated(ReLU(), moved)
-    np.testing.assert_array_equal(ramp.values, np.maximum(moved.values, 0.0))
-    assert len(ramp._own) == len(alike._own) == 3, "computed once for points that are one"
+@pytest.mark.parametrize("constant", [2.0, np.array([1.0, 2.0]), jnp.array([1.0, 2.0])])
+def test_constants_are_taken_at_each_point_and_stay_in_numpy(constant):
+    known = np.asarray(constant)
+    for found, wanted in (
+        (ALIKE + constant, ALIKE.values + known),
+        (ALIKE - constant, ALIKE.values - known),
+        (constant - ALIKE, known - ALIKE.values),
+    ):
+        assert type(found.values) is np.ndarray
+        np.testing.assert_array_equal(found.values, wanted)
+
+
+def test_units_are_computed_once_for_points_that_are_one():
+    unit = Mock(wraps=ReLU(), idle=lambda values: None)
+    found = Batch.evaluated(unit, ALIKE - 0.5)
+    np.testing.assert_array_equal(found.values, np.maximum(ALIKE.values - 0.5, 0.0))
+    assert [len(*call.args) for call in unit.call_args_list] == [3]
